@@ -1,0 +1,178 @@
+"""``fogft init | up | down``: begin and end a pool."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fogft.cli import complete, output
+from fogft.cli.complete import PoolArgument
+from fogft.cli.sections import Command
+from fogft.core.errors import FogftError
+
+if TYPE_CHECKING:
+    from fogft.pool.seen import Seen
+
+DEFAULT_FILE = Path("pool.yaml")
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the application."""
+    for command in (init, up, down):
+        app.command(command.__name__, cls=Command)(command)
+
+
+def init(
+    name: Annotated[
+        str,
+        typer.Argument(metavar="NAME", help="Which example.", autocompletion=complete.examples),
+    ] = "",
+    into: Annotated[
+        Path | None,
+        typer.Option(
+            "--into",
+            metavar="DIR",
+            show_default=False,
+            help="Where to; a folder with the example's name unless told.",
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
+) -> None:
+    """Write an example to start from: a pool file with its nodes.
+
+    \b
+    Example:
+      fogft init planner --into my_pool
+    """
+    from fogft import app
+
+    files = app.init(name, into, force=force)
+    for file in files:
+        output.data(str(file))
+    output.hint(f"look at `{files[0]}`, then run `fogft up {files[0]}`")
+
+
+def up(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The pool file.")] = DEFAULT_FILE,
+    cloud: Annotated[
+        str | None,
+        typer.Option(
+            "--cloud",
+            metavar="NAME",
+            show_default=False,
+            help="Where to run; what the file's resources name, else `local`.",
+        ),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask. Nothing is asked on the local cloud.")
+    ] = False,
+    timeout: Annotated[
+        float, typer.Option("--timeout", min=1, metavar="S", help="Wait so long for the services.")
+    ] = 300.0,
+) -> None:
+    """Start a pool, or make a running one as its file says now.
+
+    Returns once every service answers. Replicas that still start do so in the background.
+
+    \b
+    Example:
+      fogft up pool.yaml
+    """
+    from fogft import app
+    from fogft.cli import progress
+
+    order = app.order(file, cloud)
+    progress.announce(order.preview)
+    applied_at = time.time()
+    if app.start(order) and not order.preview.is_new:
+        output.say("it had no manager: one was started, and takes over what runs")
+    name = order.spec.name
+    wanted = {service.name for service in order.spec.services}
+    try:
+        seen, answers = progress.wait(
+            lambda: managed(name), lambda seen: is_answering(seen, wanted, applied_at), timeout
+        )
+    except KeyboardInterrupt:
+        output.say(f"interrupted: `{name}` goes on starting; `fogft down {name}` ends it")
+        raise typer.Exit(130) from None
+    if not answers:
+        raise not_answering(seen, timeout)
+    status = seen.status
+    missing = max(0, status.target - status.ready)
+    rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
+    if order.preview.replaces_replicas and not missing:
+        rest = "; `fogft status` shows them being replaced"
+    output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
+
+
+def managed(pool: str) -> Seen:
+    """Return a pool's status; raise when nobody manages it any more."""
+    from fogft import app
+    from fogft.pool.paths import PoolPaths
+
+    seen = app.status(pool)
+    if not seen.manager_alive:
+        raise FogftError(
+            f"the manager of `{pool}` has ended:\n{app.tail(PoolPaths.of(pool).manager_log)}",
+            f"start it again with `fogft up`; `fogft down {pool}` ends what runs",
+        )
+    return seen
+
+
+def is_answering(seen: Seen, services: set[str], since: float) -> bool:
+    """Whether every service has a ready replica and a client proxy, as seen after `since`."""
+    status = seen.status
+    ready = {service.name for service in status.services if service.ready_replicas}
+    return (
+        status.observed_at >= since
+        and status.proxy_alive
+        and {service.name for service in status.services} == services == ready
+    )
+
+
+def not_answering(seen: Seen, timeout_s: float) -> FogftError:
+    """Return the error of a start that took too long, with all that is known of the reason."""
+    from fogft import app
+
+    status = seen.status
+    silent = [service.name for service in status.services if not service.ready_replicas]
+    listed = ", ".join(f"`{name}`" for name in silent) or "the client proxy"
+    lines = [f"{listed} of `{status.pool}` does not answer after {timeout_s:.0f} s"]
+    lines += [f"  {note}" for note in status.notes]
+    lines += [f"  replica {r.slot}.{r.generation}: {r.detail}" for r in status.replicas if r.detail]
+    logs = app.logs(status.pool)
+    label, path = logs[-1] if status.proxy_alive else logs[1]
+    lines += [f"the end of the log of `{label}`:"]
+    lines += [f"  {line}" for line in app.tail(path).splitlines()]
+    return FogftError(
+        "\n".join(lines),
+        "the manager goes on trying: see `fogft status` and `fogft logs`; "
+        f"`fogft down {status.pool}` ends it",
+    )
+
+
+def down(
+    pool: PoolArgument = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask. Nothing is asked on the local cloud.")
+    ] = False,
+) -> None:
+    """End a pool: its replicas, its client proxy and its manager.
+
+    Works when the manager is dead, and is safe to repeat.
+
+    \b
+    Example:
+      fogft down
+    """
+    from fogft import app
+
+    if not app.pools():
+        output.say("nothing to end: there is no pool here")
+        return
+    name = app.pool_name(pool)
+    app.down(name, lambda what: output.say(f"ended {what}"))
+    output.done(f"nothing of `{name}` is left")

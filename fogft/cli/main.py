@@ -1,0 +1,123 @@
+"""The ``fogft`` command: which commands there are, and how each of them ends.
+
+Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage; 130
+interrupted; 141 nobody reads stdout any more. Anything else is a defect of ours and
+keeps its trace.
+
+Every import that costs more than a few milliseconds is made inside the command that
+needs it, so that ``fogft --help`` and completion stay quick (tests/cli/test_laziness).
+
+Owns: the entry point and exit statuses.
+Not here: what commands do (`fogft.app`) and how text looks (`output`).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from fogft import __version__
+from fogft.cli import change, chaos, doctor, lifecycle, output, parts, watch
+from fogft.cli.sections import Commands
+from fogft.core.errors import FogftError
+
+INTERRUPTED = 130
+STDOUT_CLOSED = 141
+# What Typer's checker of values says, and what we say.
+_OTHER_WORDS = (
+    (", unable to parse string as an integer", ""),
+    (", unable to parse string as a number", ""),
+    ("Input should be a valid integer", "must be a whole number"),
+    ("Input should be a valid number", "must be a number"),
+    ("Input should be", "must be"),
+)
+
+app = typer.Typer(
+    name="fogft",
+    cls=Commands,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+lifecycle.register(app)
+watch.register(app)
+doctor.register(app)
+change.register(app)
+chaos.register(app)
+parts.register(app)
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Keep ROS 2 services answering while the machines that run them come and go.
+
+    \b
+    fogft init          write an example to start from
+    fogft up            start the pool that its file describes
+    fogft status        see how it is
+    fogft down          end everything
+    """
+    if version:
+        output.data(f"fogft {__version__}")
+    elif context.invoked_subcommand is None:
+        output.say(context.get_help())
+        raise typer.Exit(2)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the command line and exit the process."""
+    sys.exit(run(sys.argv[1:] if args is None else args))
+
+
+def run(args: Sequence[str]) -> int:
+    """Run the command line and return the exit status."""
+    try:
+        return _run(args)
+    except KeyboardInterrupt:
+        output.say("interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        if not output.stdout_closed():
+            raise
+        output.silence_stdout()
+        return STDOUT_CLOSED
+
+
+def _run(args: Sequence[str]) -> int:
+    command = typer.main.get_command(app)
+    if os.environ.get("_FOGFT_COMPLETE"):
+        command(prog_name="fogft")  # answers the shell, and exits
+    # Not `command(args)`: that ends on any broken pipe, a socket's too, without a word.
+    # The base class of wrong usage is in a private module of Typer.
+    usage_error: type[Exception] = typer.BadParameter.__mro__[2]
+    try:
+        with command.make_context("fogft", list(args)) as context:
+            command.invoke(context)
+        sys.stdout.flush()
+    except typer.Exit as exit_:
+        sys.stdout.flush()
+        return int(exit_.exit_code)
+    except FogftError as problem:
+        output.failure(problem)
+        return 1
+    except usage_error as problem:
+        _explain_usage(problem)
+        return 2
+    return 0
+
+
+def _explain_usage(problem: Exception) -> None:
+    message = getattr(problem, "format_message", problem.__str__)()
+    context = getattr(problem, "ctx", None)
+    path = context.command_path if context else "fogft"
+    for theirs, ours in _OTHER_WORDS:
+        message = message.replace(theirs, ours)
+    slot = "; the slot of replica `2.1` is 2" if "'SLOT'" in message else ""
+    output.error(message[:1].lower() + message[1:].rstrip("."), f"see `{path} --help`{slot}")

@@ -1,0 +1,96 @@
+"""``fogft proxy | serve | manager``: one part of a pool, by hand, in the foreground.
+
+`fogft up` starts them all. These are for a service manager, a container, a debugger.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fogft.cli import complete
+from fogft.cli.sections import Command
+
+Config = Annotated[
+    Path, typer.Option("--config", "-c", metavar="FILE", help="Its configuration (YAML).")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the application."""
+    for command in (proxy, serve, manager):
+        app.command(command.__name__, cls=Command)(command)
+
+
+def proxy(config: Config) -> None:
+    """Run a client proxy: the robot's side of a pool.
+
+    The manager writes its configuration to the pool's state folder as `proxy.yaml`.
+
+    \b
+    Example:
+      fogft proxy --config ~/.local/state/fogft/pools/planner/proxy.yaml
+    """
+    from fogft import app
+
+    app.run_proxy(config)
+
+
+def serve(
+    config: Config,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
+        ),
+    ] = None,
+    domain_id: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=232, metavar="N", help="ROS domain of the service.", show_default=False
+        ),
+    ] = None,
+    workdir: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where to start the `run` command.", show_default=False),
+    ] = None,
+    notice_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A file that appears before this machine is taken away.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Run a server proxy: a replica's side of a pool.
+
+    It starts the pool file's `run` command and restarts it when it dies.
+
+    \b
+    Example:
+      fogft serve --config replica.yaml --listen 0.0.0.0:7447
+    """
+    from fogft import app
+
+    app.run_server(
+        config, listen=listen, domain_id=domain_id, workdir=workdir, notice_file=notice_file
+    )
+
+
+def manager(
+    pool: Annotated[
+        str, typer.Argument(metavar="POOL", help="Its name.", autocompletion=complete.pools)
+    ],
+) -> None:
+    """Run a pool's manager: it observes, plans and applies.
+
+    \b
+    Example:
+      fogft manager planner
+    """
+    from fogft import app
+
+    app.run_manager(pool)

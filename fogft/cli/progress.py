@@ -1,0 +1,114 @@
+"""What ``fogft up`` shows: what it will do, then each replica as it comes.
+
+On a terminal a table that is redrawn; elsewhere one line for each change. All of it goes
+to stderr.
+
+Owns: the words and the waiting.
+Not here: what is done (`fogft.app`).
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from fogft.cli import output
+
+if TYPE_CHECKING:
+    from fogft.pool.preview import Preview
+    from fogft.pool.seen import Seen
+
+LOOK_EVERY_S = 0.2
+
+
+def announce(preview: Preview) -> None:
+    """Say what will be done."""
+    spec = preview.spec
+    if preview.is_new:
+        output.say(f"pool `{spec.name}`: {_count(spec.replicas, 'replica')} on `{preview.cloud}`")
+        rows = [
+            (f"  {launch.slot}", launch.location, launch.instance, f"${launch.usd_per_hour:.3f}/h")
+            for launch in preview.launches
+        ]
+        if rows:
+            output.say(output.aligned(rows))
+            output.say(f"  together ${sum(x.usd_per_hour for x in preview.launches):.3f}/h")
+    elif preview.changes:
+        output.say(f"pool `{spec.name}` changes:")
+        for change in preview.changes:
+            output.say(f"  {change}")
+        if preview.replaces_replicas:
+            output.say("  so its replicas are replaced one after the other, new before old")
+    else:
+        output.say(f"pool `{spec.name}` is as its file says; nothing changes")
+    for note in preview.notes:
+        output.warn(note)
+
+
+def wait(
+    look: Callable[[], Seen], until: Callable[[Seen], bool], timeout_s: float
+) -> tuple[Seen, bool]:
+    """Show a pool's progress until it is as wanted; return what was last seen, and whether it is.
+
+    Args:
+        look: Returns the pool's status; raises what ends the waiting.
+        until: Whether a status is good enough.
+        timeout_s: The longest to wait.
+    """
+    deadline = time.monotonic() + timeout_s
+    with _shown() as show:
+        while True:
+            seen = look()
+            show(seen)
+            good = until(seen)
+            if good or time.monotonic() >= deadline:
+                return seen, good
+            time.sleep(LOOK_EVERY_S)
+
+
+@contextmanager
+def _shown() -> Iterator[Callable[[Seen], None]]:
+    """Yield a function that shows a status, in the way that stderr is fit for."""
+    if not output.is_terminal(sys.stderr):
+        yield PhaseLines(output.say)
+        return
+    from fogft.cli import status_text
+
+    room, colour = output.width(sys.stderr), output.coloured(sys.stderr)
+    with output.redrawn(sys.stderr) as show:
+        yield lambda seen: show(status_text.starting(seen.status, width=room, colour=colour))
+
+
+class PhaseLines:
+    """One line for each replica's change of phase, and for each new note."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._known: dict[str, tuple[str, str]] = {}
+        self._notes: set[str] = set()
+
+    def __call__(self, seen: Seen) -> None:
+        """Say what is new."""
+        replicas = {f"{r.slot}.{r.generation}": r for r in seen.status.replicas}
+        for name, replica in replicas.items():
+            phase, detail = self._known.get(name, ("", ""))
+            self._known[name] = (replica.phase, replica.detail)
+            if phase != replica.phase:
+                where = "" if phase else f" at {replica.location}"
+                self._say(f"{name}  {replica.phase}{where}")
+            if replica.detail not in ("", detail):
+                self._say(f"{name}  {replica.detail}")
+        for name in [name for name in self._known if name not in replicas]:
+            del self._known[name]
+            self._say(f"{name}  gone")
+        for note in seen.status.notes:
+            if note not in self._notes:
+                self._notes.add(note)
+                self._say(f"note: {note}")
+
+
+def _count(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"

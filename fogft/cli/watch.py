@@ -1,0 +1,143 @@
+"""``fogft status | logs``: look at a pool."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fogft.cli import complete, output
+from fogft.cli.complete import PoolArgument, PoolOption
+from fogft.cli.sections import Command
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from fogft.pool.seen import Seen
+
+REDRAW_EVERY_S = 1.0
+STALE_AFTER_S = 15.0
+FOLLOW_EVERY_S = 0.2
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the application."""
+    app.command("status", cls=Command)(status)
+    app.command("logs", cls=Command)(logs)
+
+
+def status(
+    pool: PoolArgument = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON; with --watch one object a line.")
+    ] = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Show it anew each second.")] = False,
+    refresh: Annotated[
+        bool, typer.Option("--refresh", "-r", help="Have the manager look again first.")
+    ] = False,
+) -> None:
+    """Show a pool: its replicas, their links, and what became of the requests.
+
+    Tells what the manager last saw, and how long ago that was.
+
+    \b
+    Example:
+      fogft status --watch
+    """
+    from fogft import app
+
+    name = app.pool_name(pool)
+    seen = app.refresh(name) if refresh else app.status(name)
+    if watch:
+        _watch(name, as_json=as_json)
+        return
+    if as_json:
+        output.json_data(seen.to_json())
+    else:
+        output.data(_screen(seen))
+    _remark(seen)
+
+
+def _watch(pool: str, *, as_json: bool) -> None:
+    """Show the status each second until interrupted, or until the pool is gone."""
+    from fogft import app
+
+    def looks() -> Iterator[Seen]:
+        while True:
+            yield app.status(pool)
+            time.sleep(REDRAW_EVERY_S)
+
+    if as_json:
+        for seen in looks():
+            output.data(json.dumps(seen.to_json()))
+    if not output.is_terminal(sys.stdout):
+        for seen in looks():
+            output.data(f"{_screen(seen)}\n")
+    with output.redrawn(sys.stdout) as show:
+        for seen in looks():
+            show(_screen(seen).split("\n"))
+
+
+def _screen(seen: Seen) -> str:
+    from fogft.cli import status_text
+
+    room, colour = output.width(sys.stdout), output.coloured(sys.stdout)
+    return "\n".join(status_text.rendered(seen, width=room, colour=colour))
+
+
+def _remark(seen: Seen) -> None:
+    """Say on stderr what a reader of the table might overlook."""
+    if not seen.manager_alive:
+        output.warn("no manager runs: requests go on, but nothing that is lost is replaced")
+        output.hint(f"start it with `fogft up {seen.status.file}`, or end it with `fogft down`")
+    elif seen.age_s is not None and seen.age_s > STALE_AFTER_S:
+        output.warn(f"the manager has not looked for {seen.age_s:.0f} s")
+        output.hint("see `fogft logs`")
+
+
+def logs(
+    slot: Annotated[
+        int | None,
+        typer.Argument(
+            min=0,
+            metavar="SLOT",
+            help="Only this replica's; everything unless given.",
+            autocompletion=complete.slots,
+            show_default=False,
+        ),
+    ] = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Go on showing what is written.")
+    ] = False,
+    lines: Annotated[
+        int, typer.Option("--lines", "-n", min=0, metavar="N", help="Lines of each log to begin.")
+    ] = 50,
+    pool: PoolOption = None,
+) -> None:
+    """Show what the manager, the client proxy and the replicas log.
+
+    Each line begins with the name of its log: `manager`, `proxy` or `slot.generation`.
+
+    \b
+    Example:
+      fogft logs 2 -f
+    """
+    from fogft import app
+    from fogft.cli.tail import Tail, in_order
+
+    name = app.pool_name(pool)
+    tails: dict[str, Tail] = {}
+    begin: int | None = lines
+    while True:
+        for label, path in app.logs(name, slot):
+            if label not in tails:
+                tails[label] = Tail(path, begin)
+        for label, line in in_order({name: tail.new_lines() for name, tail in tails.items()}):
+            output.data(f"{label:<8} {line}")
+        if not follow:
+            return
+        begin = None  # a log that appears from now on is shown whole
+        time.sleep(FOLLOW_EVERY_S)

@@ -1,0 +1,1 @@
+"""Where replicas run: one port, several clouds behind it."""

@@ -1,0 +1,201 @@
+"""Make things go wrong on the local cloud, on purpose. What ``fogft chaos`` calls.
+
+Everything is written to files that the machines watch, or is a signal; nothing here has to
+live on for a fault to last or to end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from fogft import disk
+from fogft.cloud.local import ending, faults, processes
+from fogft.cloud.local import folder as folders
+from fogft.cloud.local.catalogue import CLOUD
+from fogft.cloud.local.cloud import LocalCloud
+from fogft.cloud.local.faults import CloudFaults, LinkFaults
+from fogft.cloud.local.folder import Life, MachineFolder
+from fogft.core.errors import CloudError, StateError
+from fogft.core.model import Placement, ReplicaId
+from fogft.core.spec_tree import nearest, shown
+
+# In an outage a machine is cut off first, and gone so long after.
+OUTAGE_KILL_AFTER_S = 1.0
+
+
+class Chaos:
+    """Faults in one local cloud, and all its pools.
+
+    Args:
+        root: The cloud's folder, as given to `LocalCloud`.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._cloud = LocalCloud(root)
+        self._root = self._cloud.root
+
+    # -- one machine; all raise CloudError if it does not exist ------------------------------
+
+    def preempt(self, id: ReplicaId, notice_s: float | None = None) -> float:
+        """Give a machine notice; it ends when that is over. Returns the seconds until then.
+
+        Args:
+            id: The machine.
+            notice_s: None for its zone's own. A second notice never puts the end off.
+        """
+        folder = self._living(id)
+        now = time.time()
+        if notice_s is None:
+            notice_s = folder.record().notice_s
+        return max(0.0, folder.ask_end(now + notice_s, notice=True) - now)
+
+    def kill(self, id: ReplicaId) -> None:
+        """End a machine at once, with SIGKILL; return when it is gone."""
+        ending.end(self._root, self._living(id))
+
+    def freeze(self, id: ReplicaId) -> int:
+        """Stop every process of a machine (SIGSTOP); return how many. Its kernel still answers."""
+        self._living(id)
+        pids = processes.find(machine=str(id))
+        while not all(map(processes.stopped, pids)):  # what it forked meanwhile as well
+            processes.send(pids, signal.SIGSTOP)
+            time.sleep(0.002)
+            pids = processes.find(machine=str(id))
+        return len(pids)
+
+    def thaw(self, id: ReplicaId) -> int:
+        """Let a frozen machine go on (SIGCONT); return of how many processes it is."""
+        self._living(id)
+        pids = processes.find(machine=str(id))
+        processes.send(pids, signal.SIGCONT)
+        return len(pids)
+
+    def slow(
+        self,
+        id: ReplicaId,
+        delay_s: float = 0.0,
+        rate_bytes_per_s: float | None = None,
+        for_s: float | None = None,
+    ) -> None:
+        """Delay all that passes to and from a machine, each way, and limit its rate.
+
+        Args:
+            id: The machine.
+            delay_s: 0 for none.
+            rate_bytes_per_s: None for no limit.
+            for_s: None until `clear`.
+        """
+        if not 0 <= delay_s <= 3600 or not (rate_bytes_per_s is None or rate_bytes_per_s >= 1):
+            raise CloudError("a link cannot be slowed like that", "write a delay of 0 to 3600 s")
+        self._change_link(
+            id,
+            lambda old: replace(
+                old,
+                delay_s=delay_s,
+                rate_bytes_per_s=rate_bytes_per_s,
+                slow_until=_deadline(for_s),
+            ),
+        )
+
+    def blackhole(self, id: ReplicaId, for_s: float | None = None) -> None:
+        """Let nothing pass to or from a machine; its connections stay. None: until `clear`."""
+        self._change_link(
+            id, lambda old: replace(old, blackhole=True, blackhole_until=_deadline(for_s))
+        )
+
+    def reset(self, id: ReplicaId) -> None:
+        """Reset all connections to a machine once."""
+        self._change_link(id, lambda old: replace(old, resets=old.resets + 1))
+
+    # -- locations; `region`, `region/zone`, with or without `local/` before -----------------
+
+    def outage(self, location: str, for_s: float | None = None) -> list[ReplicaId]:
+        """Cut off and then end all machines in a location; launches there are refused.
+
+        Returns the machines. None: launches are refused until `clear`.
+        """
+        place = self._location(location)
+        with ending.cloud_lock(self._root):
+            known = faults.read_cloud(self._root)
+            outages = {**known.outages, place: _deadline(for_s)}
+            faults.write(self._root / faults.FILE, replace(known, outages=outages))
+        hit = []
+        for folder, placement in self._living_machines():
+            if placement.within(place):
+                with contextlib.suppress(CloudError):  # it ends anyway
+                    self.blackhole(folder.id)
+                folder.ask_end(time.time() + OUTAGE_KILL_AFTER_S)
+                hit.append(folder.id)
+        return sorted(hit)
+
+    def capacity(self, location: str, machines: int) -> None:
+        """Say how many machines fit into a location; those that run stay."""
+        place = self._location(location)
+        if machines < 0:
+            raise CloudError(f"{machines} machines cannot fit into `{place}`", "write 0 or more")
+        with ending.cloud_lock(self._root):
+            known = faults.read_cloud(self._root)
+            limits = {**known.capacity, place: machines}
+            faults.write(self._root / faults.FILE, replace(known, capacity=limits))
+
+    def clear(self) -> None:
+        """Undo what lasts: slow and dead links, frozen machines, outages, capacities."""
+        with ending.cloud_lock(self._root):
+            faults.write(self._root / faults.FILE, CloudFaults())
+        for folder, _ in self._living_machines():
+            with contextlib.suppress(CloudError):  # it has just ended, or has no relay
+                self.thaw(folder.id)
+                self._change_link(folder.id, lambda old: LinkFaults(resets=old.resets))
+
+    # -- inside -----------------------------------------------------------------------------
+
+    def _living(self, id: ReplicaId) -> MachineFolder:
+        folder = MachineFolder.under(self._cloud.machines_folder, id)
+        if not folder.exists or folder.life(time.time()) not in (Life.ORDERED, Life.ALIVE):
+            raise CloudError(
+                f"replica `{id.short}` has no machine on the local cloud now",
+                "`fogft status` shows which ones run",
+            )
+        return folder
+
+    def _living_machines(self) -> list[tuple[MachineFolder, Placement]]:
+        found = []
+        for folder in self._cloud.folders():
+            try:
+                if folder.life(time.time()) in (Life.ORDERED, Life.ALIVE):
+                    found.append((folder, folder.record().placement))
+            except StateError:
+                continue
+        return found
+
+    def _change_link(self, id: ReplicaId, change: Callable[[LinkFaults], LinkFaults]) -> None:
+        folder = self._living(id)
+        if not folder.record().relay:
+            raise CloudError(
+                f"the link to replica `{id.short}` has no relay",
+                "remove `relay: false` from `regions.yaml` and replace the machine",
+            )
+        path = folder.path / folders.LINK
+        with disk.locked(folder.path / "link.lock"):
+            faults.write(path, change(faults.read_link(path)))
+
+    def _location(self, text: str) -> str:
+        """Return a location in full, if it exists."""
+        place = text.strip().rstrip("/")
+        place = place if place.split("/")[0] == CLOUD else f"{CLOUD}/{place}"
+        zones = self._cloud.catalogue().zones
+        known = {f"{CLOUD}/{zone.region}" for zone in zones} | {zone.location for zone in zones}
+        if place not in known and place != CLOUD:
+            raise CloudError(
+                f"the local cloud has no location {shown(text)}", nearest(place, known)
+            )
+        return place
+
+
+def _deadline(for_s: float | None) -> float | None:
+    return None if for_s is None else time.time() + for_s

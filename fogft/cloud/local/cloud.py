@@ -1,0 +1,291 @@
+"""The local cloud: the port, over folders, locks and processes. See docs/design/local-cloud.md.
+
+Owns: launching, listing and ending machines.
+Not here: what a machine does (`machine`), how it ends (`ending`), what is sold
+(`catalogue`, `resources`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.local import ending, faults, processes, regions_file
+from fogft.cloud.local import folder as folders
+from fogft.cloud.local.catalogue import Catalogue, Zone
+from fogft.cloud.local.folder import Life, MachineFolder, Record, State
+from fogft.cloud.local.resources import offers as offers_for
+from fogft.cloud.port import Launch
+from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, StateError
+from fogft.core.model import Machine, MachinePhase, Offer, Placement, ReplicaId
+from fogft.core.spec_tree import nearest
+
+log = logging.getLogger(__name__)
+
+SERVE = (sys.executable, "-m", "fogft", "serve")
+# What ties a process to the session that it was started from, and is wrong in a machine.
+_NOT_INHERITED = ("NOTIFY_SOCKET", "LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "WATCHDOG_USEC")
+_UNKNOWN = Placement("local", "unknown", "unknown", "unknown")
+
+
+class LocalCloud:
+    """See the module. Implements `fogft.cloud.port.Cloud`; any thread, any number of processes.
+
+    Args:
+        root: Folder of this cloud; made when needed.
+        serve: Command that starts a server proxy; gets ``--config``, ``--listen``,
+            ``--domain-id``, ``--workdir`` and ``--notice-file``.
+    """
+
+    def __init__(self, root: Path, serve: Sequence[str] = SERVE) -> None:
+        self.root = Path(os.path.abspath(root))
+        self._serve = tuple(serve)
+        self._spawned: list[subprocess.Popen[bytes]] = []
+        self._spawned_lock = threading.Lock()
+        self._warned: set[str] = set()
+
+    @property
+    def machines_folder(self) -> Path:
+        """Where the machines' folders are."""
+        return self.root / "machines"
+
+    def catalogue(self) -> Catalogue:
+        """Return what is sold: ``regions.yaml``, or what is built in.
+
+        Raises:
+            SpecError: ``regions.yaml`` is wrong.
+        """
+        return regions_file.read(self.root / regions_file.FILE)
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """Return an offer for each zone that suits. Full zones stay: only a launch tells."""
+        return offers_for(self.catalogue(), resources)
+
+    def machines(self, pool_uid: str) -> Sequence[Machine]:
+        """List the pool's machines, and clear away those that died."""
+        self._reap()
+        now = time.time()
+        found = []
+        for folder in self.folders():
+            if folder.id.pool_uid != pool_uid:
+                continue
+            if ending.overdue(folder, now):
+                ending.end(self.root, folder)
+                continue
+            machine = self._machine(folder, now)
+            if machine is not None:
+                found.append(machine)
+        return sorted(found, key=lambda machine: machine.id)
+
+    def launch(self, order: Launch) -> None:
+        """Write the machine's folder, then start its process; both outlive the caller."""
+        zone = self._zone(order)
+        self.folders()  # or it cannot be told whether the order is a repeated one
+        with ending.cloud_lock(self.root):
+            folder = MachineFolder.under(self.machines_folder, order.id)
+            if not self._is_new(folder):
+                return
+            if not folder.exists:
+                self._check_room(zone, order.id)
+                folders.write_new(folder, self._record(order, zone), order.files)
+            try:
+                self._spawn(folder)
+            except OSError as error:
+                folders.remove(folder.path)
+                raise CloudError(
+                    f"machine `{order.id.short}` cannot be started: {error}",
+                    "check free memory and the limit of processes (`ulimit -u`)",
+                ) from error
+        log.info("machine_launched replica=%s zone=%s", order.id.short, zone.location)
+
+    def terminate(self, id: ReplicaId) -> None:
+        """Kill all of a machine's processes and remove its folder."""
+        self.folders()
+        ending.end(self.root, MachineFolder.under(self.machines_folder, id))
+        self._reap()
+
+    def log(self, id: ReplicaId) -> str | None:
+        """Return the log of a machine, also for a while after its end."""
+        folder = MachineFolder.under(self.machines_folder, id)
+        for path in (folder.log, ending.kept_log(self.root, id)):
+            if path.exists():
+                return str(path)
+        return None
+
+    def folders(self) -> list[MachineFolder]:
+        """Return the folders of all pools' machines, in any state, unordered.
+
+        Raises:
+            CloudUnreachable: The cloud's folder cannot be read.
+        """
+        try:
+            names = os.listdir(self.machines_folder)
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise CloudUnreachable(
+                f"`{self.machines_folder}` cannot be read: {error.strerror}"
+            ) from error
+        found = [MachineFolder.at(self.machines_folder / name) for name in names]
+        for name, folder in zip(names, found, strict=True):
+            if folder is None and not name.startswith("."):
+                self._warn_once(name, "it is not a machine's folder")
+        return [folder for folder in found if folder is not None]
+
+    # -- one machine ------------------------------------------------------------------------
+
+    def _machine(self, folder: MachineFolder, now: float) -> Machine | None:
+        """Return a machine as listed; None if it is gone."""
+        try:
+            life = folder.life(now)
+        except StateError as error:
+            self._warn_once(folder.path.name, error.message)
+            return _damaged(folder, now, error) if folder.locked else None
+        if life is Life.DEAD:
+            self._bury_if_free(folder)
+            return None
+        try:
+            return _listed(folder, folder.record(), folder.state())
+        except StateError as error:
+            if not folder.exists:  # it was ended while we looked
+                return None
+            self._warn_once(folder.path.name, error.message)
+            return _damaged(folder, now, error) if life is Life.ALIVE else None
+
+    def _bury_if_free(self, folder: MachineFolder) -> None:
+        """Clear a dead machine away; later, if the cloud is busy: a list never waits."""
+        with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
+            ending.bury(self.root, folder)
+
+    def _is_new(self, folder: MachineFolder) -> bool:
+        """Whether an order's machine has yet to be started. The cloud's lock is held."""
+        if folder.exists:
+            try:
+                life = folder.life(time.time())
+            except StateError:
+                life = Life.ALIVE if folder.locked else Life.DEAD
+            if life is Life.ORDERED:
+                return True  # its launcher may have been killed: a second process does no harm
+            if life is not Life.DEAD or not ending.bury(self.root, folder):
+                return False
+        return not ending.kept_log(self.root, folder.id).exists()
+
+    def _record(self, order: Launch, zone: Zone) -> Record:
+        return Record(
+            id=order.id,
+            pool=order.pool,
+            placement=order.placement,
+            usd_per_hour=order.usd_per_hour,
+            spec_hash=order.spec_hash,
+            launched_at=time.time(),
+            boot_s=zone.boot_s,
+            notice_s=zone.notice_s,
+            relay=zone.relay,
+            serve=self._serve,
+            task=order.task,
+        )
+
+    def _spawn(self, folder: MachineFolder) -> None:
+        environ = {k: v for k, v in os.environ.items() if k not in _NOT_INHERITED}
+        environ[processes.MACHINE] = str(folder.id)
+        environ[processes.POOL] = folder.id.pool_uid
+        environ.setdefault("PYTHONUNBUFFERED", "1")  # logs as they come
+        package = Path(__file__).resolve().parents[3]
+        if package.name not in ("site-packages", "dist-packages"):  # a checkout
+            paths = (str(package), environ.get("PYTHONPATH", ""))
+            environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        output = os.open(folder.log, flags, 0o600)
+        try:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "fogft.cloud.local.machine", str(folder.path)],
+                cwd=folder.path,
+                env=environ,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
+        finally:
+            os.close(output)
+        with self._spawned_lock:
+            self._spawned.append(process)
+
+    def _reap(self) -> None:
+        """Let go of the zombies of machines that we started and that have ended."""
+        with self._spawned_lock:
+            self._spawned = [process for process in self._spawned if process.poll() is None]
+
+    # -- room -------------------------------------------------------------------------------
+
+    def _zone(self, order: Launch) -> Zone:
+        catalogue = self.catalogue()
+        zone = catalogue.zone_of(order.placement)
+        if zone is None:
+            raise CloudError(
+                f"there is no zone `{order.placement.location}`",
+                nearest(order.placement.location, {z.location for z in catalogue.zones}),
+            )
+        return zone
+
+    def _check_room(self, zone: Zone, id: ReplicaId) -> None:
+        """Raise `NoCapacity` unless one more fits. The cloud's lock is held."""
+        wrong = faults.read_cloud(self.root)
+        place = Placement("local", zone.region, zone.name, "")
+        for location in wrong.out(time.time()):
+            if place.within(location):
+                raise NoCapacity(f"no capacity in `{zone.location}`: `{location}` is out")
+        limits = {zone.location: zone.capacity}
+        limits |= {where: n for where, n in wrong.capacity.items() if place.within(where)}
+        taken = [place for other, place in self._taken() if other != id]
+        for location, limit in limits.items():
+            here = sum(placement.within(location) for placement in taken)
+            if here >= limit:
+                raise NoCapacity(
+                    f"no capacity in `{zone.location}`: {here} of {limit} machines "
+                    f"in `{location}` are taken"
+                )
+
+    def _taken(self) -> list[tuple[ReplicaId, Placement]]:
+        now = time.time()
+        found = []
+        for folder in self.folders():
+            with contextlib.suppress(StateError):
+                if folder.life(now) in (Life.ORDERED, Life.ALIVE):
+                    found.append((folder.id, folder.record().placement))
+        return found
+
+    def _warn_once(self, name: str, reason: str) -> None:
+        if name not in self._warned:
+            self._warned.add(name)
+            log.warning("machine_ignored folder=%s reason=%r", name, reason)
+
+
+def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machine:
+    state = state or State(MachinePhase.PROVISIONING, progress="starting")
+    return Machine(
+        id=folder.id,
+        placement=record.placement,
+        phase=state.phase,
+        launched_at=record.launched_at,
+        endpoint=state.endpoint,
+        notice=(folder.path / folders.NOTICE).exists(),
+        usd_per_hour=record.usd_per_hour,
+        spec_hash=record.spec_hash,
+        failure=state.failure,
+        progress=state.progress,
+    )
+
+
+def _damaged(folder: MachineFolder, now: float, error: StateError) -> Machine:
+    """List a machine that lives though its files cannot be read, so that it can be ended."""
+    failure = f"error: {error.message}"
+    return Machine(folder.id, _UNKNOWN, MachinePhase.FAILED, now, failure=failure)

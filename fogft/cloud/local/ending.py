@@ -1,0 +1,141 @@
+"""End machines for good: their processes, their folder, their shared memory. Keep their log.
+
+Owns: what "gone" means. A machine is gone when none of its processes is left and its folder
+has been removed; then its log stands in ``logs/``, which also marks its id as used.
+Not here: who decides that one goes (`cloud`, `chaos`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from fogft import disk
+from fogft.cloud.local import folder as folders
+from fogft.cloud.local import processes
+from fogft.cloud.local.folder import Life, MachineFolder
+from fogft.core.errors import CloudUnreachable, StateError
+from fogft.core.model import ReplicaId
+
+log = logging.getLogger(__name__)
+
+LOGS_KEPT = 100
+_LOCK_LIMIT_S = 5.0
+_POLL_S = 0.01
+
+
+def kept_log(root: Path, id: ReplicaId) -> Path:
+    """Return where the log of an ended machine is kept."""
+    return root / "logs" / f"{id}.log"
+
+
+def end(root: Path, folder: MachineFolder) -> None:
+    """End a machine, whatever state it is in; return when it is gone. Repeatable.
+
+    Raises:
+        CloudUnreachable: One of its processes does not end.
+    """
+    if folder.exists:
+        with contextlib.suppress(StateError):  # a full disk keeps nobody alive
+            folder.ask_end(0.0)  # a process that starts only now sees it
+    ran = processes.end_machine(str(folder.id))
+    with cloud_lock(root):
+        ran |= processes.end_machine(str(folder.id))  # one that a launcher spawned meanwhile
+        _remove(root, folder, keep_log=True)
+    if ran:
+        sweep_shared_memory()
+
+
+def bury(root: Path, folder: MachineFolder) -> bool:
+    """Remove what is left of a machine that is dead. Returns whether it is gone.
+
+    The caller holds the cloud's lock.
+    """
+    lock = disk.Lock(folder.path / folders.LOCK)
+    try:
+        if not lock.acquire(wait=False):
+            return False  # it lives, or somebody looks at it just now
+    except FileNotFoundError:
+        return True
+    try:
+        processes.end_machine(str(folder.id))
+        # One whose process never ran may be ordered again.
+        ran = folder.log.exists() and folder.log.stat().st_size > 0
+        _remove(root, folder, keep_log=ran or (folder.path / folders.STATE).exists())
+    except CloudUnreachable as error:
+        log.warning("machine_not_gone replica=%s reason=%r", folder.id.short, error.message)
+        return False
+    finally:
+        lock.release()
+    return True
+
+
+def overdue(folder: MachineFolder, now: float, patience_s: float = 1.0) -> bool:
+    """Return whether a machine should have ended by itself and has not: it is frozen."""
+    try:
+        times = (folder.notice_at(), folder.end_at())
+        return folder.life(now) is Life.ALIVE and any(
+            at is not None and now > at + patience_s for at in times
+        )
+    except StateError:
+        return False
+
+
+@contextlib.contextmanager
+def cloud_lock(root: Path, limit_s: float = _LOCK_LIMIT_S) -> Iterator[None]:
+    """Hold the cloud's lock: nobody else launches or removes a machine meanwhile.
+
+    Raises:
+        CloudUnreachable: It cannot be had within `limit_s`, or the folder cannot be used.
+    """
+    path = root / "cloud.lock"
+    lock = disk.Lock(path)
+    deadline = time.monotonic() + limit_s
+    try:
+        disk.make_folder(root)
+        while not lock.acquire(wait=False):
+            if time.monotonic() > deadline:
+                raise CloudUnreachable(
+                    f"`{path}` has been held by another process for {limit_s:g} s",
+                    "is a fogft process stopped or hanging?",
+                )
+            time.sleep(_POLL_S)
+    except OSError as error:
+        raise CloudUnreachable(f"`{path}` cannot be used: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _remove(root: Path, folder: MachineFolder, *, keep_log: bool) -> None:
+    if not folder.exists:
+        return
+    try:
+        if keep_log:
+            folder.log.touch(mode=0o600)
+            disk.make_folder(root / "logs")
+            os.replace(folder.log, kept_log(root, folder.id))
+            _prune(root / "logs")
+        folders.remove(folder.path)
+    except OSError as error:
+        raise CloudUnreachable(f"`{folder.path}` cannot be removed: {error}") from error
+
+
+def _prune(logs: Path) -> None:
+    """Keep the last logs only."""
+    kept = sorted(logs.glob("*.log"), key=lambda path: path.stat().st_mtime)
+    for path in kept[:-LOGS_KEPT]:
+        path.unlink(missing_ok=True)
+
+
+def sweep_shared_memory() -> None:
+    """Remove the shared memory that killed ROS processes left."""
+    from fogft.ros import shared_memory
+
+    with contextlib.suppress(OSError):
+        shared_memory.sweep()

@@ -1,0 +1,310 @@
+"""A machine: ``python -m fogft.cloud.local.machine FOLDER``. Boots, sets up, serves, ends.
+
+It ends when it is told to (``end.json``, ``notice.json``, a signal) or when what it serves
+has ended, and takes everything that ran on it along. One thread: the kernel ties children to
+the thread that started them.
+
+Owns: the order of things in a machine's life.
+Not here: the path to it (`relay`), cleaning up after it (`guard`, `ending`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from fogft import child, disk
+from fogft.cloud.local import faults, guard, machine_log, processes, task_commands
+from fogft.cloud.local import folder as folders
+from fogft.cloud.local.ending import sweep_shared_memory
+from fogft.cloud.local.folder import MachineFolder, Record, State
+from fogft.cloud.local.relay import Relay
+from fogft.cloud.local.reservations import Reservation, reserve_domain, reserve_port
+from fogft.core.errors import FogftError, StateError
+from fogft.core.model import MachinePhase
+
+log = logging.getLogger("machine")
+
+TICK_S = 0.05
+FOLDER_PATIENCE_S = 5.0  # somebody removed it: nobody can list or end this machine any more
+_LOCK_PATIENCE_S = 0.5
+
+
+class _Ended(Exception):
+    """The machine's time has come; says why."""
+
+
+class _Failed(Exception):
+    """The machine will never run; says why, beginning with the cause."""
+
+
+def main(arguments: list[str]) -> int:
+    """Run a machine until its end."""
+    folder = MachineFolder.at(Path(arguments[0]).absolute())
+    if folder is None or os.environ.get(processes.MACHINE) != str(folder.id):
+        print("error: this is started by the local cloud only", file=sys.stderr)
+        return 2
+    if not folder.exists:
+        return 0  # it was ended before it began
+    logging.basicConfig(
+        level=logging.INFO,
+        format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
+        datefmt="%Y-%m-%dT%H:%M:%S",
+    )
+    lock = disk.Lock(folder.path / folders.LOCK)
+    if not _acquire(lock):
+        return 0  # it runs already
+    if folder.end_at() == 0:
+        return 0
+    Machine(folder, folder.record()).run()
+    return 0
+
+
+def _acquire(lock: disk.Lock) -> bool:
+    """Take the machine's lock; whoever lists the machines may have it for a moment."""
+    deadline = time.monotonic() + _LOCK_PATIENCE_S
+    try:
+        while not lock.acquire(wait=False):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.01)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+class Machine:
+    """One machine's life. The caller holds its lock."""
+
+    def __init__(self, folder: MachineFolder, record: Record) -> None:
+        self._folder = folder
+        self._record = record
+        self._guard = 0
+        self._statuses: dict[int, int] = {}  # exit codes of children that have ended
+        self._signal = 0
+        self._next_tick = 0.0
+        self._log_checked = 0.0
+        self._seen_at = time.monotonic()
+        self._link_seen: tuple[int, int] | None = None
+        self._faults = faults.LinkFaults()
+        self._relay: Relay | None = None
+
+    def run(self) -> None:
+        """Live and die. Leaves a FAILED state behind if the machine could never run."""
+        self._say(State(MachinePhase.PROVISIONING, progress="booting"))
+        self._guard = guard.start(lambda: _end_the_rest(self._record))
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, self._on_signal)
+        try:
+            self._live()
+        except _Ended as ended:
+            log.info("machine_ended replica=%s reason=%r", self._folder.id.short, str(ended))
+        except _Failed as failed:
+            reason = str(failed)
+            log.error("machine_failed replica=%s reason=%r", self._folder.id.short, reason)
+            self._say(State(MachinePhase.FAILED, failure=reason))
+        finally:
+            processes.end_machine(str(self._folder.id), spare={self._guard})
+            sweep_shared_memory()
+
+    def _live(self) -> None:
+        id, placement = self._folder.id, self._record.placement
+        log.info("machine_boots replica=%s zone=%s", id.short, placement.location)
+        booted_at = time.monotonic() + self._record.boot_s
+        self._wait(lambda: time.monotonic() >= booted_at)
+        workdir = self._workdir()
+        self._set_up(workdir)
+        self._serve(workdir)
+
+    # -- setup ------------------------------------------------------------------------------
+
+    def _workdir(self) -> Path:
+        """Return where `setup` and `run` run: the pool's own folder, used in place."""
+        wanted = self._record.task.get("workdir")
+        if wanted is None:
+            workdir = self._folder.path / "workdir"
+            workdir.mkdir(exist_ok=True)
+            return workdir
+        if not isinstance(wanted, str) or not Path(wanted).is_dir():
+            raise _Failed(f"error: `workdir` is not a folder of this computer: {wanted}")
+        return Path(wanted)
+
+    def _set_up(self, workdir: Path) -> None:
+        for key in ("file_mounts", "volumes"):
+            if self._record.task.get(key):
+                log.warning("task_key_ignored key=%s reason='not made on the local cloud'", key)
+        command = self._record.task.get("setup")
+        if not command:
+            return
+        # One at a time in a folder: machines share it, and two builds in it would clash.
+        turn = disk.Lock(task_commands.turn_file(self._folder.path.parent.parent, workdir))
+        self._say(State(MachinePhase.PROVISIONING, progress="waiting for another's setup"))
+        self._wait(lambda: turn.acquire(wait=False))
+        self._say(State(MachinePhase.PROVISIONING, progress="setup"))
+        log.info("setup_started command=%r", command)
+        begin = machine_log.size(self._folder.log)
+        environ = task_commands.environment(self._record.task)
+        pid = self._spawn(["bash", "-c", str(command)], workdir, environ)
+        self._wait(lambda: pid in self._statuses)
+        turn.release()
+        code = self._statuses.pop(pid)
+        if code:
+            tail = machine_log.tail(self._folder.log, begin)
+            raise _Failed(f"setup: {_in_words(code)}\n{tail}".rstrip())
+        log.info("setup_done")
+
+    # -- serve ------------------------------------------------------------------------------
+
+    def _serve(self, workdir: Path) -> None:
+        domain = reserve_domain({task_commands.robot_domain()})
+        port = reserve_port()
+        if domain is None or port is None:
+            raise _Failed(f"error: no {'ROS domain' if domain is None else 'port'} is free here")
+        begin = machine_log.size(self._folder.log)
+        pid = self._start_server(workdir, domain, port)
+        endpoint = f"127.0.0.1:{port.number}"
+        if self._record.relay:
+            self._relay = Relay(("127.0.0.1", port.number))
+            endpoint = self._relay.endpoint
+        running = State(
+            MachinePhase.RUNNING,
+            endpoint=endpoint,
+            pids={"machine": os.getpid(), "guard": self._guard, "serve": pid},
+            domain_id=domain.number,
+        )
+        self._say(running)
+        log.info("machine_runs endpoint=%s domain=%d serve_pid=%d", endpoint, domain.number, pid)
+        self._wait(lambda: pid in self._statuses)
+        code = self._statuses.pop(pid)
+        if code > 0 and self._relay is not None and not self._relay.reached:
+            tail = machine_log.tail(self._folder.log, begin)
+            raise _Failed(f"error: serve {_in_words(code)}\n{tail}".rstrip())
+        raise _Ended(f"serve {_in_words(code)}")
+
+    def _start_server(self, workdir: Path, domain: Reservation, port: Reservation) -> int:
+        folder = self._folder.path
+        command = [
+            *self._record.serve,
+            *("--config", str(folder / "replica.yaml")),
+            *("--listen", f"127.0.0.1:{port.number}"),
+            *("--domain-id", str(domain.number)),
+            *("--workdir", str(workdir)),
+            *("--notice-file", str(folder / folders.NOTICE)),
+        ]
+        environ = {**os.environ, "ROS_DOMAIN_ID": str(domain.number)}
+        return self._spawn(command, folder, environ)
+
+    def _spawn(self, command: list[str], workdir: Path, environ: Mapping[str, str]) -> int:
+        try:
+            process = subprocess.Popen(
+                child.tied(command), cwd=workdir, env=environ, stdin=subprocess.DEVNULL
+            )
+        except OSError as error:
+            raise _Failed(f"error: `{command[0]}` cannot be started: {error}") from error
+        process.returncode = 0  # we wait for all children ourselves: see `_reap`
+        return process.pid
+
+    # -- the loop ---------------------------------------------------------------------------
+
+    def _wait(self, done: Callable[[], object]) -> None:
+        """Pass time, and bytes, until something is so. Raises `_Ended` when the end comes first."""
+        while True:
+            now = time.monotonic()
+            if now >= self._next_tick:
+                self._next_tick = now + TICK_S
+                self._tick(now)
+                if done():
+                    return
+            rest_s = max(0.0, self._next_tick - now)
+            if self._relay is None:
+                time.sleep(rest_s)
+            else:
+                self._relay.step(rest_s)
+
+    def _tick(self, now: float) -> None:
+        self._reap()
+        if self._signal:
+            raise _Ended(f"signal {signal.Signals(self._signal).name}")
+        if os.getppid() != self._guard:
+            raise _Ended("its guard was killed")
+        for reason, asked in (
+            ("preempted", self._folder.notice_at),
+            ("told to", self._folder.end_at),
+        ):
+            with contextlib.suppress(StateError):  # it is damaged: nobody of ours wrote it
+                at = asked()
+                if at is not None and time.time() >= at:
+                    raise _Ended(reason)
+        if self._folder.exists:
+            self._seen_at = now
+        elif now > self._seen_at + FOLDER_PATIENCE_S:
+            raise _Ended("its folder is gone")
+        self._look_at_link()
+        if now >= self._log_checked + 5:
+            self._log_checked = now
+            machine_log.bound(self._folder.log)
+
+    def _reap(self) -> None:
+        """Collect every child that ended, orphans that we inherited included."""
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if not pid:
+                return
+            self._statuses[pid] = os.waitstatus_to_exitcode(status)
+
+    def _look_at_link(self) -> None:
+        if self._relay is None:
+            return
+        path = self._folder.path / folders.LINK
+        try:
+            stat = path.stat()
+            mark = (stat.st_mtime_ns, stat.st_ino)
+        except OSError:
+            mark = None
+        if mark != self._link_seen:
+            self._link_seen = mark
+            try:
+                self._faults = faults.read_link(path)
+                log.info("link_changed faults=%s", self._faults)
+            except StateError as error:
+                log.warning("link_file_ignored reason=%r", error.message)
+        self._relay.set_faults(self._faults.at(time.time()))
+
+    def _say(self, state: State) -> None:
+        try:
+            self._folder.write_state(state)
+        except StateError as error:
+            if not self._folder.exists:
+                raise _Ended("its folder is gone") from error
+            log.error("state_not_written reason=%r", error.message)
+            raise
+
+    def _on_signal(self, number: int, _: object) -> None:
+        self._signal = number
+
+
+def _end_the_rest(record: Record) -> None:
+    processes.end_machine(str(record.id))
+    sweep_shared_memory()
+
+
+def _in_words(code: int) -> str:
+    return f"died of {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except FogftError as error:
+        print(f"error: {error.message}", file=sys.stderr)
+        sys.exit(1)

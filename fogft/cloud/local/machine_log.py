@@ -1,0 +1,39 @@
+"""The log of a machine: all output of it and of what runs on it, in one file that is bounded."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+LIMIT_BYTES = 64 << 20
+KEPT_BYTES = 4 << 20
+TAIL_LINES = 5
+_TAIL_BYTES = 4096
+
+
+def size(path: Path) -> int:
+    """Return how long a log is; 0 if there is none."""
+    return path.stat().st_size if path.exists() else 0
+
+
+def tail(path: Path, begin: int = 0) -> str:
+    """Return the last lines that were written to a log since it had a size."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(begin, size(path) - _TAIL_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return ""
+    return "\n".join(lines[-TAIL_LINES:])
+
+
+def bound(path: Path, limit_bytes: int = LIMIT_BYTES, kept_bytes: int = KEPT_BYTES) -> None:
+    """Keep only the end of a log that has grown too long. Its writers append, so they go on."""
+    if size(path) <= limit_bytes:
+        return
+    with path.open("r+b") as file:
+        file.seek(-kept_bytes, os.SEEK_END)
+        kept = file.read()
+        file.truncate(0)
+        file.seek(0)
+        file.write(b"log_shortened\n" + kept.partition(b"\n")[2])

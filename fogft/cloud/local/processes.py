@@ -1,0 +1,137 @@
+"""Find every process of a machine or a pool, and end it for sure.
+
+All of them carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in their environment, which
+``/proc`` shows as it was when they began, whatever session or parent they have since. A
+process that was started with a clean environment is found as a descendant of one that was not.
+
+Owns: /proc and signals. Not here: the folders of machines (`folder`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from fogft.core.errors import CloudUnreachable
+
+MACHINE = "FOGFT_MACHINE"
+POOL = "FOGFT_POOL_UID"
+
+_PROC = Path("/proc")
+_LIMIT_S = 10.0
+_POLL_S = 0.005
+
+
+def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
+    """Return the living processes of a pool, a machine, or any machine; never this one, sorted.
+
+    Args:
+        pool_uid: Only those of this pool.
+        machine: Only those of this machine (``str`` of its `ReplicaId`).
+    """
+    marks = [f"{MACHINE}={machine}".encode()] if machine else []
+    marks += [f"{POOL}={pool_uid}".encode()] if pool_uid else []
+    parents: dict[int, int] = {}
+    marked: set[int] = set()
+    for entry in os.listdir(_PROC):
+        if not entry.isdigit():
+            continue
+        try:
+            parent = _parent(entry)
+            environ = (_PROC / entry / "environ").read_bytes().split(b"\0")
+        except OSError:  # it has ended, or is another user's
+            continue
+        if parent is None:
+            continue
+        parents[int(entry)] = parent
+        if marks:
+            if all(mark in environ for mark in marks):
+                marked.add(int(entry))
+        elif any(item.startswith(f"{MACHINE}=".encode()) for item in environ):
+            marked.add(int(entry))
+    return sorted(_with_descendants(marked, parents) - {os.getpid()})
+
+
+def end(pids: Iterable[int], limit_s: float = _LIMIT_S) -> None:
+    """Kill processes (SIGKILL) and return when they are gone.
+
+    Raises:
+        CloudUnreachable: One hangs in the kernel, or belongs to another user.
+    """
+    left = set(pids)
+    send(left, signal.SIGKILL)
+    deadline = time.monotonic() + limit_s
+    while left := {pid for pid in left if alive(pid)}:
+        if time.monotonic() > deadline:
+            raise CloudUnreachable(
+                f"these processes do not end: {', '.join(map(str, sorted(left)))}",
+                "they belong to another user, or hang in the kernel",
+            )
+        time.sleep(_POLL_S)
+
+
+def end_machine(machine: str, *, spare: Collection[int] = ()) -> bool:
+    """End all processes of a machine but those to spare. Returns whether there were any.
+
+    Looks again until a look finds nothing, since what it kills may just have forked.
+
+    Raises:
+        CloudUnreachable: See `end`.
+    """
+    ended = False
+    while pids := set(find(machine=machine)) - set(spare):
+        end(pids)
+        ended = True
+    return ended
+
+
+def send(pids: Iterable[int], number: signal.Signals) -> None:
+    """Send a signal to processes; those that are gone meanwhile are fine."""
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, number)
+
+
+def alive(pid: int) -> bool:
+    """Return whether a process runs: it exists and is no zombie."""
+    try:
+        return _parent(str(pid)) is not None
+    except OSError:
+        return False
+
+
+def stopped(pid: int) -> bool:
+    """Return whether a process is stopped by SIGSTOP, or gone."""
+    try:
+        return _stat(str(pid))[0] in "TtZX"
+    except OSError:
+        return True
+
+
+def _parent(pid: str) -> int | None:
+    """Return a process's parent; None for a zombie."""
+    fields = _stat(pid)
+    return None if fields[0] in "ZX" else int(fields[1])
+
+
+def _stat(pid: str) -> list[str]:
+    # The second field, the program's name in parentheses, may hold anything.
+    return (_PROC / pid / "stat").read_text(errors="replace").rpartition(")")[2].split()
+
+
+def _with_descendants(roots: set[int], parents: dict[int, int]) -> set[int]:
+    children: dict[int, list[int]] = {}
+    for pid, parent in parents.items():
+        children.setdefault(parent, []).append(pid)
+    found: set[int] = set()
+    waiting = list(roots)
+    while waiting:
+        pid = waiting.pop()
+        if pid not in found:
+            found.add(pid)
+            waiting += children.get(pid, [])
+    return found

@@ -1,0 +1,97 @@
+"""Take a ROS domain and a TCP port that no other machine on this computer has.
+
+A reservation is an abstract socket name: the kernel gives it to one process, of whatever
+user, and takes it back when the process ends. What others use without asking us shows in
+the ports that are bound.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+# Above 101 the ports of a domain reach Linux's ephemeral ones. Robots' domains, chosen by
+# hand or by tests, tend to be 0 or high: the low half is tried first.
+LOW_DOMAINS = range(1, 60)
+HIGH_DOMAINS = range(60, 102)
+PORTS = range(20_000, 32_000)  # below Linux's ephemeral ones
+
+_FIRST_DDS_PORT = 7400
+_DDS_PORTS_PER_DOMAIN = 250
+
+
+@dataclass
+class Reservation:
+    """A number that is ours until `release` or the end of the process."""
+
+    number: int
+    _socket: socket.socket
+
+    def release(self) -> None:
+        """Give the number back. Repeatable."""
+        self._socket.close()
+
+
+def reserve_domain(not_these: Iterable[int] = ()) -> Reservation | None:
+    """Reserve a ROS domain id whose ports nobody has bound; None if there is none left.
+
+    Args:
+        not_these: Domains that are somebody else's, such as the robot's.
+    """
+    taken = set(not_these) | _domains_in_use()
+    low, high = list(LOW_DOMAINS), list(HIGH_DOMAINS)
+    random.shuffle(low)
+    random.shuffle(high)
+    for domain in (*low, *high):
+        if domain not in taken:
+            reservation = _reserve("ros-domain", domain)
+            if reservation is not None:
+                return reservation
+    return None
+
+
+def reserve_port() -> Reservation | None:
+    """Reserve a TCP port on which nobody listens; None if there is none left."""
+    for port in random.sample(PORTS, len(PORTS)):
+        reservation = _reserve("port", port)
+        if reservation is None:
+            continue
+        if _can_listen(port):
+            return reservation
+        reservation.release()
+    return None
+
+
+def _reserve(what: str, number: int) -> Reservation | None:
+    name = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        name.bind(f"\0fogft-{what}-{number}")
+    except OSError:
+        name.close()
+        return None
+    return Reservation(number, name)
+
+
+def _can_listen(port: int) -> bool:
+    with socket.socket() as attempt:
+        attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            attempt.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
+def _domains_in_use() -> set[int]:
+    """Return the domains of which some process has bound a UDP port."""
+    domains = set()
+    for table in ("/proc/net/udp", "/proc/net/udp6"):
+        with contextlib.suppress(OSError):
+            for line in Path(table).read_text().splitlines()[1:]:
+                port = int(line.split()[1].rpartition(":")[2], 16)
+                domains.add((port - _FIRST_DDS_PORT) // _DDS_PORTS_PER_DOMAIN)
+    return domains

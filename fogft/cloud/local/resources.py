@@ -1,0 +1,194 @@
+"""Which of the local cloud's offers meet a task's `resources`. Pure.
+
+Understands what decides where a machine may be and what it is: ``infra`` (or ``cloud``,
+``region``, ``zone``), ``any_of`` and ``ordered``, ``use_spot``, ``instance_type``, ``cpus``,
+``memory``, ``accelerators``. Other keys of SkyPilot's are accepted and do nothing here.
+
+A pool written for another cloud can be run here: ``aws/us-west-1`` then means the region of
+that name in the local cloud.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
+from fogft.core.errors import SpecError
+from fogft.core.model import Offer, Placement
+from fogft.core.spec_tree import nearest, shown
+
+CLOUDS = (
+    *(CLOUD, "*", "aws", "azure", "cudo", "do", "fluidstack", "gcp", "hyperbolic", "ibm", "lambda"),
+    *("nebius", "oci", "paperspace", "primeintellect", "runpod", "scp", "seeweb", "shadeform"),
+    *("vast", "verda", "vsphere"),
+)
+_PLACE_KEYS = ("infra", "cloud", "region", "zone")
+_MACHINE_KEYS = ("use_spot", "instance_type", "cpus", "memory", "accelerators")
+_IDLE_KEYS = (
+    *("accelerator_args", "autostop", "disk_size", "disk_tier", "ephemeral_storage", "hooks"),
+    *("image_id", "job_recovery", "labels", "local_disk", "max_hourly_cost", "network_tier"),
+    *("ports", "priority", "priority_class", "volumes"),
+)
+_KNOWN = (*_PLACE_KEYS, *_MACHINE_KEYS, *_IDLE_KEYS)
+_AMOUNT = re.compile(r"(\d+(?:\.\d+)?)(\+?)")
+_PER_CPU = re.compile(r"(\d+(?:\.\d+)?)x")
+_ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
+
+
+def offers(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
+    """Return one offer for each zone that can meet the resources, the cheapest first.
+
+    In each zone it is the cheapest instance that suffices. Where alternatives overlap the
+    cheapest counts.
+
+    Raises:
+        SpecError: They can never be met here; the message names the key.
+    """
+    best: dict[Placement, Offer] = {}
+    for where, entry in _alternatives(resources):
+        spot = _use_spot(where, entry)
+        instance = _instance(catalogue, where, entry, spot)
+        for zone in _zones(catalogue, where, entry):
+            price = instance.spot_usd_per_hour if spot else instance.usd_per_hour
+            placement = Placement(CLOUD, zone.region, zone.name, instance.name, spot)
+            best[placement] = Offer(placement, round(price * zone.price_factor, 4))
+    return sorted(best.values(), key=lambda offer: (offer.usd_per_hour, offer.placement))
+
+
+def _alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield each alternative, complete, with the path of its keys."""
+    base = {key: value for key, value in resources.items() if key not in ("any_of", "ordered")}
+    _check_keys("resources", base, ("any_of", "ordered"))
+    lists = [key for key in ("any_of", "ordered") if resources.get(key) is not None]
+    if len(lists) == 2:
+        raise SpecError("resources.ordered: cannot stand beside `any_of`", "keep one of them")
+    if not lists:
+        yield "resources", base
+        return
+    entries = resources[lists[0]]
+    path = f"resources.{lists[0]}"
+    if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
+        raise SpecError(f"{path}: must be a list", "write `[{infra: local/us-west-1}]`")
+    for index, entry in enumerate(entries):
+        where = f"{path}[{index}]"
+        if not isinstance(entry, Mapping):
+            what = f"{where}: must be a map, not {shown(entry)}"
+            raise SpecError(what, "write `{infra: local/us-west-1}`")
+        _check_keys(where, entry, ())
+        yield where, {**base, **entry}
+
+
+def _check_keys(where: str, entry: Mapping[str, Any], more: Sequence[str]) -> None:
+    for key in entry:
+        if key not in _KNOWN and key not in more and not str(key).startswith("_"):
+            hint = nearest(str(key), (*_KNOWN, *more))
+            raise SpecError(f"{where}.{shown(key)[1:-1]}: unknown key", hint)
+
+
+def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Zone]:
+    infra = entry.get("infra")
+    if infra is not None:
+        parts = [part.strip() for part in str(infra).split("/")]
+        if len(parts) > 3 or not all(parts):
+            what = f"{where}.infra: {shown(infra)} is not `cloud/region/zone`"
+            raise SpecError(what, "write a place such as `local/us-west-1`")
+        named = dict(zip(("cloud", "region", "zone"), parts, strict=False))
+        keys = dict.fromkeys(named, "infra")
+    else:
+        named = {key: str(entry[key]) for key in _PLACE_KEYS[1:] if entry.get(key) is not None}
+        keys = {key: key for key in named}
+    named = {key: name for key, name in named.items() if name != "*"}
+
+    cloud = named.get("cloud", CLOUD).lower()
+    if cloud not in CLOUDS:
+        what = f"{where}.{keys['cloud']}: there is no cloud {shown(cloud)}"
+        raise SpecError(what, nearest(cloud, CLOUDS))
+    region = named.get("region")
+    if region is not None and region not in catalogue.regions:
+        what = f"{where}.{keys['region']}: the local cloud has no region {shown(region)}"
+        raise SpecError(what, nearest(region, catalogue.regions))
+    there = [zone for zone in catalogue.zones if region in (None, zone.region)]
+    name = named.get("zone")
+    if name is None:
+        return there
+    # Other clouds' zones begin with their region: us-west-1a, us-west1-a.
+    found = [z for z in there if name in (z.name, z.region + z.name, f"{z.region}-{z.name}")]
+    if not found:
+        place = f"region `{region}`" if region else "the local cloud"
+        raise SpecError(
+            f"{where}.{keys['zone']}: {place} has no zone {shown(name)}",
+            nearest(name, {zone.name for zone in there}),
+        )
+    return found
+
+
+def _use_spot(where: str, entry: Mapping[str, Any]) -> bool:
+    spot = entry.get("use_spot")
+    if spot is not None and not isinstance(spot, bool):
+        what = f"{where}.use_spot: must be true or false, not {shown(spot)}"
+        raise SpecError(what, "write `use_spot: true`")
+    return bool(spot)
+
+
+def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: bool) -> Instance:
+    """Return the cheapest instance that suffices."""
+    named = entry.get("instance_type")
+    names = [instance.name for instance in catalogue.instances]
+    if named is not None and named not in names:
+        what = f"{where}.instance_type: the local cloud has no {shown(named)}"
+        hint = nearest(str(named), names)
+        raise SpecError(what, f"{hint}; or ask with `cpus: 4+` instead")
+    fitting = [i for i in catalogue.instances if named in (None, i.name)]
+    for key in ("accelerators", "cpus", "memory"):
+        if entry.get(key) is None:
+            continue
+        kept = [i for i in fitting if _suffices(where, key, entry[key], i)]
+        if not kept:
+            have = ", ".join(f"`{_amount_of(i, key)}`" for i in fitting)
+            raise SpecError(
+                f"{where}.{key}: the local cloud has no machine with {shown(entry[key])}",
+                f"there are: {have}; `regions.yaml` can add others" if have else "",
+            )
+        fitting = kept
+    return min(fitting, key=lambda i: (i.spot_usd_per_hour if spot else i.usd_per_hour, i.name))
+
+
+def _suffices(where: str, key: str, wanted: Any, instance: Instance) -> bool:
+    if key == "accelerators":
+        return any(
+            instance.accelerators.get(name, 0) >= count for name, count in _devices(where, wanted)
+        )
+    has = instance.cpus if key == "cpus" else instance.memory_gb
+    text = str(wanted).strip()
+    per_cpu = _PER_CPU.fullmatch(text) if key == "memory" else None
+    if per_cpu:
+        return has >= float(per_cpu[1]) * instance.cpus
+    match = _AMOUNT.fullmatch(text)
+    if isinstance(wanted, bool) or match is None or float(match[1]) <= 0:
+        what = f"{where}.{key}: {shown(wanted)} is not an amount"
+        raise SpecError(what, f"write `{key}: 8`, or `{key}: 8+` for at least 8")
+    return has >= float(match[1]) if match[2] else has == float(match[1])
+
+
+def _devices(where: str, wanted: Any) -> Iterator[tuple[str, float]]:
+    """Yield the alternatives of `accelerators`: ``L4``, ``L4:2``, ``{L4: 2}``, ``[L4, T4]``."""
+    if isinstance(wanted, Mapping):
+        items = [name if n is None else f"{name}:{n}" for name, n in wanted.items()]
+    else:
+        items = wanted if isinstance(wanted, list) else [wanted]
+    for item in items:
+        match = _ACCELERATOR.fullmatch(str(item).strip())
+        if match is None:
+            what = f"{where}.accelerators: {shown(item)} is not an accelerator"
+            raise SpecError(what, "write `accelerators: L4:1`")
+        yield match[1], float(match[2] or 1)
+
+
+def _amount_of(instance: Instance, key: str) -> str:
+    if key == "accelerators":
+        names = "+".join(f"{n}:{c:g}" for n, c in instance.accelerators.items())
+        return f"{instance.name} ({names or 'none'})"
+    amount = instance.cpus if key == "cpus" else instance.memory_gb
+    return f"{instance.name} ({amount:g})"

@@ -1,0 +1,35 @@
+"""What a machine needs to run a task's commands here: environment, domain, whose turn it is."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fogft.ros.environment import child_environment
+
+
+def environment(task: Mapping[str, Any]) -> dict[str, str]:
+    """Return the environment of `setup`: the user's own, with the task's variables."""
+    environ = child_environment(os.environ)
+    for key in ("envs", "secrets"):
+        values = task.get(key)
+        if isinstance(values, Mapping):
+            environ |= {str(k): "" if v is None else str(v) for k, v in values.items()}
+    return environ
+
+
+def robot_domain(environ: Mapping[str, str] = os.environ) -> int:
+    """Return the ROS domain of whoever launched the machine: a replica must not be in it."""
+    try:
+        return int(environ.get("ROS_DOMAIN_ID") or 0)
+    except ValueError:
+        return 0
+
+
+def turn_file(root: Path, workdir: Path) -> Path:
+    """Return the file whose lock a `setup` in a folder holds."""
+    name = hashlib.sha256(str(workdir.resolve()).encode()).hexdigest()[:16]
+    return root / f"setup-{name}.lock"

@@ -1,0 +1,126 @@
+"""What clouds tell a machine before they take it, read into one shape. Pure.
+
+| cloud | what is asked | how long before |
+|---|---|---|
+| AWS | ``spot/instance-action``, ``events/recommendations/rebalance`` | 2 min; earlier, or not |
+| GCP | ``instance/preempted`` | 30 s at most |
+| Azure | ``scheduledevents``, of type ``Preempt`` or ``Terminate`` | 30 s at least |
+
+Sources: the clouds' own pages on spot interruption notices, on the metadata values
+``instance/preempted``, and on Scheduled Events.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from email.utils import parsedate_to_datetime
+from enum import Enum
+from typing import Any
+
+
+class NoticeKind(str, Enum):
+    """What a machine was told."""
+
+    REBALANCE = "rebalance"  # a hint: it is more likely than before to be taken
+    PREEMPTION = "preemption"  # it will be taken
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A machine was told that it may have to go, or will.
+
+    Attributes:
+        at: When it ends, in seconds since the epoch; None when that was not said.
+        source: Who said so: ``aws``, ``gcp``, ``azure`` or ``file``.
+        detail: The words, for the log.
+    """
+
+    kind: NoticeKind
+    at: float | None
+    source: str
+    detail: str = ""
+
+
+def aws_action(body: str) -> Notice | None:
+    """Read ``spot/instance-action``. What cannot be read is a notice without a time.
+
+    The address exists only when there is one, so its very answer is the news.
+    """
+    value = _json(body)
+    action = value.get("action", "unknown") if isinstance(value, dict) else "unknown"
+    if action == "none":
+        return None
+    at = _iso(value.get("time")) if isinstance(value, dict) else None
+    return Notice(NoticeKind.PREEMPTION, at, "aws", f"spot instance action: {action}")
+
+
+def aws_rebalance(body: str) -> Notice | None:
+    """Read ``events/recommendations/rebalance``. Its time is that of the notice, not of an end."""
+    value = _json(body)
+    if not isinstance(value, dict) or "noticeTime" not in value:
+        return None
+    return Notice(NoticeKind.REBALANCE, None, "aws", f"rebalance, {value['noticeTime']}")
+
+
+def gcp_preempted(body: str) -> Notice | None:
+    """Read ``instance/preempted``: ``TRUE`` or ``FALSE``."""
+    if body.strip().upper() != "TRUE":
+        return None
+    return Notice(NoticeKind.PREEMPTION, None, "gcp", "instance preempted")
+
+
+def azure_events(body: str, machine: str) -> Notice | None:
+    """Read ``scheduledevents``: the events of all machines of a group.
+
+    Args:
+        body: The document.
+        machine: This machine's name; empty takes every event as its own.
+    """
+    value = _json(body)
+    events = value.get("Events") if isinstance(value, dict) else None
+    for event in events if isinstance(events, list) else ():
+        if not isinstance(event, dict) or event.get("EventType") not in ("Preempt", "Terminate"):
+            continue
+        if event.get("EventStatus") in ("Completed", "Canceled"):
+            continue
+        if machine and machine not in (event.get("Resources") or [machine]):
+            continue
+        at = _http_date(event.get("NotBefore"))
+        return Notice(NoticeKind.PREEMPTION, at, "azure", f"scheduled {event['EventType']}")
+    return None
+
+
+def file_notice(content: str) -> Notice:
+    """Read a notice file: ``{"action": "terminate" | "rebalance", "at": seconds}``.
+
+    That the file exists is the news; one that is empty or says something else is a preemption.
+    """
+    value = _json(content)
+    value = value if isinstance(value, dict) else {}
+    at = value.get("at")
+    kind = NoticeKind.REBALANCE if value.get("action") == "rebalance" else NoticeKind.PREEMPTION
+    return Notice(kind, float(at) if isinstance(at, (int, float)) else None, "file")
+
+
+def _json(body: str) -> Any:
+    try:
+        return json.loads(body)
+    except ValueError:
+        return None
+
+
+def _iso(text: Any) -> float | None:
+    try:
+        when = datetime.strptime(str(text), "%Y-%m-%dT%H:%M:%SZ")
+    except ValueError:
+        return None
+    return when.replace(tzinfo=timezone.utc).timestamp()
+
+
+def _http_date(text: Any) -> float | None:
+    try:
+        return parsedate_to_datetime(str(text)).timestamp()
+    except (ValueError, TypeError, IndexError):
+        return None

@@ -1,0 +1,91 @@
+"""The port to a cloud. Every implementation passes `tests/contract`.
+
+The cloud's own list is the record: machines carry the pool's uid, slot and generation,
+and nothing that lacks the uid is ever touched.
+
+Errors: `CloudUnreachable` when the cloud cannot tell, `NoCapacity` and `QuotaExceeded`
+where they are known at once; a launch that fails later is listed as FAILED.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+from fogft.core.model import Machine, Offer, Placement, ReplicaId
+
+
+@dataclass(frozen=True)
+class Launch:
+    """An order for one machine.
+
+    Attributes:
+        pool: The pool's name, for people.
+        task: The SkyPilot task of the pool file, without its `fogft` section.
+        files: What the machine needs to serve: file name -> content. Holds
+            ``replica.yaml``, ``ca.crt``, ``replica.crt`` and ``replica.key``; the
+            configuration names the others relative to its own folder. Kept 0600.
+    """
+
+    id: ReplicaId
+    pool: str
+    placement: Placement
+    usd_per_hour: float
+    spec_hash: str
+    task: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+class Cloud(Protocol):
+    """Where replicas run."""
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """List what can be bought for a task's `resources`.
+
+        Raises:
+            CloudUnreachable: Prices cannot be had now.
+            SpecError: The resources can never be met (message names the key).
+        """
+
+    def machines(self, pool_uid: str) -> Sequence[Machine]:
+        """List this pool's machines that exist now, in any phase, ordered by id.
+
+        Raises:
+            CloudUnreachable: It cannot tell; the caller must conclude nothing.
+        """
+
+    def launch(self, order: Launch) -> None:
+        """Order a machine; return before it runs. Repeating an id does nothing.
+
+        Once this has returned the machine is listed, though the caller may be killed.
+
+        Raises:
+            NoCapacity: The placement is full. Nothing was launched.
+            QuotaExceeded: The account may not have more. Nothing was launched.
+            CloudUnreachable: Unknown whether it was launched: look at `machines`.
+        """
+
+    def terminate(self, id: ReplicaId) -> None:
+        """End a machine and all that runs on it; return when it is gone. Repeatable.
+
+        Raises:
+            CloudUnreachable: Unknown whether it is gone.
+        """
+
+    def log(self, id: ReplicaId) -> str | None:
+        """Return the path of the machine's log on this computer, if it is kept here."""
+
+
+@runtime_checkable
+class Refreshing(Protocol):
+    """A cloud whose list is from memory, and may still show what is gone."""
+
+    def refresh(self, id: ReplicaId) -> None:
+        """Ask the provider about one machine, so that `machines` is true of it afterwards.
+
+        For a replica that stopped to answer probes. Takes seconds: not from the manager's loop.
+
+        Raises:
+            CloudUnreachable: It cannot tell; nothing has changed.
+        """

@@ -1,0 +1,27 @@
+"""Real clouds through SkyPilot's public SDK: one cluster a replica. See docs/design/sky.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fogft.cloud.sky.adapter import SkyCloud
+
+
+def make(folder: Path, base: Path) -> SkyCloud:
+    """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until it is asked.
+
+    Args:
+        folder: Where launches are remembered, for all pools of this user.
+        base: Folder of the pool file: relative paths in it start there.
+    """
+    import getpass
+    import socket
+
+    from fogft.cloud.sky.adapter import SkyCloud
+    from fogft.cloud.sky.aws import Aws
+    from fogft.cloud.sky.installed import InstalledSky
+
+    owner = f"{getpass.getuser()}-{socket.gethostname()}"
+    return SkyCloud(folder, InstalledSky(), [Aws()], owner=owner, base=base)

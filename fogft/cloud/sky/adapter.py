@@ -1,0 +1,274 @@
+"""Replicas on real clouds: `fogft.cloud.port.Cloud` through SkyPilot. See docs/design/sky.md.
+
+Owns: the order of steps of each call, and the threads that follow launches.
+Not here: each step's own module: `task`, `journal`, `following`, `ending`, `presence`, `prices`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.port import Launch
+from fogft.cloud.sky import listing, task, template, wheel
+from fogft.cloud.sky.census import Census
+from fogft.cloud.sky.ending import Ending
+from fogft.cloud.sky.failures import Cause, classify
+from fogft.cloud.sky.following import DEFAULT_LIMITS, UNDER_WAY, Following, Limits
+from fogft.cloud.sky.journal import Entry, Journal, Stage
+from fogft.cloud.sky.naming import OWNER, cluster_name, label_value, replica_of
+from fogft.cloud.sky.presence import Presence
+from fogft.cloud.sky.prices import Prices
+from fogft.cloud.sky.provider import Provider
+from fogft.cloud.sky.sdk import RefusedError, Sky
+from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
+from fogft.core.model import Machine, Offer, ReplicaId
+from fogft.disk import write_whole
+
+log = logging.getLogger(__name__)
+
+_ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
+_LOG_LINES = 1000
+
+
+def on_thread(run: Callable[[], None]) -> None:
+    """Run a function on a thread that does not keep the process alive."""
+    threading.Thread(target=run, name="sky", daemon=True).start()
+
+
+def each_second(step: Callable[[], bool]) -> None:
+    """Call a function each second, on a thread of its own, until it returns False."""
+
+    def run() -> None:
+        while step():
+            time.sleep(1.0)
+
+    threading.Thread(target=run, name="sky-follow", daemon=True).start()
+
+
+class SkyCloud:
+    """Real clouds. Implements `fogft.cloud.port.Cloud` and `Refreshing`.
+
+    Args:
+        folder: Where it remembers its launches, for all pools of this user.
+        sky: SkyPilot.
+        providers: Clouds that can be asked directly.
+        owner: Whose machines these are, for their labels.
+        base: Folder that relative paths of the pool file start from.
+        clock: Seconds since the epoch.
+        submit: Runs a function on another thread.
+        repeat: Calls a function every so often on another thread, until it returns False.
+        sleep: Waits some seconds.
+        limits: When a launch hangs.
+        make_wheel: Puts fogft's wheel into a folder below the one given, and returns that.
+        port: Where server proxies listen.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        sky: Sky,
+        providers: Sequence[Provider] = (),
+        *,
+        owner: str,
+        base: Path,
+        clock: Callable[[], float] = time.time,
+        submit: Callable[[Callable[[], None]], object] = on_thread,
+        repeat: Callable[[Callable[[], bool]], object] = each_second,
+        sleep: Callable[[float], object] = time.sleep,
+        limits: Limits = DEFAULT_LIMITS,
+        make_wheel: Callable[[Path], Path] = wheel.make,
+        port: int = task.LINK_PORT,
+    ) -> None:
+        self._folder = folder
+        self._sky = sky
+        self._owner = owner
+        self._base = base
+        self._clock = clock
+        self._repeat = repeat
+        self._make_wheel = make_wheel
+        self._port = port
+        by_name = {provider.cloud: provider for provider in providers}
+        self._journal = Journal(folder / "launches")
+        self._census = Census(by_name, clock, submit)
+        self._presence = Presence(
+            sky, self._journal, self._census, clock=clock, submit=submit, port=port
+        )
+        self._ending = Ending(sky, self._journal, by_name, sleep=sleep, clock=clock)
+        self._following = Following(
+            sky,
+            self._journal,
+            self._ending,
+            clock=clock,
+            on_move=self._presence.forget,
+            limits=limits,
+        )
+        self._prices = Prices(sky, by_name, clock, submit)
+        self._lock = threading.Lock()
+        self._followed: set[ReplicaId] = set()
+        self._closed = threading.Event()
+
+    # -- the port -------------------------------------------------------------------------
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """See `Cloud`. Of each location the cheapest machine that SkyPilot would choose."""
+        task.refuse_what_cannot_be_honoured({"resources": resources})
+        return self._prices.offers(resources)
+
+    def machines(self, pool_uid: str) -> Sequence[Machine]:
+        """See `Cloud`. Costs one question to SkyPilot's memory; no cloud is asked, as a rule."""
+        entries = self._journal.entries(pool_uid)
+        machines = self._presence.machines(pool_uid, entries, self._prices.regions)
+        for entry in entries:
+            if entry.stage in UNDER_WAY:
+                self._follow(entry.id)
+        return machines
+
+    def launch(self, order: Launch) -> None:
+        """See `Cloud`. Returns when SkyPilot has accepted the order: seconds.
+
+        Raises:
+            SpecError: The pool file asks for what cannot be honoured. Nothing was launched.
+            CloudError: SkyPilot refuses the task. Nothing was launched.
+        """
+        made = task.build(
+            order,
+            template.read(),
+            files=self._journal.files(order.id),
+            wheel=self._make_wheel(self._folder / "wheels"),
+            owner=self._owner,
+            base=self._base,
+            port=self._port,
+        )
+        begun = Entry(order.id, order.placement, order.usd_per_hour, order.spec_hash, self._clock())
+        if not self._journal.open(begun, order.files):
+            return
+        try:
+            request = self._sky.launch(made, cluster_name(order.id))
+        except RefusedError as error:
+            self._journal.close(order.id)
+            raise _refusal(error, order) from error
+        except CloudUnreachable:
+            self._follow(order.id)
+            raise
+        entry = self._journal.update(order.id, stage=Stage.LAUNCHING, request=request)
+        if entry is None or entry.stage is Stage.ENDING:  # ended meanwhile, by another process
+            self._ending.end(order.id)
+            return
+        self._follow(order.id)
+
+    def terminate(self, id: ReplicaId) -> None:
+        """See `Cloud`. Returns when SkyPilot, and the provider where it can be asked, agree."""
+        self._journal.update(id, stage=Stage.ENDING)
+        try:
+            self._ending.end(id)
+        finally:
+            self._presence.forget()
+        self._journal.close(id)
+        self._census.forget(id)
+
+    def log(self, id: ReplicaId) -> str | None:
+        """See `Cloud`. Fetches the end of the log from the machine first; takes seconds."""
+        entry = self._journal.get(id)
+        name = cluster_name(id)
+        told = ""
+        if entry is None or entry.stage in _ON_THE_MACHINE:
+            told = self._sky.job_log(name, entry.job if entry else None, _LOG_LINES)
+        if not told and entry is not None:
+            told = self._sky.provision_log(name, _LOG_LINES)
+        path = self._journal.provision_log(id)
+        if told:
+            write_whole(path, told, durable=False)
+        return str(path) if path.exists() else None
+
+    # -- beyond the port --------------------------------------------------------------------
+
+    def refresh(self, id: ReplicaId) -> None:
+        """Ask the cloud about one machine, so that `machines` is true of it: a second or two.
+
+        For a replica that stopped to answer: SkyPilot's memory of it may be old. The provider
+        is asked where it can be, since SkyPilot's own refresh waits its turn behind others.
+
+        Raises:
+            CloudUnreachable: It cannot tell.
+        """
+        self._presence.refresh(id)
+
+    def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
+        """Test credentials: cloud -> empty, or what is wrong and what to do about it.
+
+        Raises:
+            CloudUnreachable: SkyPilot does not answer.
+        """
+        return self._sky.check(clouds)
+
+    def unverified(self, cloud: str) -> str:
+        """Return why what exists in a cloud is SkyPilot's word alone; empty when it is not."""
+        return self._census.unverified(cloud)
+
+    def sweep(self) -> Sequence[Machine]:
+        """List every machine of this user's pools, whatever became of the pool. Takes seconds.
+
+        Raises:
+            CloudUnreachable: It cannot tell.
+        """
+        uids = {entry.id.pool_uid for entry in self._journal.entries()}
+        for cluster in self._presence.everywhere():
+            id = replica_of(cluster.name)
+            if id is not None and self._mine(cluster.labels):
+                uids.add(id.pool_uid)
+        machines = {m.id: m for uid in sorted(uids) for m in self.machines(uid)}
+        for instance in self._census.everything():
+            if self._mine(instance.labels):
+                machines.setdefault(instance.id, listing.of_instance(instance))
+        return [machines[id] for id in sorted(machines)]
+
+    def close(self) -> None:
+        """Stop to follow launches; they go on. Repeatable."""
+        self._closed.set()
+
+    def _mine(self, labels: Mapping[str, str]) -> bool:
+        return labels.get(OWNER, label_value(self._owner)) == label_value(self._owner)
+
+    # -- launches under way -------------------------------------------------------------------
+
+    def _follow(self, id: ReplicaId) -> None:
+        with self._lock:
+            if id in self._followed or self._closed.is_set():
+                return
+            self._followed.add(id)
+        self._repeat(lambda: self._step(id))
+
+    def _step(self, id: ReplicaId) -> bool:
+        more = True
+        try:
+            more = not self._closed.is_set() and self._following.step(id)
+        except CloudUnreachable as error:
+            log.warning("launch_unknown replica=%s reason=%r", id.short, error.message)
+        except CloudError as error:  # an answer that no step expects; the limits end it
+            log.warning("launch_unclear replica=%s reason=%r", id.short, error.message)
+        except StateError:  # the journal cannot be read: `machines` says so to the user
+            more = False
+        finally:
+            if not more:
+                self._presence.forget()
+                with self._lock:
+                    self._followed.discard(id)
+        return more
+
+
+def _refusal(error: RefusedError, order: Launch) -> CloudError:
+    failure = classify(error.kind, error.texts)
+    where = f"`{order.placement.location}`"
+    if failure.cause is Cause.CAPACITY:
+        return NoCapacity(f"no capacity in {where}: {failure.words}")
+    if failure.cause is Cause.QUOTA:
+        return QuotaExceeded(
+            f"the account's quota is used up in {where}: {failure.words}",
+            "ask the cloud for a higher quota, or name other regions",
+        )
+    return CloudError(f"SkyPilot refuses to launch in {where}: {failure.words}")

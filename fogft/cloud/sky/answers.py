@@ -1,0 +1,126 @@
+"""SkyPilot's answers and errors as ours: records, reasons, and what an exception means. Pure.
+
+The line that matters: "nobody knows" (the API server, the network, the credentials) against
+"the answer is no". From the first nothing may be concluded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from fogft.cloud.sky.failures import plain
+from fogft.cloud.sky.sdk import Cluster, ClusterState, JobState, RefusedError, Request, RequestState
+from fogft.core.errors import CloudError, CloudUnreachable
+from fogft.core.model import Placement
+
+# Their meaning is "nobody knows": the server, the network or the credentials, not the cluster.
+_UNKNOWN = frozenset(
+    (
+        *("ApiServerConnectionError", "ApiServerAuthenticationError", "APIVersionMismatchError"),
+        *("ServerTemporarilyUnavailableError", "RequestInterruptedError", "NetworkError"),
+        *("ClusterStatusFetchingError", "FetchClusterInfoError", "KubeAPIUnreachableError"),
+        *("ConcurrentWorkerExhaustedError", "ExecutionRetryableError", "ExecutionPoolFullError"),
+        *("SkyletUnavailableError", "CloudUserIdentityError", "InvalidCloudCredentials"),
+        *("NoCloudAccessError", "CloudError"),
+        *("ConnectionError", "ConnectTimeout", "ReadTimeout", "Timeout", "TimeoutError"),
+        *("HTTPError", "ChunkedEncodingError"),
+    )
+)
+_STATES = {"SUCCEEDED": RequestState.SUCCEEDED, "FAILED": RequestState.FAILED,
+           "CANCELLED": RequestState.CANCELLED}  # fmt: skip
+JOBS = {
+    "INIT": JobState.PENDING, "PENDING": JobState.PENDING, "SETTING_UP": JobState.SETTING_UP,
+    "RUNNING": JobState.RUNNING, "FAILED_SETUP": JobState.SETUP_FAILED,
+}  # fmt: skip
+
+
+def translated(error: BaseException, subject: str) -> CloudError:
+    """Return what an exception out of SkyPilot means: `CloudUnreachable` or `RefusedError`."""
+    if isinstance(error, CloudError):
+        return error
+    kind = type(error).__name__
+    words = plain(str(error)) or kind
+    if kind in _UNKNOWN or isinstance(error, OSError) or _server_lost(error):
+        return CloudUnreachable(f"SkyPilot cannot tell about {subject}: {words}", _hint(kind))
+    return RefusedError(kind, _texts(error))
+
+
+def _server_lost(error: BaseException) -> bool:
+    """Whether a bare RuntimeError speaks of the API server, as SkyPilot's `get` words it."""
+    return type(error) is RuntimeError and str(error).startswith(
+        ("Failed to get request", "Failed to connect", "SkyPilot API server")
+    )
+
+
+@contextlib.contextmanager
+def as_answer() -> Iterator[None]:
+    """Take an exception as SkyPilot's answer, except those that say nothing is known."""
+    try:
+        yield
+    except Exception as error:
+        kind = type(error).__name__
+        said_by_server = kind in ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
+                                  "InvalidCloudCredentials")  # fmt: skip
+        if not said_by_server and (kind in _UNKNOWN or isinstance(error, OSError)):
+            raise
+        if _server_lost(error):
+            raise
+        raise RefusedError(kind, _texts(error)) from error
+
+
+def _texts(error: BaseException) -> list[str]:
+    history = getattr(error, "failover_history", None) or []
+    return [plain(str(text)) for text in (error, *history)]
+
+
+def _hint(kind: str) -> str:
+    if kind in ("CloudUserIdentityError", "InvalidCloudCredentials", "NoCloudAccessError"):
+        return "renew the credentials of this cloud; `sky check` tests them"
+    return "`sky api info` and `sky check` tell what is wrong"
+
+
+def cluster_of(record: Any) -> Cluster:
+    """Return a `StatusResponse` of SkyPilot's as our record."""
+    state = getattr(record.status, "value", str(record.status))
+    chosen = getattr(record.handle, "launched_resources", None)
+    placement = None
+    if chosen is not None and chosen.cloud is not None and chosen.region is not None:
+        placement = Placement(
+            str(chosen.cloud).lower(),
+            chosen.region,
+            chosen.zone or "",
+            chosen.instance_type or "",
+            bool(chosen.use_spot),
+        )
+    return Cluster(
+        name=record.name,
+        state=ClusterState(state) if state in ClusterState.__members__ else ClusterState.OTHER,
+        placement=placement,
+        head_ip=getattr(record.handle, "head_ip", None) or "",
+        launched_at=float(record.launched_at or 0.0),
+        progress=plain(record.init_status_reason or record.last_event or ""),
+        labels=dict(record.labels or getattr(chosen, "labels", None) or {}),
+    )
+
+
+def request_of(payload: Any) -> Request:
+    """Return a `RequestPayload` of SkyPilot's as our record."""
+    state = _STATES.get(payload.status, RequestState.ACTIVE)
+    return Request(payload.request_id, state, plain(payload.status_msg or ""))
+
+
+def told_reasons(output: str) -> dict[str, str]:
+    """Return cloud -> reason, out of what ``sky check`` prints of clouds that do not work."""
+    reasons: dict[str, str] = {}
+    cloud = ""
+    for line in map(plain, output.splitlines()):
+        heading = re.fullmatch(r"(\w[\w ]*): (enabled|disabled).*", line)
+        if heading:
+            cloud = heading[1].lower() if heading[2] == "disabled" else ""
+        elif cloud and line:
+            text = re.sub(r"^Reason \[[^]]*\]: ", "", line)
+            reasons[cloud] = " ".join(part for part in (reasons.get(cloud, ""), text) if part)
+    return reasons

@@ -1,0 +1,166 @@
+"""AWS by its own interface (boto3, which comes with SkyPilot's AWS support). See `provider`.
+
+Only `describe` calls, and `TerminateInstances` on instances whose tags were just read and are
+ours. Credentials and regions come from the same places as SkyPilot's.
+"""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import importlib
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from fogft.cloud.sky import naming
+from fogft.cloud.sky.failures import Cause, classify
+from fogft.cloud.sky.provider import Instance, NotAllowedError
+from fogft.core.errors import CloudUnreachable
+from fogft.core.model import Placement
+
+T = TypeVar("T")
+
+_ALIVE = ["pending", "running", "stopping", "stopped"]  # a stopped one's disk still costs
+_FORBIDDEN = ("UnauthorizedOperation", "AccessDenied", "AccessDeniedException")
+_HOME = "us-east-1"  # any region lists the others
+
+
+class Aws:
+    """See `fogft.cloud.sky.provider.Provider`."""
+
+    cloud = "aws"
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._session: Any = None
+        self._clients: dict[str, Any] = {}
+
+    def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
+        """See `Provider`. Regions are asked side by side."""
+        where = sorted(set(self._regions() if regions is None else regions))
+        if not where:
+            return []
+        with ThreadPoolExecutor(min(8, len(where)), "aws") as pool:
+            found = pool.map(lambda region: self._instances_in(region, pool_uid), where)
+            return sorted((i for part in found for i in part), key=lambda i: (i.id, i.key))
+
+    def terminate(self, instances: Iterable[Instance]) -> None:
+        """See `Provider`."""
+        by_region: dict[str, list[str]] = {}
+        for instance in instances:
+            by_region.setdefault(instance.placement.region, []).append(instance.key)
+        for region, keys in by_region.items():
+            for key in keys:  # one by one: a single unknown key fails a whole call
+                self._ask(region, functools.partial(_terminate, key))
+
+    def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
+        """See `Provider`."""
+        now = datetime.datetime.now(datetime.timezone.utc)
+
+        def prices(ec2: Any) -> dict[tuple[str, str], float]:
+            pages = ec2.get_paginator("describe_spot_price_history").paginate(
+                InstanceTypes=sorted(set(instances)),
+                ProductDescriptions=["Linux/UNIX"],
+                StartTime=now,  # the one price in force now, of each zone
+            )
+            found = [entry for page in pages for entry in page["SpotPriceHistory"]]
+            found.sort(key=lambda entry: entry["Timestamp"])
+            return {
+                (p["AvailabilityZone"], p["InstanceType"]): float(p["SpotPrice"]) for p in found
+            }
+
+        return self._ask(region, prices)
+
+    def _instances_in(self, region: str, pool_uid: str) -> list[Instance]:
+        ours = (
+            {"Name": f"tag:{naming.POOL}", "Values": [pool_uid]}
+            if pool_uid
+            else {"Name": "tag-key", "Values": [naming.POOL]}
+        )
+
+        def instances(ec2: Any) -> list[Instance]:
+            pages = ec2.get_paginator("describe_instances").paginate(
+                Filters=[ours, {"Name": "instance-state-name", "Values": _ALIVE}]
+            )
+            found = (
+                _instance(region, raw)
+                for page in pages
+                for reservation in page["Reservations"]
+                for raw in reservation["Instances"]
+            )
+            return [instance for instance in found if instance is not None]
+
+        return self._ask(region, instances)
+
+    def _regions(self) -> list[str]:
+        def regions(ec2: Any) -> list[str]:
+            return [str(region["RegionName"]) for region in ec2.describe_regions()["Regions"]]
+
+        return self._ask(_HOME, regions)
+
+    def _client(self, region: str) -> Any:
+        """Return a region's client: safe to share, unlike sessions, and each costs megabytes."""
+        with self._lock:
+            if region not in self._clients:
+                if self._session is None:
+                    self._session = importlib.import_module("boto3").session.Session()
+                config = importlib.import_module("botocore.config").Config(
+                    connect_timeout=5,
+                    read_timeout=10,
+                    retries={"max_attempts": 2, "mode": "standard"},
+                )
+                self._clients[region] = self._session.client(
+                    "ec2", region_name=region, config=config
+                )
+            return self._clients[region]
+
+    def _ask(self, region: str, call: Callable[[Any], T]) -> T:
+        try:
+            return call(self._client(region))
+        except ImportError as error:
+            raise NotAllowedError("boto3 is not installed") from error
+        except Exception as error:
+            told = getattr(error, "response", None) or {}
+            code = str(told.get("Error", {}).get("Code", "")) or type(error).__name__
+            if code in _FORBIDDEN or code == "NoCredentialsError":
+                raise NotAllowedError(f"{code}: {error}") from error
+            hint = ""
+            if classify(code, [str(error)]).cause is Cause.CREDENTIALS:
+                with self._lock:  # renewed ones are read by a new session only
+                    self._session = None
+                    self._clients.clear()
+                hint = "renew the AWS credentials; `sky check aws` tests them"
+            raise CloudUnreachable(f"AWS cannot tell about `{region}`: {error}", hint) from error
+
+
+def _terminate(key: str, ec2: Any) -> None:
+    try:
+        ec2.terminate_instances(InstanceIds=[key])
+    except Exception as error:
+        if "InvalidInstanceID.NotFound" not in str(error):
+            raise
+
+
+def _instance(region: str, raw: Mapping[str, Any]) -> Instance | None:
+    labels = {tag["Key"]: tag["Value"] for tag in raw.get("Tags", ())}
+    id = naming.replica_of_labels(labels)
+    if id is None:
+        return None
+    placement = Placement(
+        "aws",
+        region,
+        raw.get("Placement", {}).get("AvailabilityZone", ""),
+        raw.get("InstanceType", ""),
+        raw.get("InstanceLifecycle") == "spot",
+    )
+    launched = raw.get("LaunchTime")
+    return Instance(
+        id=id,
+        key=raw["InstanceId"],
+        placement=placement,
+        labels=labels,
+        public_ip=raw.get("PublicIpAddress", ""),
+        launched_at=launched.timestamp() if launched else 0.0,
+    )

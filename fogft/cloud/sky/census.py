@@ -1,0 +1,126 @@
+"""Ask the providers: is what SkyPilot no longer lists really gone, and what else is there?
+
+Owns: when a provider is asked, and what it said last.
+Not here: the providers' interfaces (`provider`, `aws`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from fogft.cloud.sky.journal import Entry
+from fogft.cloud.sky.provider import Instance, NotAllowedError, Provider
+from fogft.core.errors import CloudUnreachable
+from fogft.core.model import ReplicaId
+
+log = logging.getLogger(__name__)
+
+EVERY_S = 60.0
+
+
+class Census:
+    """What providers list with our labels.
+
+    Args:
+        providers: Clouds that can be asked directly, by name.
+        clock: Seconds since the epoch.
+        submit: Runs a function on another thread.
+    """
+
+    def __init__(
+        self,
+        providers: Mapping[str, Provider],
+        clock: Callable[[], float],
+        submit: Callable[[Callable[[], None]], object],
+    ) -> None:
+        self._providers = providers
+        self._clock = clock
+        self._submit = submit
+        self._lock = threading.Lock()
+        self._found: dict[str, tuple[Instance, ...]] = {}
+        self._begun_at: dict[str, float] = {}
+        self._refused: dict[str, str] = {}
+
+    def alive(self, entry: Entry) -> Instance | None:
+        """Return the instance of a replica that SkyPilot does not list; None when it is gone.
+
+        Where the provider cannot be asked, SkyPilot's word has to do.
+
+        Raises:
+            CloudUnreachable: The provider could be asked, and did not answer.
+        """
+        provider = self._providers.get(entry.placement.cloud)
+        if provider is None:
+            return None
+        found = self._ask(provider, [entry.placement.region], entry.id.pool_uid)
+        return next((instance for instance in found if instance.id == entry.id), None)
+
+    def vouches(self, cloud: str) -> bool:
+        """Whether a cloud's own list can be had, as far as is known."""
+        return cloud in self._providers and cloud not in self._refused
+
+    def latest(self, pool_uid: str, regions: Mapping[str, Iterable[str]]) -> Sequence[Instance]:
+        """Return what the last census of a pool found, and take another when it is old.
+
+        The first one looks everywhere, later ones where machines of the pool can be, if
+        that is known.
+        """
+        now = self._clock()
+        with self._lock:
+            begun_at = self._begun_at.get(pool_uid)
+            due = begun_at is None or now - begun_at >= EVERY_S
+            if due:
+                self._begun_at[pool_uid] = now
+            found = self._found.get(pool_uid, ())
+        if due and self._providers:
+            everywhere = begun_at is None
+            where = {cloud: sorted(names) for cloud, names in regions.items()}
+            self._submit(lambda: self._take(pool_uid, None if everywhere else where))
+        return found
+
+    def everything(self) -> Sequence[Instance]:
+        """Return what carries our labels anywhere, of any pool. Takes seconds.
+
+        Raises:
+            CloudUnreachable: A provider did not answer.
+        """
+        return [i for provider in self._providers.values() for i in self._ask(provider, None, "")]
+
+    def forget(self, id: ReplicaId) -> None:
+        """Take a replica that is known to be gone out of the last census."""
+        with self._lock:
+            kept = self._found.get(id.pool_uid, ())
+            self._found[id.pool_uid] = tuple(i for i in kept if i.id != id)
+
+    def unverified(self, cloud: str) -> str:
+        """Return why a cloud is not asked directly; empty when it is."""
+        if cloud not in self._providers:
+            return f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word"
+        return self._refused.get(cloud, "")
+
+    def _take(self, pool_uid: str, regions: Mapping[str, Sequence[str]] | None) -> None:
+        found: list[Instance] = []
+        for cloud, provider in self._providers.items():
+            try:
+                where = None if regions is None else regions.get(cloud)
+                found += self._ask(provider, where, pool_uid)
+            except CloudUnreachable as error:
+                log.warning("census_failed cloud=%s reason=%r", cloud, error.message)
+                return
+        with self._lock:
+            self._found[pool_uid] = tuple(found)
+
+    def _ask(
+        self, provider: Provider, regions: Iterable[str] | None, pool_uid: str
+    ) -> Sequence[Instance]:
+        try:
+            found = provider.instances(regions, pool_uid)
+        except NotAllowedError as error:
+            if provider.cloud not in self._refused:
+                log.warning("census_not_allowed cloud=%s reason=%r", provider.cloud, str(error))
+            self._refused[provider.cloud] = f"this account may not list machines: {error}"
+            return []
+        self._refused.pop(provider.cloud, None)
+        return found

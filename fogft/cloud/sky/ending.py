@@ -1,0 +1,118 @@
+"""End a replica for certain: abort its launch, take it down, and look whether it is gone.
+
+"Down" that returned without an error is not believed. SkyPilot's list is read again with a
+refresh from the cloud, and the provider is asked itself where it can be. What SkyPilot has
+forgotten is ended through the provider, by its labels.
+
+Owns: the order of these steps.
+Not here: which replicas shall end (`fogft.core.planner`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+
+from fogft.cloud.sky.journal import Journal
+from fogft.cloud.sky.naming import cluster_name
+from fogft.cloud.sky.provider import Instance, NotAllowedError, Provider
+from fogft.cloud.sky.sdk import RefusedError, RequestState, Sky
+from fogft.core.errors import CloudError, CloudUnreachable
+from fogft.core.model import ReplicaId
+
+log = logging.getLogger(__name__)
+
+_TRIES = 5
+_PAUSE_S = 3.0
+_LIMIT_S = 300.0  # no further try after that
+
+
+class Ending:
+    """Ends replicas.
+
+    Args:
+        sky: SkyPilot.
+        journal: What was launched.
+        providers: Clouds that can be asked directly, by name.
+        sleep: Waits some seconds.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(
+        self,
+        sky: Sky,
+        journal: Journal,
+        providers: Mapping[str, Provider],
+        *,
+        sleep: Callable[[float], object],
+        clock: Callable[[], float],
+    ) -> None:
+        self._sky = sky
+        self._journal = journal
+        self._providers = providers
+        self._sleep = sleep
+        self._clock = clock
+
+    def end(self, id: ReplicaId) -> None:
+        """End a replica's machine; return when nothing of it is left. Repeatable.
+
+        The journal's entry stays, for whoever wants to know why.
+
+        Raises:
+            CloudUnreachable: Something may still run; the hint says how to look.
+        """
+        name = cluster_name(id)
+        trouble: Exception | None = None
+        begun_at = self._clock()
+        for attempt in range(_TRIES):
+            if attempt and self._clock() - begun_at > _LIMIT_S:
+                break
+            if attempt:
+                self._sleep(_PAUSE_S)
+            try:
+                self._abort_launches(name)
+                self._sky.down(name)
+                left = self._left(id, name)
+            except (CloudUnreachable, RefusedError) as error:
+                trouble = error
+                log.warning("end_failed replica=%s reason=%r", id.short, str(error))
+                continue
+            if not left:
+                return
+            trouble = CloudError(f"still there: {', '.join(left)}")
+        raise CloudUnreachable(
+            f"`{name}` may still run: {trouble}",
+            f"look with `sky status --refresh {name}`, end it with `sky down {name}`, and check "
+            f"the cloud's console for machines with the label `fogft-pool={id.pool_uid}`",
+        ) from trouble
+
+    def _abort_launches(self, name: str) -> None:
+        for request in self._sky.launches(name):
+            if request.state is RequestState.ACTIVE:
+                self._sky.cancel(request.id)
+
+    def _left(self, id: ReplicaId, name: str) -> list[str]:
+        """Return what still exists; ask the provider to end what SkyPilot did not."""
+        clusters = self._sky.clusters(name, refresh=True)
+        left = [f"cluster {c.name} ({c.state.value})" for c in clusters if c.name == name]
+        for instance in self._instances(id):
+            left.append(f"{instance.placement.cloud} instance {instance.key}")
+            try:
+                self._providers[instance.placement.cloud].terminate([instance])
+            except NotAllowedError as error:
+                raise CloudUnreachable(f"{instance.key} may not be ended: {error}") from error
+        return left
+
+    def _instances(self, id: ReplicaId) -> list[Instance]:
+        entry = self._journal.get(id)
+        out: list[Instance] = []
+        for cloud, provider in self._providers.items():
+            if entry is not None and entry.placement.cloud != cloud:
+                continue
+            regions = None if entry is None else [entry.placement.region]
+            try:
+                found: Sequence[Instance] = provider.instances(regions, id.pool_uid)
+            except NotAllowedError:
+                continue  # SkyPilot's word has to do
+            out += [instance for instance in found if instance.id == id]
+        return out

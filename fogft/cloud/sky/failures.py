@@ -1,0 +1,113 @@
+"""What a failed launch means: capacity, quota, credentials, setup, timeout or error. Pure.
+
+SkyPilot reports a refused launch as one exception with a history of others, and passes the
+clouds' own codes on in their texts. The codes decide, not the exception's class: a region
+without spot capacity and an account without quota come in the same class.
+
+Owns: the table of codes.
+Not here: catching exceptions (`sdk`) and what to do next (`fogft.core.quarantine`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Cause(str, Enum):
+    """Why there is no machine. The first word of `Machine.failure`."""
+
+    CAPACITY = "capacity"  # full now: another place, or another time
+    QUOTA = "quota"  # the account may not have more: waiting does not help
+    CREDENTIALS = "credentials"  # expired, wrong, or without a permission
+    SETUP = "setup"  # the pool file's `setup` failed: every place would do the same
+    TIMEOUT = "timeout"  # it hung
+    ERROR = "error"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A launch that will never run, with the cloud's own words."""
+
+    cause: Cause
+    words: str
+
+    def __str__(self) -> str:
+        return f"{self.cause.value}: {self.words}"
+
+
+# In order: the first that matches decides. Quota before capacity, since some quota messages
+# also speak of capacity; credentials first, since without them nothing else is known.
+_CODES: tuple[tuple[Cause, str], ...] = (
+    (
+        Cause.CREDENTIALS,
+        r"ExpiredToken|RequestExpired|InvalidClientTokenId|AuthFailure|UnauthorizedOperation"
+        r"|AccessDenied|SignatureDoesNotMatch|OptInRequired|NoCredentialsError"
+        r"|Unable to locate credentials|invalid_grant|RefreshError|PERMISSION_DENIED"
+        r"|does not have .{0,60}permission|AuthorizationFailed|InvalidAuthenticationToken"
+        r"|NoCloudAccess|InvalidCloudCredentials|CloudUserIdentityError",
+    ),
+    (
+        Cause.QUOTA,
+        r"VcpuLimitExceeded|MaxSpotInstanceCountExceeded|InstanceLimitExceeded"
+        r"|SpotInstanceCountExceeded|quotaExceeded|QUOTA_EXCEEDED|QuotaExceeded|quota limit"
+        r"|exceeding approved .{0,60}quota|AddressLimitExceeded|(?i:insufficient quota)",
+    ),
+    (
+        Cause.CAPACITY,
+        r"InsufficientInstanceCapacity|InsufficientHostCapacity|InsufficientReservedInstance"
+        r"|SpotMaxPriceTooLow|Unsupported.{0,80}Availability Zone|ZONE_RESOURCE_POOL_EXHAUSTED"
+        r"|resourceExhausted|does not have enough resources|SkuNotAvailable|AllocationFailed"
+        r"|OverconstrainedAllocationRequest|OverconstrainedZonalAllocation"
+        r"|(?i:no (spot )?capacity)|(?i:insufficient capacity)|(?i:out of capacity)",
+    ),
+)
+_KINDS = {
+    "ResourcesUnavailableError": Cause.CAPACITY,
+    "NoCloudAccessError": Cause.CREDENTIALS,
+    "InvalidCloudCredentials": Cause.CREDENTIALS,
+    "CloudUserIdentityError": Cause.CREDENTIALS,
+    "PermissionDeniedError": Cause.CREDENTIALS,
+}
+
+
+def classify(kind: str, texts: Iterable[str]) -> Failure:
+    """Return why a launch failed.
+
+    Args:
+        kind: Class name of SkyPilot's exception.
+        texts: Its message, then those of its failover history.
+    """
+    told = [text for text in (plain(text) for text in texts) if text]
+    for cause, pattern in _CODES:
+        for text in told:
+            if re.search(pattern, text):
+                return Failure(cause, _short(text, pattern))
+    words = _short(told[-1] if told else kind, "")
+    return Failure(_KINDS.get(kind, Cause.ERROR), words)
+
+
+_SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")
+_DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # what SkyPilot says of its own doing
+_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+
+
+def plain(text: str) -> str:
+    """Return a text of SkyPilot's without colours and line breaks."""
+    return " ".join(_COLOUR.sub("", text).split())
+
+
+def tail(log: str, lines: int = 12, width: int = 200) -> str:
+    """Return the last lines of a log that say something, each cut to `width` characters."""
+    lines_of_log = (_SPEAKER.sub("", line.rstrip()) for line in _COLOUR.sub("", log).splitlines())
+    told = [line for line in lines_of_log if line.strip() and not line.startswith(_DECORATION)]
+    return "\n".join(line[:width] for line in told[-lines:])
+
+
+def _short(text: str, pattern: str, room: int = 300) -> str:
+    """Return the part of a text around what matched."""
+    found = re.search(pattern, text) if pattern else None
+    start = max(0, found.start() - 80) if found and len(text) > room else 0
+    return ("... " if start else "") + text[start : start + room]

@@ -1,0 +1,202 @@
+"""Follow a launch from the order to the running job, one level-triggered step at a time.
+
+Each step reads where the launch stands, asks SkyPilot once, and writes where it stands now.
+So a step can be lost, repeated, or made by another process after a crash. A launch that
+fails or hangs is taken down at once, whoever is watching: a machine that was made before the
+failure would cost money until somebody looks.
+
+Owns: the stages of a launch and what each failure is called.
+Not here: threads and waiting (`adapter`), taking down (`ending`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fogft.cloud.sky.ending import Ending
+from fogft.cloud.sky.failures import Cause, Failure, classify, tail
+from fogft.cloud.sky.journal import Entry, Journal, Stage
+from fogft.cloud.sky.naming import cluster_name
+from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
+from fogft.core.errors import CloudError, CloudUnreachable
+from fogft.core.model import ReplicaId
+
+log = logging.getLogger(__name__)
+
+JOB_PAUSE_S = 10.0
+"""Shortest pause between two questions about a job. For each SkyPilot runs a program on the
+machine over ssh, in one of its few workers: others wait meanwhile, so the pause grows with the
+time that an answer takes."""
+
+UNDER_WAY = frozenset({Stage.ASKING, Stage.LAUNCHING, Stage.SETTING_UP})
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long a launch may take. Seconds.
+
+    Attributes:
+        ask_s: Until SkyPilot has accepted the order; then it is known that it never will.
+        launch_s: From the order to the running machine.
+        setup_s: From the order to the running job.
+    """
+
+    ask_s: float = 180.0
+    launch_s: float = 900.0
+    setup_s: float = 3600.0
+
+
+DEFAULT_LIMITS = Limits()
+
+
+class Following:
+    """Makes the steps.
+
+    Args:
+        sky: SkyPilot.
+        journal: Where each launch stands.
+        ending: Takes down what failed.
+        clock: Seconds since the epoch.
+        on_move: Called when a launch has moved on.
+        limits: When a launch hangs.
+    """
+
+    def __init__(
+        self,
+        sky: Sky,
+        journal: Journal,
+        ending: Ending,
+        *,
+        clock: Callable[[], float],
+        on_move: Callable[[], None] = lambda: None,
+        limits: Limits = DEFAULT_LIMITS,
+    ) -> None:
+        self._sky = sky
+        self._journal = journal
+        self._ending = ending
+        self._clock = clock
+        self._on_move = on_move
+        self._limits = limits
+        self._job_not_before: dict[ReplicaId, float] = {}
+
+    def step(self, id: ReplicaId) -> bool:
+        """Move a launch on if it can be. Returns whether there is more to follow.
+
+        Raises:
+            CloudUnreachable: Nothing was learned; try again later.
+        """
+        entry = self._journal.get(id)
+        if entry is None or entry.stage not in UNDER_WAY:
+            return False
+        if self._age(entry) > self._limits.setup_s:
+            doing = "setting up" if entry.stage is Stage.SETTING_UP else "launching"
+            self._fail(entry, self._hung(entry, self._limits.setup_s, doing))
+        elif entry.stage is Stage.ASKING:
+            self._asking(entry)
+        elif entry.stage is Stage.LAUNCHING:
+            self._launching(entry)
+        else:
+            self._setting_up(entry)
+        entry = self._journal.get(id)
+        return entry is not None and entry.stage in UNDER_WAY
+
+    def _asking(self, entry: Entry) -> None:
+        requests = self._sky.launches(cluster_name(entry.id))
+        if requests:
+            self._move(entry, stage=Stage.LAUNCHING, request=requests[-1].id)
+        elif self._age(entry) > self._limits.ask_s:
+            self._fail(entry, Failure(Cause.ERROR, "SkyPilot never heard of this launch"))
+
+    def _launching(self, entry: Entry) -> None:
+        request = self._sky.request(entry.request)
+        if request is None:
+            self._lost(entry)
+        elif request.state is RequestState.ACTIVE:
+            if self._age(entry) > self._limits.launch_s:
+                self._fail(entry, self._hung(entry, self._limits.launch_s, "launching"))
+        else:
+            try:
+                job = self._sky.launched_job(entry.request)
+            except RefusedError as error:
+                self._fail(entry, self._refused(entry, error))
+            else:
+                self._move(entry, stage=Stage.SETTING_UP, job=job)
+
+    def _lost(self, entry: Entry) -> None:
+        """SkyPilot lost the request (its database, or a server that was put in place of it)."""
+        clusters = self._sky.clusters(cluster_name(entry.id), refresh=True)
+        if any(c.state is ClusterState.UP for c in clusters):
+            self._move(entry, stage=Stage.SETTING_UP)
+        else:
+            self._fail(entry, Failure(Cause.ERROR, "SkyPilot lost this launch"))
+
+    def _setting_up(self, entry: Entry) -> None:
+        asked_at = self._clock()
+        if asked_at < self._job_not_before.get(entry.id, 0.0):
+            return
+        try:
+            job = self._sky.job(cluster_name(entry.id), entry.job)
+        except RefusedError as error:  # the cluster is gone, or not up: its absence will tell
+            log.info("job_unknown replica=%s reason=%r", entry.id.short, str(error))
+            return
+        finally:
+            now = self._clock()
+            pause_s = max(JOB_PAUSE_S, 3 * (now - asked_at))
+            self._job_not_before[entry.id] = now + pause_s
+        if job is JobState.RUNNING:
+            self._move(entry, stage=Stage.RUNNING)
+        elif job is JobState.SETUP_FAILED:
+            self._fail(entry, Failure(Cause.SETUP, "`setup` failed" + self._job_tail(entry)))
+        elif job is JobState.MISSING:
+            self._fail(entry, Failure(Cause.ERROR, "SkyPilot started no job on the machine"))
+        elif job is JobState.ENDED:
+            words = "`fogft serve` ended on the machine" + self._job_tail(entry)
+            self._fail(entry, Failure(Cause.ERROR, words))
+
+    # -- failures ---------------------------------------------------------------------------
+
+    def _fail(self, entry: Entry, failure: Failure) -> None:
+        """Write the failure first: whatever happens while it is taken down, it stays known."""
+        log.warning("launch_failed replica=%s reason=%r", entry.id.short, str(failure))
+        self._journal.update(entry.id, stage=Stage.FAILED, failure=str(failure))
+        try:
+            self._ending.end(entry.id)
+        except CloudError as error:  # it stays listed as failed until `terminate` has managed
+            log.warning("end_failed replica=%s reason=%r", entry.id.short, str(error))
+
+    def _refused(self, entry: Entry, error: RefusedError) -> Failure:
+        failure = classify(error.kind, error.texts)
+        if error.kind in ("CommandError", "ClusterSetUpError") and failure.cause is Cause.ERROR:
+            log_tail = self._job_tail(entry)
+            cause = Cause.SETUP if "setup" in " ".join(error.texts).lower() else Cause.ERROR
+            return Failure(cause, failure.words + log_tail)
+        if error.kind == "RequestCancelled":
+            return Failure(Cause.ERROR, "the launch was cancelled")
+        return failure
+
+    def _hung(self, entry: Entry, limit_s: float, doing: str) -> Failure:
+        words = f"still {doing} after {limit_s:.0f} s"
+        log_tail = self._job_tail(entry) if entry.stage is Stage.SETTING_UP else ""
+        return Failure(Cause.TIMEOUT, words + (log_tail or self._provision_tail(entry)))
+
+    def _job_tail(self, entry: Entry) -> str:
+        told = tail(self._sky.job_log(cluster_name(entry.id), entry.job, 30))
+        return f"\n{told}" if told else ""
+
+    def _provision_tail(self, entry: Entry) -> str:
+        try:
+            told = tail(self._sky.provision_log(cluster_name(entry.id), 30))
+        except CloudUnreachable:
+            return ""
+        return f"\n{told}" if told else ""
+
+    def _move(self, entry: Entry, **changes: object) -> None:
+        moved = self._journal.update(entry.id, **changes)
+        if moved is not None and moved.stage is not entry.stage:
+            log.info("launch_moved replica=%s stage=%s", entry.id.short, moved.stage.value)
+            self._on_move()
+
+    def _age(self, entry: Entry) -> float:
+        return self._clock() - entry.launched_at

@@ -1,0 +1,247 @@
+"""The installed SkyPilot behind `sdk.Sky`. The only module that imports `sky`, and only when used.
+
+Importing it takes 2 to 4 s, and the first call may start its API server (11 s, 0.6 GB); a
+server elsewhere is used by `SKYPILOT_API_SERVER_ENDPOINT` or ``sky api login``, as always.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import importlib
+import io
+import re
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
+from fogft.cloud.sky.calls import Calls
+from fogft.cloud.sky.sdk import Cluster, JobState, Request
+from fogft.core.errors import CloudError
+from fogft.core.model import Offer, Placement
+
+T = TypeVar("T")
+
+ASK_LIMIT_S = 30.0
+REFRESH_LIMIT_S = 60.0
+CHECK_LIMIT_S = 180.0  # asks every cloud, and may start the API server
+JOB_LIMIT_S = 120.0  # starts a Python on the machine, over ssh
+LAUNCH_LIMIT_S = 120.0  # uploads `workdir` and `file_mounts`, and may start the API server
+DOWN_LIMIT_S = 300.0
+
+_ZONE_ID = re.compile(r"[a-z]{2,5}\d-[a-z]{2,4}\d")  # `use1-az1`: a zone whose name is not known
+
+
+class InstalledSky:
+    """See `fogft.cloud.sky.sdk.Sky`."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._modules: tuple[Any, Any] | None = None
+        self._calls = Calls()
+
+    def launch(self, task: Mapping[str, Any], name: str) -> str:
+        """See `Sky`."""
+
+        def run() -> str:
+            sky, sdk = self._sky()
+            with as_answer():
+                made = sky.Task.from_yaml_config(dict(task))
+            return str(sdk.launch(made, cluster_name=name))
+
+        return self._within(LAUNCH_LIMIT_S, f"the launch of `{name}`", run)
+
+    def launches(self, name: str) -> Sequence[Request]:
+        """See `Sky`."""
+
+        def run() -> Sequence[Request]:
+            _, sdk = self._sky()
+            found = _asked(sdk, all_status=True, cluster_name=name)
+            found = [r for r in found if r.name == "sky.launch" and r.cluster_name == name]
+            return [request_of(r) for r in sorted(found, key=lambda r: r.created_at)]
+
+        return self._within(ASK_LIMIT_S, f"the requests of `{name}`", run)
+
+    def request(self, id: str) -> Request | None:
+        """See `Sky`."""
+
+        def run() -> Request | None:
+            _, sdk = self._sky()
+            found = _asked(sdk, request_ids=[id])
+            return next((request_of(r) for r in found if r.request_id == id), None)
+
+        return self._within(ASK_LIMIT_S, f"request {id}", run)
+
+    def launched_job(self, id: str) -> int | None:
+        """See `Sky`."""
+
+        def run() -> int | None:
+            _, sdk = self._sky()
+            with as_answer():
+                job, _ = sdk.get(id)
+            return None if job is None else int(job)
+
+        return self._within(ASK_LIMIT_S, f"the outcome of request {id}", run)
+
+    def cancel(self, id: str) -> None:
+        """See `Sky`."""
+        _, sdk = self._sky()
+        self._within(
+            ASK_LIMIT_S,
+            f"the abort of request {id}",
+            lambda: sdk.get(sdk.api_cancel([id], silent=True)),
+        )
+
+    def clusters(self, name: str | None, *, refresh: bool) -> Sequence[Cluster]:
+        """See `Sky`."""
+
+        def run() -> Sequence[Cluster]:
+            sky, sdk = self._sky()
+            mode = sky.StatusRefreshMode.FORCE if refresh else sky.StatusRefreshMode.NONE
+            names = None if name is None else [name]
+            # Of all users: who lost `~/.sky/user_hash` is another user to SkyPilot, and the
+            # machines still cost the same person. The pool's uid tells them apart.
+            found = sdk.get(sdk.status(names, refresh=mode, all_users=True))
+            return [cluster_of(record) for record in found]
+
+        limit_s = REFRESH_LIMIT_S if refresh else ASK_LIMIT_S
+        subject = f"cluster `{name}`" if name else "the list of clusters"
+        return self._within(limit_s, subject, run)
+
+    def job(self, name: str, number: int | None) -> JobState:
+        """See `Sky`."""
+
+        def run() -> JobState:
+            _, sdk = self._sky()
+            states = sdk.get(sdk.job_status(name, None if number is None else [number]))
+            state = next(iter(states.values()), None)
+            if state is None:
+                return JobState.MISSING
+            return JOBS.get(state.value, JobState.ENDED)
+
+        return self._within(JOB_LIMIT_S, f"the job of `{name}`", run)
+
+    def job_log(self, name: str, number: int | None, lines: int) -> str:
+        """See `Sky`."""
+        _, sdk = self._sky()
+        return self._log(
+            lambda out: sdk.tail_logs(name, number, follow=False, tail=lines, output_stream=out)
+        )
+
+    def provision_log(self, name: str, lines: int) -> str:
+        """See `Sky`."""
+        _, sdk = self._sky()
+        return self._log(
+            lambda out: sdk.tail_provision_logs(name, follow=False, tail=lines, output_stream=out)
+        )
+
+    def down(self, name: str) -> None:
+        """See `Sky`."""
+
+        def run() -> None:
+            _, sdk = self._sky()
+            try:
+                sdk.get(sdk.down(name))
+            except Exception as error:
+                if type(error).__name__ != "ClusterDoesNotExist":
+                    raise
+
+        self._within(DOWN_LIMIT_S, f"the end of `{name}`", run)
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """See `Sky`."""
+
+        def run() -> Sequence[Offer]:
+            sky, sdk = self._sky()
+            found: dict[Placement, float] = {}
+            with as_answer():
+                asked = sky.Resources.from_yaml_config(copy.deepcopy(dict(resources)))
+            for one in asked:
+                clouds = [one.cloud]
+                if one.cloud is None:
+                    enabled = sdk.get(sdk.enabled_clouds())
+                    clouds = [sky.CLOUD_REGISTRY.from_str(name) for name in enabled]
+                for cloud in clouds:
+                    for offer in _offers_of(cloud, one.copy(cloud=cloud)):
+                        price = found.get(offer.placement, offer.usd_per_hour)
+                        found[offer.placement] = min(price, offer.usd_per_hour)
+            offers = [Offer(placement, price) for placement, price in found.items()]
+            return sorted(offers, key=lambda o: (o.usd_per_hour, o.placement))
+
+        return self._within(REFRESH_LIMIT_S, "the catalogue of prices", run)
+
+    def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
+        """See `Sky`."""
+
+        def run() -> Mapping[str, str]:
+            _, sdk = self._sky()
+            told = io.StringIO()
+            request = sdk.check(tuple(clouds) or None, verbose=False)
+            enabled = sdk.stream_and_get(request, output_stream=told)
+            usable = {
+                cloud.lower()
+                for workspace in enabled.values()
+                for cloud, capabilities in workspace.items()
+                if "compute" in capabilities
+            }
+            reasons = told_reasons(told.getvalue())
+            asked = {cloud.lower() for cloud in clouds} or usable | set(reasons)
+            return {
+                cloud: "" if cloud in usable else reasons.get(cloud, "SkyPilot may not use it")
+                for cloud in sorted(asked)
+            }
+
+        return self._within(CHECK_LIMIT_S, "the check of credentials", run)
+
+    def _log(self, read: Callable[[io.StringIO], object]) -> str:
+        out = io.StringIO()
+        with contextlib.suppress(CloudError):  # a log that is missing must not hide the failure
+            self._within(JOB_LIMIT_S, f"log {id(out)}", lambda: read(out))
+        return out.getvalue()
+
+    def _within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
+        return self._calls.within(limit_s, subject, call)
+
+    def _sky(self) -> tuple[Any, Any]:
+        with self._lock:
+            if self._modules is None:
+                try:
+                    self._modules = (
+                        importlib.import_module("sky"),
+                        importlib.import_module("sky.client.sdk"),
+                    )
+                except ImportError as error:
+                    raise CloudError(
+                        f"SkyPilot is not usable here: {error}",
+                        "`pip install 'fogft[cloud]'`, or run with `--cloud local`",
+                    ) from error
+            return self._modules
+
+
+def _asked(sdk: Any, **filters: Any) -> list[Any]:
+    """Return requests. Without the first call a local server that died would say "none"."""
+    try:
+        sdk.api_info()  # also tells the client which filters this server knows
+    except Exception:
+        sdk.status(["fogft-is-the-server-there"])  # starts a local one; says what ails a remote one
+    return list(sdk.api_status(**filters))
+
+
+def _offers_of(cloud: Any, resources: Any) -> Iterator[Offer]:
+    for launchable in cloud.get_feasible_launchable_resources(
+        resources, num_nodes=1
+    ).resources_list:
+        instance = launchable.instance_type
+        if launchable.accelerators and str(cloud).lower() == "gcp":
+            name, count = next(iter(launchable.accelerators.items()))
+            instance = f"{instance}+{name}:{count}"  # there the type does not imply them
+        for region in launchable.get_valid_regions_for_launchable():
+            zones = [zone.name for zone in region.zones or ()]
+            for zone in zones or [None]:
+                named = None if zone is None or _ZONE_ID.fullmatch(zone) else zone
+                price = launchable.copy(region=region.name, zone=zone).get_cost(3600)
+                placement = Placement(
+                    str(cloud).lower(), region.name, named or "", instance, launchable.use_spot
+                )
+                yield Offer(placement, float(price))

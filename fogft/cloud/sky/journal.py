@@ -1,0 +1,162 @@
+"""What was asked of SkyPilot, on disk: one small file a replica, until it is gone.
+
+SkyPilot's own list misses a launch in its first seconds, and forgets why one failed. The
+journal is written before SkyPilot is asked, so a replica is listed from then on, even
+if the manager dies in that moment. It holds no secret. Losing it loses no machine: names
+and labels in the cloud say the same.
+
+Owns: these files, and the folder with each replica's own files.
+Not here: what is true in the cloud (`adapter`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.sky.naming import cluster_name, replica_of
+from fogft.core.errors import StateError
+from fogft.core.model import Placement, ReplicaId
+from fogft.disk import locked, make_folder, read_json, write_json, write_whole
+
+
+class Stage(str, Enum):
+    """How far a launch has come. It only ever moves down this list."""
+
+    ASKING = "asking"  # SkyPilot is being asked; whether it heard us is not known
+    LAUNCHING = "launching"  # it accepted: `request` says how it is doing
+    SETTING_UP = "setting up"  # the VM runs; the job does not yet
+    RUNNING = "running"  # the job runs
+    FAILED = "failed"  # it never will; `failure` says why
+    ENDING = "ending"  # to be gone
+
+
+_ORDER = list(Stage)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One launch.
+
+    Attributes:
+        launched_at: Seconds since the epoch.
+        request: SkyPilot's id of the launch request; empty until it is known.
+        job: SkyPilot's number of the job that runs the server proxy; None until known.
+        failure: As in `Machine.failure`.
+    """
+
+    id: ReplicaId
+    placement: Placement
+    usd_per_hour: float
+    spec_hash: str
+    launched_at: float
+    stage: Stage = Stage.ASKING
+    request: str = ""
+    job: int | None = None
+    failure: str = ""
+
+
+class Journal:
+    """The entries of all pools of this user.
+
+    Args:
+        folder: Where they lie; made when it is missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        make_folder(folder)
+
+    def open(self, entry: Entry, files: Mapping[str, bytes]) -> bool:
+        """Write a new entry and its files; False when there is one for this id already.
+
+        Raises:
+            StateError: The disk refuses; nothing was begun.
+        """
+        with locked(self._folder / "journal.lock"):
+            if self._path(entry.id).exists():
+                return False
+            folder = self.files(entry.id)
+            make_folder(folder)
+            for name, content in files.items():
+                write_whole(folder / name, content)
+            self._write(entry)
+            return True
+
+    def update(self, id: ReplicaId, **changes: Any) -> Entry | None:
+        """Change an entry; None when it was closed meanwhile. A stage never moves back.
+
+        Raises:
+            StateError: It cannot be read or written.
+        """
+        with locked(self._folder / "journal.lock"):
+            entry = self.get(id)
+            if entry is None:
+                return None
+            stage = changes.get("stage", entry.stage)
+            if _ORDER.index(stage) < _ORDER.index(entry.stage):
+                changes = {k: v for k, v in changes.items() if k not in ("stage", "failure")}
+            changed = replace(entry, **changes)
+            if changed != entry:
+                self._write(changed)
+            return changed
+
+    def close(self, id: ReplicaId) -> None:
+        """Forget a replica that is gone, and remove its files. Repeatable."""
+        with locked(self._folder / "journal.lock"):
+            shutil.rmtree(self.files(id), ignore_errors=True)
+            with contextlib.suppress(OSError):
+                self.provision_log(id).unlink()
+            self._path(id).unlink(missing_ok=True)
+
+    def get(self, id: ReplicaId) -> Entry | None:
+        """Return an entry, or None.
+
+        Raises:
+            StateError: It cannot be read.
+        """
+        value = read_json(self._path(id))
+        return None if value is None else _entry(value, self._path(id))
+
+    def entries(self, pool_uid: str = "") -> list[Entry]:
+        """Return the entries of one pool, or of all, ordered by id.
+
+        Raises:
+            StateError: One cannot be read: what it stood for must not be forgotten.
+        """
+        ids = (replica_of(path.stem) for path in self._folder.glob("*.json"))
+        wanted = sorted(id for id in ids if id and pool_uid in ("", id.pool_uid))
+        return [entry for entry in map(self.get, wanted) if entry is not None]
+
+    def files(self, id: ReplicaId) -> Path:
+        """Return the folder with a replica's own files."""
+        return self._folder / cluster_name(id)
+
+    def provision_log(self, id: ReplicaId) -> Path:
+        """Return where the log of a replica's launch is kept."""
+        return self._folder / f"{cluster_name(id)}.log"
+
+    def _path(self, id: ReplicaId) -> Path:
+        return self._folder / f"{cluster_name(id)}.json"
+
+    def _write(self, entry: Entry) -> None:
+        write_json(self._path(entry.id), asdict(entry))
+
+
+def _entry(value: Any, path: Path) -> Entry:
+    try:
+        return Entry(
+            **{
+                **value,
+                "id": ReplicaId(**value["id"]),
+                "placement": Placement(**value["placement"]),
+                "stage": Stage(value["stage"]),
+            }
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise StateError(f"`{path}` is damaged: {error}") from error

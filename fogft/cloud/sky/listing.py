@@ -1,0 +1,94 @@
+"""One machine, out of what the journal, SkyPilot and the provider each say of it. Pure.
+
+SkyPilot's list decides what exists; the journal says what a launch is waiting for and why it
+failed; the provider is heard where SkyPilot is silent.
+"""
+
+from __future__ import annotations
+
+from fogft.cloud.sky import naming
+from fogft.cloud.sky.journal import Entry, Stage
+from fogft.cloud.sky.provider import Instance
+from fogft.cloud.sky.sdk import Cluster, ClusterState
+from fogft.core.model import Machine, MachinePhase, Placement, ReplicaId
+
+NOWHERE = Placement("", "", "", "")
+
+
+def of_entry(
+    entry: Entry, cluster: Cluster | None, instance: Instance | None, port: int
+) -> Machine:
+    """Return a machine that the journal knows; the others may say nothing of it."""
+    phase = MachinePhase.PROVISIONING
+    failure, progress = "", entry.stage.value
+    if entry.stage is Stage.SETTING_UP:
+        phase = MachinePhase.RUNNING  # the machine runs; its services do not answer yet
+    elif entry.stage is Stage.RUNNING:
+        phase, progress = MachinePhase.RUNNING, ""
+    elif cluster is not None:
+        progress = cluster.progress or progress
+    if entry.stage is Stage.FAILED:
+        phase, failure = MachinePhase.FAILED, entry.failure
+    elif entry.stage is Stage.ENDING:
+        # Listed until it is certain that nothing runs, so that a crash in between is repaired.
+        phase, failure = MachinePhase.FAILED, entry.failure or "error: its end was not confirmed"
+    elif cluster is not None and cluster.state is ClusterState.STOPPED:
+        phase, failure = MachinePhase.FAILED, "error: the machine was stopped"
+    placement = entry.placement
+    if cluster is not None and cluster.placement is not None:
+        placement = _with_zone(placement, cluster.placement)
+    ip = (cluster.head_ip if cluster else "") or (instance.public_ip if instance else "")
+    return Machine(
+        id=entry.id,
+        placement=placement,
+        phase=phase,
+        launched_at=entry.launched_at,
+        endpoint=f"{ip}:{port}" if ip and phase is not MachinePhase.FAILED else None,
+        usd_per_hour=entry.usd_per_hour,
+        spec_hash=entry.spec_hash,
+        failure=failure,
+        progress=progress if phase is not MachinePhase.FAILED else "",
+    )
+
+
+def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool, port: int) -> Machine:
+    """Return a machine that SkyPilot lists and the journal has lost."""
+    phase, failure = MachinePhase.FAILED, ""
+    if cluster.state is ClusterState.UP:
+        phase = MachinePhase.RUNNING
+    elif launching:
+        phase = MachinePhase.PROVISIONING
+    else:
+        failure = f"error: SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}"
+    running = phase is MachinePhase.RUNNING and cluster.head_ip
+    return Machine(
+        id=id,
+        placement=cluster.placement or NOWHERE,
+        phase=phase,
+        launched_at=cluster.launched_at,
+        endpoint=f"{cluster.head_ip}:{port}" if running else None,
+        usd_per_hour=naming.usd_per_hour(cluster.labels),
+        spec_hash=cluster.labels.get(naming.SPEC, ""),
+        failure=failure,
+        progress=cluster.progress if phase is MachinePhase.PROVISIONING else "",
+    )
+
+
+def of_instance(instance: Instance) -> Machine:
+    """Return a machine that only the provider knows: nobody can use it, so it is to go."""
+    return Machine(
+        id=instance.id,
+        placement=instance.placement,
+        phase=MachinePhase.FAILED,
+        launched_at=instance.launched_at,
+        usd_per_hour=naming.usd_per_hour(instance.labels),
+        spec_hash=instance.labels.get(naming.SPEC, ""),
+        failure=f"error: SkyPilot does not know {instance.placement.cloud} `{instance.key}`",
+    )
+
+
+def _with_zone(asked: Placement, found: Placement) -> Placement:
+    """Keep what was ordered, but for a zone that the cloud has chosen."""
+    if asked.zone or (asked.cloud, asked.region) != (found.cloud, found.region):
+        return asked
+    return Placement(asked.cloud, asked.region, found.zone, asked.instance, asked.spot)

@@ -1,0 +1,86 @@
+"""How a replica is named in a cloud, and read back from there. Pure.
+
+A cluster's name and its labels each carry the pool's uid, the slot and the generation. What
+does not match is not ours, and nothing that is not ours is ever touched: every name that
+reaches SkyPilot is made by `cluster_name`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from fogft.core.model import Placement, ReplicaId
+from fogft.core.names import POOL_UID_PATTERN
+
+PREFIX = "fogft-"
+POOL = "fogft-pool"
+SLOT = "fogft-slot"
+GENERATION = "fogft-generation"
+OWNER = "fogft-owner"
+SPEC = "fogft-spec"
+PRICE = "fogft-microusd"
+
+_NAME = re.compile(r"fogft-([0-9a-f]{16})-(\d{1,9})-(\d{1,9})")
+_NUMBER = re.compile(r"\d{1,9}")
+_NOT_A_LABEL = re.compile(r"[^a-z0-9_-]")
+
+
+def cluster_name(id: ReplicaId) -> str:
+    """Return the name of a replica's cluster: ``fogft-<uid>-<slot>-<generation>``.
+
+    Raises:
+        ValueError: The id is not one of ours; a name made of it could mean something else.
+    """
+    name = f"{PREFIX}{id.pool_uid}-{id.slot}-{id.generation}"
+    if replica_of(name) != id:
+        raise ValueError(f"not a replica's id: {id!r}")
+    return name
+
+
+def replica_of(name: str) -> ReplicaId | None:
+    """Return whose cluster a name belongs to, or None when it is not one of ours."""
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return None
+    id = ReplicaId(match[1], int(match[2]), int(match[3]))
+    return id if name == f"{PREFIX}{id.pool_uid}-{id.slot}-{id.generation}" else None
+
+
+def labels(
+    id: ReplicaId, *, pool: str, owner: str, spec_hash: str, usd_per_hour: float
+) -> dict[str, str]:
+    """Return the labels of a replica's machine, in characters that every cloud takes."""
+    return {
+        POOL: id.pool_uid,
+        SLOT: str(id.slot),
+        GENERATION: str(id.generation),
+        OWNER: label_value(owner),
+        SPEC: label_value(spec_hash),
+        PRICE: str(round(usd_per_hour * 1e6)),
+        "fogft-name": label_value(pool),
+    }
+
+
+def replica_of_labels(found: Mapping[str, str]) -> ReplicaId | None:
+    """Return whose machine carries these labels, or None when it is not one of ours."""
+    uid, slot, generation = (found.get(key, "") for key in (POOL, SLOT, GENERATION))
+    if not (POOL_UID_PATTERN.fullmatch(uid) and _NUMBER.fullmatch(slot)):
+        return None
+    return ReplicaId(uid, int(slot), int(generation)) if _NUMBER.fullmatch(generation) else None
+
+
+def usd_per_hour(found: Mapping[str, str]) -> float:
+    """Return the price that the labels carry; 0 where they carry none."""
+    text = found.get(PRICE, "")
+    return int(text) / 1e6 if text.isascii() and text.isdigit() else 0.0
+
+
+def label_value(text: str) -> str:
+    """Return a text as a label's value: lower case, 63 characters at most."""
+    return _NOT_A_LABEL.sub("_", text.lower())[:63]
+
+
+def infra(placement: Placement) -> str:
+    """Return a placement in SkyPilot's words: ``aws/us-west-2/us-west-2a``."""
+    return "/".join(part for part in (placement.cloud, placement.region, placement.zone) if part)

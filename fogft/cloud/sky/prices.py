@@ -1,0 +1,151 @@
+"""What can be bought, and for how much: SkyPilot's catalogue, and live spot prices.
+
+The catalogue is a file that SkyPilot renews every few hours; spot prices move meanwhile. So an
+offer says where its price comes from and how old it is. Prices are kept for a while: the
+planner asks every half minute, and the answer must not cost a second each time.
+
+Owns: which price an offer carries, and how long it is kept.
+Not here: the catalogue (`sdk`) and the provider's interface (`provider`).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fogft.cloud.sky.failures import classify
+from fogft.cloud.sky.provider import NotAllowedError, Provider
+from fogft.cloud.sky.sdk import RefusedError, Sky
+from fogft.core.errors import CloudUnreachable, SpecError
+from fogft.core.model import Offer
+
+log = logging.getLogger(__name__)
+
+FRESH_S = 300.0
+USABLE_S = 3600.0
+
+
+@dataclass(frozen=True)
+class _Kept:
+    at: float
+    offers: tuple[Offer, ...]
+
+
+class Prices:
+    """Offers, kept for a while.
+
+    Args:
+        sky: SkyPilot's catalogue.
+        providers: Clouds that can be asked for live prices, by name.
+        clock: Seconds since the epoch.
+        submit: Runs a function on another thread.
+    """
+
+    def __init__(
+        self,
+        sky: Sky,
+        providers: Mapping[str, Provider],
+        clock: Callable[[], float],
+        submit: Callable[[Callable[[], None]], object],
+    ) -> None:
+        self._sky = sky
+        self._providers = providers
+        self._clock = clock
+        self._submit = submit
+        self._lock = threading.Lock()
+        self._kept: dict[str, _Kept] = {}
+        self._renewing: set[str] = set()
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """See `fogft.cloud.port.Cloud.offers`. The first call takes seconds, later ones none.
+
+        Prices of `FRESH_S` to `USABLE_S` seconds of age are returned while new ones are fetched.
+        """
+        key = json.dumps(resources, sort_keys=True, default=str)
+        with self._lock:
+            kept = self._kept.get(key)
+        age_s = float("inf") if kept is None else self._clock() - kept.at
+        if kept is None or age_s > USABLE_S:
+            return self._renewed(key, resources)
+        if age_s > FRESH_S:
+            self._renew_later(key, resources)
+        return kept.offers
+
+    @property
+    def regions(self) -> Mapping[str, set[str]]:
+        """Cloud -> regions that were offered: where machines of ours can be."""
+        with self._lock:
+            out: dict[str, set[str]] = {}
+            for kept in self._kept.values():
+                for offer in kept.offers:
+                    out.setdefault(offer.placement.cloud, set()).add(offer.placement.region)
+            return out
+
+    def _renew_later(self, key: str, resources: Mapping[str, Any]) -> None:
+        with self._lock:
+            if key in self._renewing:
+                return
+            self._renewing.add(key)
+
+        def renew() -> None:
+            try:
+                self._renewed(key, resources)
+            except (CloudUnreachable, SpecError) as error:
+                log.warning("prices_not_renewed reason=%r", error.message)
+            finally:
+                with self._lock:
+                    self._renewing.discard(key)
+
+        self._submit(renew)
+
+    def _renewed(self, key: str, resources: Mapping[str, Any]) -> tuple[Offer, ...]:
+        try:
+            listed = self._sky.offers(resources)
+        except RefusedError as error:
+            words = classify(error.kind, error.texts).words
+            raise SpecError(f"resources: SkyPilot refuses this section: {words}") from error
+        if not listed:
+            raise SpecError(
+                "resources: no cloud that can be used here sells this",
+                "ask for less, or name more clouds and regions; `sky check` lists the clouds "
+                "that this account may use",
+            )
+        offers = tuple(sorted(self._priced(listed), key=lambda o: (o.usd_per_hour, o.placement)))
+        with self._lock:
+            self._kept[key] = _Kept(self._clock(), offers)
+        return offers
+
+    def _priced(self, listed: Sequence[Offer]) -> Sequence[Offer]:
+        wanted: dict[tuple[str, str], set[str]] = {}
+        for offer in listed:
+            place = offer.placement
+            if place.spot and place.cloud in self._providers:
+                wanted.setdefault((place.cloud, place.region), set()).add(place.instance)
+        if not wanted:
+            return listed
+        with ThreadPoolExecutor(min(8, len(wanted)), "prices") as pool:
+            answers = dict(zip(wanted, pool.map(self._live, wanted.items()), strict=True))
+        now = self._clock()
+
+        def priced(offer: Offer) -> Offer:
+            place = offer.placement
+            live = answers.get((place.cloud, place.region), {}) if place.spot else {}
+            price = live.get((place.zone, place.instance))
+            if price is None:
+                return offer
+            return replace(offer, usd_per_hour=price, source="live", as_of=now)
+
+        return [priced(offer) for offer in listed]
+
+    def _live(self, wanted: tuple[tuple[str, str], set[str]]) -> Mapping[tuple[str, str], float]:
+        (cloud, region), instances = wanted
+        try:
+            return self._providers[cloud].spot_prices(region, instances)
+        except (NotAllowedError, CloudUnreachable) as error:
+            log.info("live_prices_missing region=%s/%s reason=%r", cloud, region, str(error))
+            return {}

@@ -1,0 +1,71 @@
+"""The provider itself, asked directly: what exists with our labels, and what it costs.
+
+SkyPilot's database is a file that can be lost; the provider's own list cannot. Where a cloud
+can be asked directly, every "it is gone" is checked there, and what SkyPilot has forgotten
+is found and ended there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from fogft.core.model import Placement, ReplicaId
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A machine in the provider's list that carries our labels and still costs money.
+
+    Attributes:
+        key: The provider's own name of it.
+        launched_at: Seconds since the epoch.
+    """
+
+    id: ReplicaId
+    key: str
+    placement: Placement
+    labels: Mapping[str, str]
+    public_ip: str = ""
+    launched_at: float = 0.0
+
+
+class NotAllowedError(Exception):
+    """This account may not ask: SkyPilot's word has to do."""
+
+
+class Provider(Protocol):
+    """One cloud, by its own interface. Calls come from any thread and have limits."""
+
+    @property
+    def cloud(self) -> str:
+        """Its name, as in `Placement.cloud`."""
+
+    def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
+        """List what carries our labels and is not terminated.
+
+        Args:
+            regions: Where to look; None for everywhere.
+            pool_uid: Of which pool; empty for all pools.
+
+        Raises:
+            CloudUnreachable: It cannot tell.
+            NotAllowedError: The account may not list.
+        """
+
+    def terminate(self, instances: Iterable[Instance]) -> None:
+        """Ask for the end of instances. Those that are gone are no error.
+
+        Raises:
+            CloudUnreachable: Unknown whether it was heard.
+            NotAllowedError: The account may not.
+        """
+
+    def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
+        """Return live spot prices: (zone, instance type) -> US dollars per hour.
+
+        Raises:
+            CloudUnreachable: It cannot tell.
+            NotAllowedError: The account may not ask.
+        """

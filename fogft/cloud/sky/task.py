@@ -1,0 +1,177 @@
+"""Make the SkyPilot task of one replica: the pool file's task on `templates/sky_task.yaml`. Pure.
+
+What the pool file says passes through untouched, but for the few fields that a pool decides
+itself; those are refused, since a field that is ignored is a promise broken in silence.
+
+Owns: the merge, and which fields are refused.
+Not here: the files on disk (`parcel`) and what SkyPilot thinks of the result (`sdk`).
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.port import Launch
+from fogft.cloud.sky import naming
+from fogft.core.errors import SpecError
+from fogft.core.model import Placement
+
+LINK_PORT = 7447
+OURS = "~/.fogft"
+_PLACE = ("infra", "cloud", "region", "zone")
+_CHOICES = (*_PLACE, "any_of", "ordered", "instance_type", "use_spot", "accelerators")
+_REFUSED_TASK = {
+    "num_nodes": "a replica is one machine: ask for more under `fogft.replicas`",
+    "service": "that section is SkyServe's: the `fogft` section takes its place",
+    "pool": "that section is for SkyPilot's managed jobs",
+}
+_REFUSED_RESOURCES = {
+    "ports": "only the link's port is opened; robots reach the services through it",
+    "autostop": "a replica runs as long as its pool wants it",
+    "job_recovery": "fogft replaces what is lost",
+}
+_NOT_VMS = ("kubernetes", "k8s", "ssh", "slurm")
+
+
+def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
+    """Check a pool file's task for fields that a pool decides itself.
+
+    Raises:
+        SpecError: One is there; the message names its key.
+    """
+    for key, reason in _REFUSED_TASK.items():
+        if key in task and not (key == "num_nodes" and task[key] == 1):
+            raise SpecError(f"{key}: cannot be honoured by a pool", reason)
+    for target in task.get("file_mounts") or {}:
+        if os.path.normpath(str(target)).startswith(OURS):
+            raise SpecError(f"file_mounts.{target}: `{OURS}` is fogft's own folder")
+    for where, entry in _entries(task.get("resources") or {}):
+        for key, reason in _REFUSED_RESOURCES.items():
+            if key in entry:
+                raise SpecError(f"{where}.{key}: cannot be honoured by a pool", reason)
+        for label in entry.get("labels") or {}:
+            if str(label).startswith(naming.PREFIX):
+                raise SpecError(f"{where}.labels.{label}: this prefix is fogft's own")
+        cloud = _location(entry)[0]
+        if cloud.lower() in _NOT_VMS:
+            raise SpecError(
+                f"{where}: `{cloud}` has no machines of its own",
+                "name clouds that sell VMs, such as `infra: aws/us-west-2`",
+            )
+
+
+def build(
+    order: Launch,
+    template: Mapping[str, Any],
+    *,
+    files: Path,
+    wheel: Path,
+    owner: str,
+    base: Path,
+    port: int = LINK_PORT,
+) -> dict[str, Any]:
+    """Return the task of one replica, for exactly one location.
+
+    Args:
+        order: What is launched.
+        template: `templates/sky_task.yaml`, read.
+        files: Folder with the order's files.
+        wheel: Folder with fogft's wheel.
+        owner: Whose machine it is, for its labels.
+        base: Folder that relative paths of the pool file start from.
+        port: Where the server proxy shall listen.
+
+    Raises:
+        SpecError: A field of the pool file cannot be honoured.
+    """
+    refuse_what_cannot_be_honoured(order.task)
+    setup = str(order.task.get("setup") or ":").rstrip()
+    marks = {"@FILES@": str(files), "@WHEEL@": str(wheel), "@PORT@": str(port), "@SETUP@": setup}
+    ours = _filled(template, marks)
+    task = copy.deepcopy({k: v for k, v in order.task.items() if k != "num_nodes"})
+    task["name"] = order.pool
+    task["setup"], task["run"] = ours["setup"], ours["run"]
+    if isinstance(task.get("workdir"), str):
+        task["workdir"] = _absolute(task["workdir"], base)
+    mounts = {k: _absolute(v, base) for k, v in (task.get("file_mounts") or {}).items()}
+    task["file_mounts"] = {**mounts, **ours["file_mounts"]}
+    task["resources"] = _resources(order, owner) | ours["resources"]
+    return task
+
+
+def _resources(order: Launch, owner: str) -> dict[str, Any]:
+    asked = order.task.get("resources") or {}
+    chosen = next(
+        (entry for _, entry in _entries(asked) if _sells(entry, order.placement)), dict(asked)
+    )
+    out = {k: copy.deepcopy(v) for k, v in chosen.items() if k not in _CHOICES}
+    instance, _, accelerators = order.placement.instance.partition("+")
+    out["infra"] = naming.infra(order.placement)
+    out["instance_type"] = instance
+    out["use_spot"] = order.placement.spot
+    if accelerators:
+        out["accelerators"] = accelerators
+    out["labels"] = dict(chosen.get("labels") or {}) | naming.labels(
+        order.id,
+        pool=order.pool,
+        owner=owner,
+        spec_hash=order.spec_hash,
+        usd_per_hour=order.usd_per_hour,
+    )
+    return out
+
+
+def _entries(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield every alternative of a `resources` section, each whole, with its key."""
+    base = {k: v for k, v in resources.items() if k not in ("any_of", "ordered")}
+    alternatives = 0
+    for key in ("any_of", "ordered"):
+        for index, entry in enumerate(resources.get(key) or ()):
+            alternatives += 1
+            labels = {**(base.get("labels") or {}), **(entry.get("labels") or {})}
+            whole = {**base, **entry, **({"labels": labels} if labels else {})}
+            yield f"resources.{key}[{index}]", whole
+    if not alternatives:
+        yield "resources", base
+
+
+def _sells(entry: Mapping[str, Any], placement: Placement) -> bool:
+    """Whether a placement can have come from this alternative."""
+    parts = zip(_location(entry), (placement.cloud, placement.region, placement.zone), strict=True)
+    return (
+        all(asked in ("", "*") or asked.lower() == sold.lower() for asked, sold in parts)
+        and entry.get("instance_type") in (None, placement.instance.partition("+")[0])
+        and entry.get("use_spot") in (None, placement.spot)
+    )
+
+
+def _location(entry: Mapping[str, Any]) -> tuple[str, str, str]:
+    infra = entry.get("infra")
+    parts: Sequence[Any] = (
+        str(infra).split("/", 2) if infra else [entry.get(k) or "" for k in _PLACE[1:]]
+    )
+    cloud, region, zone = [*(str(part) for part in parts), "", ""][:3]
+    return cloud, region, zone
+
+
+def _absolute(source: Any, base: Path) -> Any:
+    """Anchor a relative path of this machine; leave buckets and repositories alone."""
+    if not isinstance(source, str) or "://" in source:
+        return source
+    return str((base / Path(source).expanduser()).resolve())
+
+
+def _filled(value: Any, marks: Mapping[str, str]) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _filled(inner, marks) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_filled(inner, marks) for inner in value]
+    if not isinstance(value, str):
+        return value
+    for mark in ("@FILES@", "@WHEEL@", "@PORT@", "@SETUP@"):  # the user's text last, as it is
+        value = value.replace(mark, marks[mark])
+    return value

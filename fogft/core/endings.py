@@ -1,0 +1,240 @@
+"""Decide which machines end, and when. Pure.
+
+The law: a replica that serves, or may serve, ends only if enough others serve. "Others"
+never counts one that is itself to go, has a notice, or is silent. One whose link is up is
+first marked as draining, so that requests stop going there, and ends when it is idle.
+
+Owns: the order of endings and the two steps of draining.
+Not here: why a replica should go (`planner`, `health`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from fogft.core.health import Health, Judged, Verdict
+from fogft.core.history import History, Record
+from fogft.core.model import LinkState, ReplicaId
+from fogft.core.placement import crowding, domains
+
+# After the mark, the client proxy needs a moment to read it and to report what is in flight.
+DRAIN_SETTLE_S = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """A judged machine with its record, and why it should be replaced, if it should."""
+
+    judged: Judged
+    record: Record | None
+    reason: str = ""
+
+    @property
+    def id(self) -> ReplicaId:
+        """The replica."""
+        return self.judged.id
+
+    @property
+    def slot(self) -> int:
+        """Its slot."""
+        return self.judged.id.slot
+
+    @property
+    def short(self) -> str:
+        """Slot and generation for people."""
+        return self.judged.id.short
+
+    @property
+    def location(self) -> str:
+        """Where it is."""
+        return self.judged.machine.placement.location
+
+    @property
+    def verdict(self) -> Verdict:
+        """What health says."""
+        return self.judged.verdict
+
+    @property
+    def why(self) -> str:
+        """The reason to replace it, or health's."""
+        return self.reason or self.judged.why
+
+    @property
+    def ever_ready(self) -> bool:
+        """Whether it ever served."""
+        if self.judged.serving:
+            return True
+        return self.record is not None and self.record.first_ready_at is not None
+
+    @property
+    def answers(self) -> bool:
+        """Whether its server proxy answers."""
+        link = self.judged.link
+        return link is not None and link.state is LinkState.UP
+
+    @property
+    def draining_since(self) -> float | None:
+        """When it was marked to go."""
+        return self.record.draining_since if self.record is not None else None
+
+
+@dataclass
+class Census:
+    """Every machine of the pool, by what it is to the pool.
+
+    Attributes:
+        good: Serve or will serve.
+        replaced: Work, but shall be replaced, new before old.
+        lost: Leaving or unresponsive: replaced at once, and not counted as machines.
+        failed: Launches that failed: ended at once, not counted.
+        aborted: Not wanted as they are, and never served: ended at once.
+        ending: Already asked to end.
+    """
+
+    good: list[Standing] = field(default_factory=list)
+    replaced: list[Standing] = field(default_factory=list)
+    lost: list[Standing] = field(default_factory=list)
+    failed: list[Standing] = field(default_factory=list)
+    aborted: list[Standing] = field(default_factory=list)
+    ending: list[Standing] = field(default_factory=list)
+
+    def everyone(self) -> Iterator[Standing]:
+        """Yield every machine."""
+        yield from self.good
+        yield from self.replaced
+        yield from self.lost
+        yield from self.failed
+        yield from self.aborted
+        yield from self.ending
+
+    @property
+    def live(self) -> int:
+        """Machines that count against `replicas + max_surge`."""
+        exempt = (Verdict.FAILED, Verdict.LEAVING, Verdict.UNRESPONSIVE)
+        return sum(s.verdict not in exempt for s in self.everyone())
+
+
+@dataclass
+class Endings:
+    """Who ends now, who is marked, and what is worth saying."""
+
+    now: list[tuple[Standing, str]] = field(default_factory=list)
+    draining: list[Standing] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def ids(self) -> set[ReplicaId]:
+        """Those that end now."""
+        return {s.id for s, _ in self.now}
+
+
+def choose_endings(
+    wanted: int,
+    census: Census,
+    health: Health,
+    history: History,
+    *,
+    now: float,
+    drain_limit_s: float,
+) -> Endings:
+    """Choose who ends of those that are lost, replaced or too many."""
+    chooser = _Chooser(wanted, census, now, drain_limit_s)
+    surplus = len(census.good) + len(census.replaced) - wanted
+    if health.uplink_suspected or not health.links_known:
+        if surplus > 0 or census.lost:
+            chooser.out.notes.append("nothing is ended while no replica can be heard")
+        return chooser.out
+    for standing in census.lost:
+        chooser.end_lost(standing, history)
+    chooser.end_some(_by_expendability(census.good), len(census.good) - wanted, "not wanted")
+    left = len(census.good) + len(census.replaced) - chooser.counted_out - wanted
+    ready_slots = {s.slot for s in census.good if s.judged.serving}
+    replaced = sorted(
+        census.replaced,
+        key=lambda s: (
+            s.judged.may_serve,
+            s.draining_since is None,
+            s.slot not in ready_slots,
+            s.id,
+        ),
+    )
+    chooser.end_some(replaced, left, "replaced")
+    return chooser.out
+
+
+def _by_expendability(standings: Iterable[Standing]) -> list[Standing]:
+    """Not serving first, then already draining, then the most crowded domain, then the top slot."""
+    standings = list(standings)
+    count = crowding(s.judged.machine.placement for s in standings)
+
+    def rank(s: Standing) -> tuple[bool, bool, bool, int, int, int, int, int]:
+        cloud, region, zone = domains(s.judged.machine.placement)
+        return (
+            s.judged.may_serve,
+            s.judged.serving,
+            s.draining_since is None,
+            -count[cloud],
+            -count[region],
+            -count[zone],
+            -s.slot,
+            -s.id.generation,
+        )
+
+    return sorted(standings, key=rank)
+
+
+class _Chooser:
+    def __init__(self, wanted: int, census: Census, now: float, drain_limit_s: float) -> None:
+        self.out = Endings()
+        self.counted_out = 0
+        self._wanted = wanted
+        self._now = now
+        self._drain_limit_s = drain_limit_s
+        self._pillars = {s.id for s in (*census.good, *census.replaced) if s.judged.serving}
+
+    def end_lost(self, standing: Standing, history: History) -> None:
+        """A lost one ends once it is replaced, or at once when it cannot serve."""
+        enough = len(self._pillars) >= self._wanted
+        if enough or not standing.ever_ready or self._superseded(standing, history):
+            self._go(standing, standing.why)
+
+    def _superseded(self, standing: Standing, history: History) -> bool:
+        """Whether a later launch of its slot has served: its own turn is over."""
+        return standing.verdict is Verdict.UNRESPONSIVE and any(
+            (record := history.record(standing.slot, generation)) is not None
+            and record.first_ready_at is not None
+            for generation in range(
+                standing.id.generation + 1, history.generation(standing.slot) + 1
+            )
+        )
+
+    def end_some(self, standings: Iterable[Standing], count: int, reason: str) -> None:
+        """End up to `count`, in order, where the law allows it."""
+        for standing in standings:
+            if count <= 0:
+                return
+            others = len(self._pillars - {standing.id})
+            if standing.judged.may_serve and others < self._wanted:
+                continue
+            count -= 1
+            self.counted_out += 1
+            self._go(standing, f"{reason}: {standing.why}" if standing.why else reason)
+
+    def _go(self, standing: Standing, why: str) -> None:
+        self._pillars.discard(standing.id)
+        if self._must_drain_first(standing):
+            self.out.draining.append(standing)
+        else:
+            self.out.now.append((standing, why))
+
+    def _must_drain_first(self, standing: Standing) -> bool:
+        link = standing.judged.link
+        if link is None or not standing.answers or not standing.judged.serving:
+            return False
+        if standing.draining_since is None:
+            return True
+        age_s = self._now - standing.draining_since
+        if age_s >= self._drain_limit_s:
+            return False
+        return age_s < DRAIN_SETTLE_S or link.in_flight > 0

@@ -1,0 +1,65 @@
+"""Every error that a user can meet. Each has a message (what, where) and a hint (what to do).
+
+The command line prints a `FogftError` as ``error:`` and ``hint:``, without a stack
+trace, and exits with status 1. Anything else is a defect of ours and keeps its trace.
+"""
+
+from __future__ import annotations
+
+
+class FogftError(Exception):
+    """A failure that the user can understand and act on.
+
+    Args:
+        message: What happened, and where. Names stand in backquotes.
+        hint: What to do about it; empty when nothing can be said.
+    """
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+
+class SpecError(FogftError):
+    """A pool file is wrong. The message begins with ``file:line: key:``."""
+
+
+class StateError(FogftError):
+    """What is stored on disk for a pool cannot be used."""
+
+
+class PoolNotFound(FogftError):
+    """There is no pool of that name here."""
+
+
+class PoolBusy(FogftError):
+    """Another process holds this pool (its lock or a newer lease)."""
+
+
+class RosError(FogftError):
+    """ROS 2, or one of its types, is not usable here."""
+
+
+class WireError(FogftError):
+    """A link or a listener cannot be made."""
+
+
+class CredentialError(FogftError):
+    """A key or a certificate is missing, unreadable, expired or of the wrong role."""
+
+
+class CloudError(FogftError):
+    """A cloud refused something, and said so."""
+
+
+class CloudUnreachable(CloudError):
+    """The cloud did not answer: nothing is known, and nothing may be concluded."""
+
+
+class NoCapacity(CloudError):
+    """This placement is full now. Another one, or another time, may do."""
+
+
+class QuotaExceeded(CloudError):
+    """The account may not have more here. Waiting does not help."""

@@ -1,0 +1,212 @@
+"""Judge every replica from what the cloud and the links say. Pure.
+
+The cloud says whether a machine exists; the links say whether it answers. Neither alone
+replaces anything: a machine that the cloud lists and that is silent may be behind a dead
+uplink, so silence counts only while another replica answers.
+
+Owns: each replica's phase and verdict, and the suspicion against the robot's own uplink.
+Not here: what to do about it (`planner`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from fogft.core.history import History, Record
+from fogft.core.model import (
+    LinkReport,
+    LinkState,
+    Machine,
+    MachinePhase,
+    Observed,
+    Phase,
+    ReplicaId,
+)
+from fogft.core.spec import PoolSpec
+
+# A single replica's silence looks like a dead uplink. When the cloud still answers after this
+# many times `replace_after_s`, the uplink is fine and the replica is not.
+LONE_SILENCE_FACTOR = 4.0
+
+
+class Verdict(str, Enum):
+    """What a replica is good for."""
+
+    GOOD = "good"  # serves, will serve, or nothing can be said against it
+    FAILED = "failed"  # its launch has failed, or took longer than `start_limit_s`
+    LEAVING = "leaving"  # a preemption notice was given, or it asked to be left alone
+    UNRESPONSIVE = "unresponsive"  # silent past `replace_after_s` while another answers
+    STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One of our machines with all that is known of it.
+
+    Attributes:
+        serving: Its link is up and its services are ready: ending it would be felt.
+        may_serve: It served once and nothing proves that it does not serve now.
+        why: The verdict's reason in words; empty when good.
+    """
+
+    machine: Machine
+    link: LinkReport | None
+    phase: Phase
+    verdict: Verdict
+    serving: bool
+    may_serve: bool
+    why: str = ""
+
+    @property
+    def id(self) -> ReplicaId:
+        """The replica."""
+        return self.machine.id
+
+
+@dataclass(frozen=True)
+class Health:
+    """The whole pool, judged; ordered by replica.
+
+    Attributes:
+        uplink_suspected: All links that once answered are silent together.
+        links_known: There is a fresh report; without one nobody is doubted.
+    """
+
+    replicas: tuple[Judged, ...]
+    uplink_suspected: bool
+    links_known: bool
+
+
+def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
+    """Judge what is observed. Machines of other pools are left out."""
+    links = {report.id: report for report in observed.links or ()}
+    ours = sorted(
+        (m for m in observed.machines or () if m.id.pool_uid == pool_uid), key=lambda m: m.id
+    )
+    heard = [
+        link
+        for machine in ours
+        if machine.phase is MachinePhase.RUNNING
+        and machine.id not in observed.ending
+        and (link := links.get(machine.id)) is not None
+        and was_heard(link, history.record(machine.id.slot, machine.id.generation))
+    ]
+    answering = sum(link.state is LinkState.UP for link in heard)
+    alone = len(heard) == 1
+    patience_s = spec.health.replace_after_s * (LONE_SILENCE_FACTOR if alone else 1.0)
+    uplink_suspected = bool(heard) and not answering
+    if alone and heard[0].silent_for_s > patience_s:
+        uplink_suspected = False
+    may_doubt = observed.links is not None and not uplink_suspected
+    ready_somewhere = any(
+        is_ready(spec, machine, links.get(machine.id)) for machine in ours if not machine.notice
+    )
+    context = _Context(spec, observed, patience_s, may_doubt, ready_somewhere)
+    return Health(
+        replicas=tuple(
+            _judge_one(
+                context,
+                machine,
+                links.get(machine.id),
+                history.record(machine.id.slot, machine.id.generation),
+            )
+            for machine in ours
+        ),
+        uplink_suspected=uplink_suspected,
+        links_known=observed.links is not None,
+    )
+
+
+def was_heard(link: LinkReport, record: Record | None) -> bool:
+    """Whether this replica ever answered: by its link, or by an earlier proxy's report."""
+    ever_ready = record is not None and record.first_ready_at is not None
+    return link.state is not LinkState.CONNECTING or (ever_ready and link.silent_for_s > 0)
+
+
+def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
+    """Whether a replica answers all that it was launched for.
+
+    An outdated one was launched for other services, so answering any counts.
+    """
+    if link is None or link.state is not LinkState.UP or machine.phase is not MachinePhase.RUNNING:
+        return False
+    if machine.spec_hash != spec.replica_hash:
+        return bool(link.ready)
+    return link.ready.issuperset(service.name for service in spec.services)
+
+
+@dataclass(frozen=True)
+class _Context:
+    spec: PoolSpec
+    observed: Observed
+    patience_s: float
+    may_doubt: bool
+    ready_somewhere: bool
+
+
+def _judge_one(
+    context: _Context, machine: Machine, link: LinkReport | None, record: Record | None
+) -> Judged:
+    serving = is_ready(context.spec, machine, link)
+    verdict, why = _verdict(context, machine, link, record, serving)
+    ever_ready = record is not None and record.first_ready_at is not None
+    answers = link is not None and link.state is LinkState.UP
+    may_serve = serving or (
+        ever_ready and not answers and verdict not in (Verdict.UNRESPONSIVE, Verdict.FAILED)
+    )
+    return Judged(
+        machine=machine,
+        link=link,
+        phase=_phase(machine, verdict, serving),
+        verdict=verdict,
+        serving=serving,
+        may_serve=may_serve,
+        why=why,
+    )
+
+
+def _phase(machine: Machine, verdict: Verdict, serving: bool) -> Phase:
+    if verdict is Verdict.FAILED:
+        return Phase.GONE
+    if machine.phase is MachinePhase.PROVISIONING:
+        return Phase.PROVISIONING
+    if verdict is Verdict.LEAVING:
+        return Phase.DRAINING
+    return Phase.READY if serving else Phase.STARTING
+
+
+def _verdict(  # noqa: PLR0911 - one line a verdict reads better than nesting
+    context: _Context,
+    machine: Machine,
+    link: LinkReport | None,
+    record: Record | None,
+    serving: bool,
+) -> tuple[Verdict, str]:
+    health, now = context.spec.health, context.observed.now
+    if machine.phase is MachinePhase.FAILED:
+        return Verdict.FAILED, machine.failure or "error"
+    if machine.notice:
+        return Verdict.LEAVING, "preemption notice"
+    if machine.phase is MachinePhase.PROVISIONING:
+        if now - machine.launched_at > health.start_limit_s:
+            return Verdict.FAILED, f"timeout: not running after {health.start_limit_s:.0f} s"
+        return Verdict.GOOD, ""
+    # A mark of our own comes back in the report: it is not the replica's wish.
+    if link is not None and link.draining and not (record and record.draining_since):
+        return Verdict.LEAVING, "it asked to be left alone"
+    if serving or not context.may_doubt:
+        return Verdict.GOOD, ""
+    if link is not None and was_heard(link, record) and link.state is not LinkState.UP:
+        if link.silent_for_s > context.patience_s:
+            return Verdict.UNRESPONSIVE, f"silent for {link.silent_for_s:.0f} s"
+        return Verdict.GOOD, ""
+    if record is None or record.first_ready_at is None:
+        since = machine.launched_at if record is None else record.launched_at
+        if now - since > health.start_limit_s:
+            return Verdict.FAILED, f"timeout: not ready after {health.start_limit_s:.0f} s"
+        return Verdict.GOOD, ""
+    away_s = now - record.unready_since if record.unready_since is not None else 0.0
+    if away_s > health.start_limit_s and context.ready_somewhere:
+        return Verdict.STUCK, f"its service has been away for {away_s:.0f} s"
+    return Verdict.GOOD, ""

@@ -1,0 +1,244 @@
+"""What happened to each replica, as a list of events, and what follows from it.
+
+The cloud's list says what is; history says what was: which generations are used up,
+who was ever ready, which locations failed, and since when a replica drains. It is
+the only memory that must outlive a crash of the manager. Pure: events in, facts out.
+
+Owns: the events and the facts derived from them.
+Not here: the file they are stored in (`fogft.pool.store`) and what to make of failures
+(`quarantine`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from fogft.core.errors import StateError
+
+
+class EventKind(str, Enum):
+    """What can happen to a replica."""
+
+    LAUNCH = "launch"  # written before the cloud is asked: the generation is used from here on
+    REFUSED = "refused"  # the cloud said no: capacity, quota or an error
+    READY = "ready"  # its services answer
+    UNREADY = "unready"  # they no longer do
+    DRAINING = "draining"  # marked to go
+    UNDRAINED = "undrained"  # the mark was taken back
+    FAILED = "failed"  # its launch has failed
+    ENDING = "ending"  # written before the cloud is asked to end it
+    ENDED = "ended"  # gone, as asked
+    GONE = "gone"  # gone, unasked: preempted, crashed or ended by someone else
+
+
+CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
+
+
+@dataclass(frozen=True)
+class Event:
+    """One thing that happened.
+
+    Attributes:
+        at: Seconds since the epoch.
+        location: Where (``cloud/region/zone``); empty in events after the launch.
+        detail: Why, in words. For REFUSED and FAILED the first word is the cause:
+            ``capacity``, ``quota``, ``setup``, ``timeout`` or ``error``.
+    """
+
+    at: float
+    kind: EventKind
+    slot: int
+    generation: int
+    location: str = ""
+    detail: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the event as a JSON object."""
+        out: dict[str, Any] = {
+            "at": self.at,
+            "event": self.kind.value,
+            "slot": self.slot,
+            "generation": self.generation,
+        }
+        if self.location:
+            out["location"] = self.location
+        if self.detail:
+            out["detail"] = self.detail
+        return out
+
+    @classmethod
+    def from_json(cls, value: Any) -> Event:
+        """Read one event back.
+
+        Raises:
+            StateError: It is not an event.
+        """
+        try:
+            return cls(
+                at=float(value["at"]),
+                kind=EventKind(value["event"]),
+                slot=int(value["slot"]),
+                generation=int(value["generation"]),
+                location=str(value.get("location", "")),
+                detail=str(value.get("detail", "")),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise StateError(f"not an event: `{value!r:.120}`") from error
+
+
+@dataclass
+class Record:
+    """What the events say of one launch. Times in seconds since the epoch; None for never."""
+
+    slot: int
+    generation: int
+    launched_at: float
+    location: str = ""
+    first_ready_at: float | None = None
+    unready_since: float | None = None
+    draining_since: float | None = None
+    failed: bool = False
+    ending: bool = False
+    closed: EventKind | None = None
+    closed_at: float = 0.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A location disappointed: it refused, a launch failed there, or a replica died young."""
+
+    at: float
+    cause: str
+
+
+class History:
+    """Events folded into facts. `add` is the only change; planner and placement only read."""
+
+    def __init__(self, events: Iterable[Event] = ()) -> None:
+        self._records: dict[tuple[int, int], Record] = {}
+        self._open: dict[tuple[int, int], Record] = {}
+        self._generations: dict[int, int] = {}
+        self._failures: dict[str, list[Failure]] = {}
+        self._proven_at: dict[str, float] = {}
+        self._lost_at: dict[str, float] = {}
+        for event in events:
+            self.add(event)
+
+    def add(self, event: Event) -> None:
+        """Take one more event into account. Events come in the order they happened."""
+        key = (event.slot, event.generation)
+        latest = self._generations.get(event.slot, 0)
+        self._generations[event.slot] = max(latest, event.generation)
+        record = self._records.get(key)
+        if record is None:
+            record = Record(event.slot, event.generation, event.at, event.location)
+            self._records[key] = record
+        if event.kind is EventKind.LAUNCH:  # a second one: it was thought gone, and is listed
+            record.closed, record.ending = None, False
+        self._update(record, event)
+        if record.closed is None:
+            self._open[key] = record
+        else:
+            self._open.pop(key, None)
+
+    def _update(self, record: Record, event: Event) -> None:
+        kind = event.kind
+        if kind is EventKind.READY:
+            if record.first_ready_at is None:
+                record.first_ready_at = event.at
+            record.unready_since = None
+            self._proven_at[record.location] = event.at
+        elif kind is EventKind.UNREADY:
+            record.unready_since = event.at
+        elif kind is EventKind.DRAINING:
+            record.draining_since = event.at
+        elif kind is EventKind.UNDRAINED:
+            record.draining_since = None
+        elif kind is EventKind.ENDING:
+            record.ending = True
+        elif kind is EventKind.FAILED:
+            record.failed = True
+            self._fail(record, event)
+        elif kind in CLOSING:
+            if kind is EventKind.REFUSED or (kind is EventKind.GONE and died_young(record, event)):
+                self._fail(record, event)
+            if kind is EventKind.GONE:
+                self._lost_at[record.location] = event.at
+            record.closed = kind
+            record.closed_at = event.at
+
+    def _fail(self, record: Record, event: Event) -> None:
+        cause = event.detail.split(":")[0].split(" ")[0] or "error"
+        self._failures.setdefault(record.location, []).append(Failure(event.at, cause))
+
+    def record(self, slot: int, generation: int) -> Record | None:
+        """Return what is known of a launch."""
+        return self._records.get((slot, generation))
+
+    def open(self) -> list[Record]:
+        """Return the launches that have not ended, as far as was seen."""
+        return list(self._open.values())
+
+    def generation(self, slot: int) -> int:
+        """Return the highest generation ever used in a slot; 0 for none."""
+        return self._generations.get(slot, 0)
+
+    @property
+    def generations(self) -> Mapping[int, int]:
+        """Slot -> highest generation ever used."""
+        return self._generations
+
+    @property
+    def failures(self) -> Mapping[str, list[Failure]]:
+        """Location -> its failures, oldest first."""
+        return self._failures
+
+    def proven_at(self, location: str) -> float:
+        """Return when a replica last became ready there; minus infinity for never."""
+        return self._proven_at.get(location, float("-inf"))
+
+    def lost_at(self, location: str) -> float:
+        """Return when a replica was last lost there unasked; minus infinity for never."""
+        return self._lost_at.get(location, float("-inf"))
+
+
+YOUNG_S = 60.0
+
+
+def died_young(record: Record, event: Event) -> bool:
+    """Whether a loss speaks against the location: never ready, or ready for under a minute."""
+    return record.first_ready_at is None or event.at - record.first_ready_at < YOUNG_S
+
+
+def compacted(events: Iterable[Event], now: float, keep_s: float = 86_400.0) -> list[Event]:
+    """Drop what no decision needs any more.
+
+    Kept whole: launches that are open, or to which something happened within `keep_s`.
+    Kept in part: the latest launch of each slot, so that generations stay used. Of a
+    kept launch's comings and goings of readiness the first READY and the last two stay.
+    """
+    events = list(events)
+    history = History(events)
+    kept = {(r.slot, r.generation) for r in history.open()}
+    kept |= {(e.slot, e.generation) for e in events if now - e.at < keep_s}
+    flapping: dict[tuple[int, int], list[int]] = {}
+    for index, event in enumerate(events):
+        if event.kind in (EventKind.READY, EventKind.UNREADY):
+            flapping.setdefault((event.slot, event.generation), []).append(index)
+    dropped: set[int] = set()
+    for indices in flapping.values():
+        first_ready = [i for i in indices if events[i].kind is EventKind.READY][:1]
+        dropped |= set(indices) - {*first_ready, *indices[-2:]}
+    return [
+        e
+        for index, e in enumerate(events)
+        if index not in dropped
+        and (
+            (e.slot, e.generation) in kept
+            or (e.kind is EventKind.LAUNCH and history.generation(e.slot) == e.generation)
+            or (e.kind in CLOSING and history.generation(e.slot) == e.generation)
+        )
+    ]

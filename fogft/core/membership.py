@@ -1,0 +1,137 @@
+"""Who is where: the record that the manager writes and proxies follow. Pure.
+
+A membership is ordered by (epoch, version): the epoch is the writing manager's lease, so
+what an old manager wrote late never replaces what its successor wrote. Its JSON form
+carries a checksum; a damaged one is an error and changes nothing.
+
+Owns: building a membership from machines, its order and its JSON form.
+Not here: the file (`fogft.pool.store`) and what a proxy does with it (`fogft.proxy`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+from fogft.core.errors import StateError
+from fogft.core.model import Machine, MachinePhase, Member, Membership, ReplicaId
+from fogft.core.names import POOL_UID_PATTERN
+
+
+def members_of(
+    machines: Iterable[Machine],
+    *,
+    pool_uid: str,
+    draining: Collection[ReplicaId] = (),
+    ending: Collection[ReplicaId] = (),
+) -> tuple[Member, ...]:
+    """Return whom a proxy should hold a link to: ours, not ending, with a known endpoint."""
+    return tuple(
+        Member(machine.id, machine.endpoint, machine.id in draining or machine.notice)
+        for machine in sorted(machines, key=lambda m: m.id)
+        if machine.id.pool_uid == pool_uid
+        and machine.endpoint is not None
+        and machine.phase is not MachinePhase.FAILED
+        and machine.id not in ending
+    )
+
+
+def is_newer(candidate: Membership, current: Membership | None) -> bool:
+    """Whether a membership replaces another of the same pool."""
+    if current is None:
+        return True
+    if candidate.pool_uid != current.pool_uid:
+        return False
+    return (candidate.epoch, candidate.version) > (current.epoch, current.version)
+
+
+def successor(
+    current: Membership | None, *, pool: str, pool_uid: str, epoch: int, members: tuple[Member, ...]
+) -> Membership | None:
+    """Return the next membership to write, or None when nothing would change."""
+    if current is None or current.pool_uid != pool_uid:
+        return Membership(pool, pool_uid, epoch, 1, members)
+    if epoch < current.epoch:
+        return None  # a manager out of office writes nothing
+    if epoch == current.epoch and members == current.members:
+        return None
+    version = current.version + 1 if epoch == current.epoch else 1
+    return Membership(pool, pool_uid, epoch, version, members)
+
+
+def to_dict(membership: Membership) -> dict[str, Any]:
+    """Return the JSON form, with its checksum."""
+    content = {
+        "pool": membership.pool,
+        "pool_uid": membership.pool_uid,
+        "epoch": membership.epoch,
+        "version": membership.version,
+        "members": [
+            {
+                "slot": m.id.slot,
+                "generation": m.id.generation,
+                "endpoint": m.endpoint,
+                "draining": m.draining,
+            }
+            for m in membership.members
+        ],
+    }
+    return {**content, "checksum": _checksum(content)}
+
+
+def from_dict(raw: Any) -> Membership:
+    """Read a membership back.
+
+    Raises:
+        StateError: It is none, or it is damaged.
+    """
+    try:
+        content = {key: value for key, value in raw.items() if key != "checksum"}
+        if raw["checksum"] != _checksum(content):
+            raise ValueError("its checksum is wrong")
+        if not POOL_UID_PATTERN.fullmatch(content["pool_uid"]):
+            raise ValueError("its pool_uid is not one")
+        uid = content["pool_uid"]
+        membership = Membership(
+            pool=_text(content["pool"]),
+            pool_uid=uid,
+            epoch=_count(content["epoch"]),
+            version=_count(content["version"]),
+            members=tuple(_member(uid, entry) for entry in content["members"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise StateError(f"not a membership: {error}") from error
+    ids = [m.id for m in membership.members]
+    if len(set(ids)) != len(ids):
+        raise StateError("not a membership: a replica is listed twice")
+    return membership
+
+
+def _member(uid: str, entry: Mapping[str, Any]) -> Member:
+    endpoint = _text(entry["endpoint"])
+    host, _, port = endpoint.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"`{endpoint}` is not host:port")
+    if not isinstance(entry["draining"], bool):
+        raise TypeError("draining is not true or false")
+    id = ReplicaId(uid, _count(entry["slot"]), _count(entry["generation"]))
+    return Member(id, endpoint, entry["draining"])
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"not a count: {value!r:.40}")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"not a text: {value!r:.40}")
+    return value
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]

@@ -1,0 +1,194 @@
+"""The values that every part speaks of: replica, placement, machine, link report.
+
+Pure data, immutable, compared by value. The words are those of docs/glossary.md.
+
+Owns: what a replica is and what was observed of it.
+Not here: decisions (`planner`, `placement`) and the pool file (`spec`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+@dataclass(frozen=True, order=True)
+class ReplicaId:
+    """One launch of one slot of one pool. Never used twice.
+
+    Attributes:
+        pool_uid: 16 lower-case hexadecimal digits, random, made at the pool's first `up`.
+        slot: The place in the pool, 0 and up. Outlives the machines that fill it.
+        generation: Counts the launches of a slot from 1. A higher one fences off the lower.
+    """
+
+    pool_uid: str
+    slot: int
+    generation: int
+
+    @property
+    def short(self) -> str:
+        """Slot and generation, as people see it: ``2.1``."""
+        return f"{self.slot}.{self.generation}"
+
+    def __str__(self) -> str:
+        return f"{self.pool_uid}-{self.slot}.{self.generation}"
+
+
+@dataclass(frozen=True, order=True)
+class Placement:
+    """Where and what: the thing that an offer sells and a launch asks for."""
+
+    cloud: str
+    region: str
+    zone: str
+    instance: str
+    spot: bool = True
+
+    @property
+    def location(self) -> str:
+        """``cloud/region/zone``: what can be excluded, full or quarantined."""
+        return f"{self.cloud}/{self.region}/{self.zone}"
+
+    def within(self, location: str) -> bool:
+        """Whether this lies in a location given as ``cloud``, ``cloud/region`` or all three."""
+        return (self.location + "/").startswith(location.rstrip("/") + "/")
+
+
+@dataclass(frozen=True)
+class Offer:
+    """A placement with its price in US dollars per hour.
+
+    Attributes:
+        source: Where the price comes from: ``live``, ``catalogue``; empty where it is made up.
+        as_of: When it was true, in seconds since the epoch; 0 when that is not known.
+    """
+
+    placement: Placement
+    usd_per_hour: float
+    source: str = ""
+    as_of: float = 0.0
+
+
+class Phase(str, Enum):
+    """Where a replica stands in its life. It only ever moves forward."""
+
+    PROVISIONING = "provisioning"  # asked of the cloud, not yet running
+    STARTING = "starting"  # the machine runs; the service does not answer yet
+    READY = "ready"  # the service answers
+    DRAINING = "draining"  # answers, but is to go: nothing new is sent while others can
+    GONE = "gone"
+
+
+class MachinePhase(str, Enum):
+    """What a cloud says of a machine. Absence from its list means gone."""
+
+    PROVISIONING = "provisioning"
+    RUNNING = "running"
+    FAILED = "failed"  # a launch that will never run; stays listed until terminated
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One of our machines in a cloud's own list.
+
+    Attributes:
+        endpoint: ``host:port`` where the server proxy listens, once known.
+        notice: A preemption notice was given: the machine ends soon.
+        spec_hash: `PoolSpec.replica_hash` at its launch; another one means outdated.
+        launched_at: Seconds since the epoch.
+        failure: Why the phase is FAILED: ``capacity``, ``quota``, ``credentials``,
+            ``setup``, ``timeout`` or ``error``, then ``: `` and the cloud's words (a log's
+            last lines after a line break); empty otherwise.
+        progress: What the cloud says is being done there until it serves, for people.
+    """
+
+    id: ReplicaId
+    placement: Placement
+    phase: MachinePhase
+    launched_at: float
+    endpoint: str | None = None
+    notice: bool = False
+    usd_per_hour: float = 0.0
+    spec_hash: str = ""
+    failure: str = ""
+    progress: str = ""
+
+
+class LinkState(str, Enum):
+    """What the client proxy knows of its link to a replica."""
+
+    CONNECTING = "connecting"  # never answered a probe yet
+    UP = "up"  # the last probe was answered in time
+    SUSPECT = "suspect"  # was up; the server proxy no longer answers probes
+
+
+@dataclass(frozen=True)
+class LinkReport:
+    """What the client proxy reports of one replica. Ages and durations in seconds.
+
+    Attributes:
+        ready: Names of the services that this replica says it can answer now.
+        draining: The replica asked to be left alone (a preemption notice, a drain).
+        heard_age_s: Since the server proxy last answered a probe; None if never.
+        silent_for_s: How long probes have gone unanswered; 0 while they are answered.
+        rtt_s: Round trip of the last probe.
+        restarts: How often the server proxy restarted the user's `run` command.
+        detail: Last error in words (connection refused, wrong certificate, ...).
+    """
+
+    id: ReplicaId
+    state: LinkState
+    ready: frozenset[str] = frozenset()
+    draining: bool = False
+    heard_age_s: float | None = None
+    silent_for_s: float = 0.0
+    rtt_s: float | None = None
+    in_flight: int = 0
+    won: int = 0
+    restarts: int = 0
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """All that a plan depends on besides the spec: the world as seen at `now`.
+
+    Attributes:
+        now: Seconds since the epoch.
+        machines: The cloud's own list; None when the cloud could not tell.
+        links: What the client proxy reports; None when there is no fresh report.
+        offers: What can be bought now, in any order.
+        ending: Machines that were already asked to end, and may still be listed.
+    """
+
+    now: float
+    machines: tuple[Machine, ...] | None
+    links: tuple[LinkReport, ...] | None = None
+    offers: tuple[Offer, ...] = ()
+    ending: frozenset[ReplicaId] = frozenset()
+
+
+@dataclass(frozen=True)
+class Member:
+    """A replica that the client proxy shall hold a link to."""
+
+    id: ReplicaId
+    endpoint: str
+    draining: bool = False
+
+
+@dataclass(frozen=True)
+class Membership:
+    """Who is where: written by the manager, read by proxies, never application data.
+
+    Attributes:
+        epoch: The writing manager's lease; then `version` counts its writes. A lower
+            (epoch, version) never replaces a higher one.
+    """
+
+    pool: str
+    pool_uid: str
+    epoch: int
+    version: int
+    members: tuple[Member, ...] = field(default_factory=tuple)

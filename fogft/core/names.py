@@ -1,0 +1,54 @@
+"""Identifiers that both ends derive by themselves: keys, certificate names, request ids.
+
+A connection is known by pool, slot, service and type, never by an address, so a replica
+that is launched again elsewhere resumes the same connection. The identifier is the
+SHA-256 of those parts with their lengths, so that no two lists of parts collide.
+
+Source: FogROS2-SGC's construction of identifiers, extended to connections by FogROS2-FT.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+from fogft.core.model import ReplicaId
+
+REQUEST_ID_BYTES = 16
+POOL_UID_PATTERN = re.compile(r"[0-9a-f]{16}")
+POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
+
+
+def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str:
+    """Return the 32 hexadecimal digits that name a connection for good."""
+    digest = hashlib.sha256()
+    for part in (pool_uid, str(slot), service, type_name):
+        encoded = part.encode()
+        digest.update(len(encoded).to_bytes(4, "big"))
+        digest.update(encoded)
+    return digest.hexdigest()[:32]
+
+
+def slot_prefix(pool_uid: str, slot: int) -> str:
+    """Return the key prefix that a slot owns: it may serve these keys and no others."""
+    return f"fogft/{pool_uid}/{slot}"
+
+
+def service_key(pool_uid: str, slot: int, service: str, type_name: str) -> str:
+    """Return the Zenoh key at which a slot answers a service."""
+    return f"{slot_prefix(pool_uid, slot)}/s/{connection_id(pool_uid, slot, service, type_name)}"
+
+
+def probe_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot answers probes."""
+    return f"{slot_prefix(pool_uid, slot)}/probe"
+
+
+def replica_certificate_name(id: ReplicaId) -> str:
+    """Return the common name of a replica's certificate: pool, slot and generation."""
+    return f"replica.{id.slot}.{id.generation}.{id.pool_uid}"
+
+
+def robot_certificate_name(pool_uid: str, robot: str) -> str:
+    """Return the common name of a robot's certificate."""
+    return f"robot.{robot}.{pool_uid}"

@@ -1,0 +1,73 @@
+"""How long a location is left alone after it disappointed. Pure.
+
+Failures are refused launches (no capacity, no quota), launches that failed, and replicas
+that died young. After n failures in a row a location rests for
+
+    min(BASE_S * 2 ** (n - 1), LIMIT_S)
+
+seconds from the last one. A replica that becomes ready there, or FORGIVE_S without a
+failure, wipes the slate clean. A failed `setup` is the pool file's fault, not the
+location's: it is counted against `EVERYWHERE`, so a broken file does not tour the world
+at the user's expense.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fogft.core.history import Failure, History
+
+BASE_S = 5.0
+LIMIT_S = 600.0
+FORGIVE_S = 3600.0
+EVERYWHERE = "*"
+
+
+@dataclass(frozen=True)
+class Backoff:
+    """A location at rest.
+
+    Attributes:
+        until: Seconds since the epoch; from then on it may be tried again.
+        failures: How many in a row.
+        cause: Of the last one: ``capacity``, ``quota``, ``setup``, ...
+    """
+
+    until: float
+    failures: int
+    cause: str
+
+
+def resting(history: History, now: float) -> Mapping[str, Backoff]:
+    """Return the locations that must not be tried now, with the reason.
+
+    The key `EVERYWHERE` means that nothing may be launched at all.
+    """
+    out: dict[str, Backoff] = {}
+    setup_failures: list[Failure] = []
+    for location, failures in history.failures.items():
+        setup_failures += [f for f in failures if f.cause == "setup"]
+        proven_at = history.proven_at(location)
+        rest = backoff([f for f in failures if f.cause != "setup" and f.at > proven_at], now)
+        if rest is not None:
+            out[location] = rest
+    proven_at = max((history.proven_at(place) for place in history.failures), default=0.0)
+    everywhere = backoff([f for f in setup_failures if f.at > proven_at], now)
+    if everywhere is not None:
+        out[EVERYWHERE] = everywhere
+    return out
+
+
+def backoff(failures: list[Failure], now: float) -> Backoff | None:
+    """Return the rest that a run of failures earns, or None when it is over."""
+    recent = sorted((f for f in failures if now - f.at < FORGIVE_S), key=lambda f: f.at)
+    if not recent:
+        return None
+    last = recent[-1]
+    rest_s = min(BASE_S * 2.0 ** min(len(recent) - 1, 16), LIMIT_S)
+    if last.cause == "quota":  # waiting a little does not help: the account is full
+        rest_s = LIMIT_S
+    if now >= last.at + rest_s:
+        return None
+    return Backoff(until=last.at + rest_s, failures=len(recent), cause=last.cause)

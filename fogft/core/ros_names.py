@@ -1,0 +1,65 @@
+"""ROS 2's rules for the names that stand in a pool file. Pure: nothing is looked up.
+
+Kept equal to what ROS itself accepts by tests/ros/test_service_names.
+
+Source: the ROS 2 design documents on topic and service names and on interface
+definitions; `rmw_validate_full_topic_name` and rosidl's own patterns.
+"""
+
+from __future__ import annotations
+
+import re
+
+MAX_SERVICE_NAME = 240  # DDS allows 255; ROS adds a prefix and a suffix
+_TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_FIELD = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")
+_PACKAGE = _FIELD
+_INTERFACE = re.compile(r"[A-Z][A-Za-z0-9]*")
+
+
+def absolute_service_name(name: str) -> str:
+    """Return a service's absolute name: ``detect`` becomes ``/detect``.
+
+    Raises:
+        ValueError: It is not a service name; the text says why.
+    """
+    if name.startswith("~") or "{" in name:
+        raise ValueError("private names and substitutions need a node; write the full name")
+    absolute = name if name.startswith("/") else "/" + name
+    if len(absolute) > MAX_SERVICE_NAME:
+        raise ValueError(f"it is longer than {MAX_SERVICE_NAME} characters")
+    for token in absolute[1:].split("/"):
+        if not token:
+            raise ValueError("there is nothing between, or after, two slashes")
+        if token[0].isdigit():
+            raise ValueError("a part begins with a digit")
+        if not _TOKEN.fullmatch(token):
+            raise ValueError("only letters, digits, `_` and `/` are allowed")
+    return absolute
+
+
+def is_service_type(name: str) -> bool:
+    """Whether this has the form ``package/srv/Name``."""
+    parts = name.split("/")
+    return (
+        len(parts) == 3
+        and bool(_PACKAGE.fullmatch(parts[0]))
+        and parts[1] == "srv"
+        and bool(_INTERFACE.fullmatch(parts[2]))
+    )
+
+
+def suggested_service_type(name: str) -> str:
+    """Return the service type that was probably meant, or an empty text."""
+    parts = [part for part in re.split(r"[./:]+", name.strip()) if part]
+    if len(parts) == 2:
+        parts.insert(1, "srv")
+    if len(parts) == 3 and parts[1] == "srvs":
+        parts[1] = "srv"
+    guess = "/".join(parts)
+    return guess if is_service_type(guess) else ""
+
+
+def is_field_name(name: str) -> bool:
+    """Whether a ROS message may have a field of this name."""
+    return bool(_FIELD.fullmatch(name))

@@ -1,0 +1,89 @@
+"""What a pool file asks for, as values. Reading and judging the file is `spec_reader`'s."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+
+class OnTimeout(str, Enum):
+    """What the caller gets when no replica answered before the deadline."""
+
+    SILENT = "silent"  # no response: an empty list of obstacles is never mistaken for a clear road
+    EMPTY = "empty"  # a default-constructed response, as in the paper
+
+
+@dataclass(frozen=True)
+class ServiceSpec:
+    """One proxied service.
+
+    Attributes:
+        timeout_s: From the request's arrival at the client proxy to its deadline.
+        ok_field: Name of a boolean response field that must be true while another
+            attempt is left; empty for none.
+    """
+
+    name: str
+    type: str
+    timeout_s: float = 10.0
+    on_timeout: OnTimeout = OnTimeout.SILENT
+    ok_field: str = ""
+
+
+@dataclass(frozen=True)
+class HealthSpec:
+    """When a replica is doubted, and when it is replaced. Seconds.
+
+    Attributes:
+        suspect_after_s: Probes unanswered for so long: nothing more is sent there.
+        replace_after_s: Suspect for so long, while others answer: it is replaced.
+        start_limit_s: Not ready so long after its launch: the launch has failed.
+        orphan_after_s: A replica that hears of no manager for so long ends itself.
+    """
+
+    suspect_after_s: float = 2.0
+    replace_after_s: float = 15.0
+    start_limit_s: float = 900.0
+    orphan_after_s: float = 3600.0
+
+
+@dataclass(frozen=True)
+class PoolSpec:
+    """A whole pool file.
+
+    Attributes:
+        name: The pool's name: lower-case letters, digits and dashes, at most 40.
+        services: At least one, names distinct.
+        replicas: How many should be ready.
+        max_surge: How many more may exist while one replaces another.
+        max_usd_per_hour: Cap on the price of all machines together, surge included;
+            None for no cap.
+        task: The SkyPilot task: the file without its `fogft` section.
+    """
+
+    name: str
+    services: tuple[ServiceSpec, ...]
+    replicas: int = 2
+    max_surge: int = 1
+    max_usd_per_hour: float | None = None
+    health: HealthSpec = field(default_factory=HealthSpec)
+    task: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def replica_hash(self) -> str:
+        """16 hexadecimal digits that change when running replicas must be replaced.
+
+        Covers what a replica runs and serves, and the machine it needs; not how many
+        there are, how long the robot waits, or in what order regions are listed.
+        """
+        asked = {
+            "services": sorted((s.name, s.type) for s in self.services),
+            "orphan_after_s": self.health.orphan_after_s,
+            "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
+        }
+        canonical = json.dumps(asked, sort_keys=True, default=str)
+        return hashlib.sha256(canonical.encode()).hexdigest()[:16]

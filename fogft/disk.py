@@ -1,0 +1,159 @@
+"""Files as every process here shares them: written whole, private, locked by the kernel.
+
+A reader sees the old file or the new one, never a torn one; a full disk leaves the old one.
+Locks are flocks: they end with the process that holds them, whatever ends it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from fogft.core.errors import PoolBusy, StateError
+
+_PATIENCE_S = 0.2
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder that only this user can enter, and those above it."""
+    path.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(OSError):
+        path.chmod(0o700)
+
+
+def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> None:
+    """Replace a file at once, mode 0600; its folder must exist.
+
+    Args:
+        path: The file.
+        content: Bytes, or text for UTF-8.
+        durable: Whether it must survive a power cut (one fsync).
+
+    Raises:
+        StateError: It cannot be written; the old file is as it was.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    temporary = ""
+    try:
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise StateError(
+            f"`{path}` cannot be written: {error.strerror}",
+            "check the disk's free space and the folder's owner",
+        ) from error
+
+
+def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
+    """Replace a file with a value as JSON; see `write_whole`."""
+    write_whole(path, json.dumps(value, indent=1) + "\n", durable=durable)
+
+
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds, or None where there is no file.
+
+    Raises:
+        StateError: It cannot be read or is not JSON.
+    """
+    try:
+        text = path.read_text()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise StateError(f"`{path}` cannot be read: {error}") from error
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise StateError(f"`{path}` is damaged: {error}") from error
+
+
+class Lock:
+    """An exclusive lock on a file, held until `release` or the end of the process."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._descriptor: int | None = None
+
+    def acquire(self, *, wait: bool) -> bool:
+        """Take the lock; without `wait`, return False where another keeps it.
+
+        Whoever only looks whether it is held (`is_locked`) holds it for an instant, so one
+        refusal proves nothing: it is tried for a moment.
+        """
+        if wait:
+            return self._try(fcntl.LOCK_EX)
+        until = time.monotonic() + _PATIENCE_S
+        while not self._try(fcntl.LOCK_EX | fcntl.LOCK_NB):
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.01)
+        return True
+
+    def take_if_free(self) -> bool:
+        """Take the lock if it is free now, without patience, for who only wants to look."""
+        return self._try(fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def _try(self, how: int) -> bool:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, how)
+        except BlockingIOError:
+            os.close(descriptor)
+            return False
+        self._descriptor = descriptor
+        return True
+
+    def release(self) -> None:
+        """Give the lock back. Repeatable."""
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold a lock for a while.
+
+    Raises:
+        PoolBusy: Another process holds it, and `wait` is false.
+        StateError: There is no such folder, or the file cannot be made.
+    """
+    lock = Lock(path)
+    try:
+        taken = lock.acquire(wait=wait)
+    except OSError as error:
+        raise StateError(
+            f"`{path}` cannot be opened: {error.strerror}",
+            "check the disk's free space and the folder's owner",
+        ) from error
+    if not taken:
+        raise PoolBusy(f"`{path}` is held by another process")
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def is_locked(path: Path) -> bool:
+    """Return whether a living process holds the lock of this file."""
+    if not path.exists():
+        return False
+    lock = Lock(path)
+    if not lock.take_if_free():
+        return True
+    lock.release()
+    return False

@@ -1,0 +1,89 @@
+"""What a check found, and what to do about it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from fogft.core.spec import PoolSpec
+
+
+class Verdict(str, Enum):
+    """How bad it is."""
+
+    OK = "ok"
+    WARN = "warn"  # works, but will surprise
+    FAIL = "fail"  # does not work
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        check: What was looked at, in one or two words.
+        text: What was found.
+        advice: What to do; empty when there is nothing to do.
+    """
+
+    check: str
+    verdict: Verdict
+    text: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What the checks may look at.
+
+    Attributes:
+        home: fogft's state folder.
+        pools: Names of the pools in it.
+        spec: The pool file asked about, if any.
+        now: Seconds since the epoch, by this machine's clock.
+    """
+
+    home: Path
+    pools: tuple[str, ...] = ()
+    spec: PoolSpec | None = None
+    now: float = 0.0
+
+
+Check = Callable[[Situation], Iterable[Finding]]
+
+
+def ok(check: str, text: str) -> Finding:
+    """Return a finding that needs nothing done."""
+    return Finding(check, Verdict.OK, text)
+
+
+def warn(check: str, text: str, advice: str) -> Finding:
+    """Return a finding that will surprise somebody, with what to do."""
+    return Finding(check, Verdict.WARN, text, advice)
+
+
+def fail(check: str, text: str, advice: str) -> Finding:
+    """Return a finding that stops a pool from working, with what to do."""
+    return Finding(check, Verdict.FAIL, text, advice)
+
+
+def run(checks: Iterable[Check], situation: Situation) -> Iterator[Finding]:
+    """Run checks one after the other and yield what they find as they find it."""
+    for check in checks:
+        try:
+            yield from check(situation)
+        except Exception as error:
+            name = check.__name__.replace("_", " ")
+            yield fail(
+                name,
+                f"the check itself failed: {type(error).__name__}: {error}",
+                "report this as a defect of `fogft doctor`",
+            )
+
+
+def situation(home: Path, pools: Iterable[str], spec: PoolSpec | None) -> Situation:
+    """Return what is to be looked at now."""
+    return Situation(home, tuple(pools), spec, time.time())

@@ -1,0 +1,74 @@
+"""Checks for what dead processes and forgotten pools left behind.
+
+A process that is killed cannot remove its segments. They are harmless but take memory
+until the machine restarts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+from fogft.cloud.local import faults as local_faults
+from fogft.cloud.local import processes as local_processes
+from fogft.core.errors import FogftError
+from fogft.doctor.finding import Check, Finding, Situation, ok, warn
+from fogft.pool.paths import PoolPaths
+from fogft.pool.store import read_identity
+from fogft.ros import shared_memory
+
+
+def segments(_: Situation) -> Iterator[Finding]:
+    """No shared memory of ROS is without a process."""
+    abandoned = shared_memory.abandoned()
+    if not abandoned:
+        yield ok("leftovers", "no shared memory of dead processes")
+        return
+    size = 0
+    for path in abandoned:
+        with contextlib.suppress(OSError):
+            size += path.stat().st_blocks * 512
+    yield warn(
+        "leftovers",
+        f"{len(abandoned)} files of dead processes in {shared_memory.FOLDER} "
+        f"hold {size / 2**20:.1f} MiB",
+        "they do no harm but take memory; the next `fogft down` removes them",
+    )
+
+
+def processes(situation: Situation) -> Iterator[Finding]:
+    """No replica of the local cloud runs without a pool that it belongs to."""
+    uids = []
+    for pool in situation.pools:
+        with contextlib.suppress(FogftError):
+            uids.append(read_identity(PoolPaths.of(pool, situation.home)).uid)
+    owned = {pid for uid in uids for pid in local_processes.find(pool_uid=uid)}
+    orphans = [pid for pid in local_processes.find() if pid not in owned]
+    if not orphans:
+        yield ok("leftovers", "no replicas without a pool")
+        return
+    listed = " ".join(map(str, orphans[:20]))
+    yield warn(
+        "leftovers",
+        f"{len(orphans)} processes of replicas run whose pool is not in `{situation.home}`",
+        "they end themselves after `orphan_after_s`. Is FOGFT_HOME the one that the pool was "
+        f"started with? If the pool is gone for good: `kill {listed}`",
+    )
+
+
+def chaos(situation: Situation) -> Iterator[Finding]:
+    """Nothing that `fogft chaos` did to locations lasts."""
+    faults = local_faults.read_cloud(situation.home / "local")
+    found = [f"`{place}` is out" for place in faults.out(situation.now)]
+    found += [
+        f"`{place}` has room for {n} machines" for place, n in sorted(faults.capacity.items())
+    ]
+    if found:
+        yield warn(
+            "leftovers",
+            f"`fogft chaos` lasts, for every pool: {', '.join(found)}",
+            "undo it with `fogft chaos clear`",
+        )
+
+
+CHECKS: tuple[Check, ...] = (segments, processes, chaos)

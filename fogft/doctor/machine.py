@@ -1,0 +1,163 @@
+"""Checks of this machine: Python, the installation, disk, shared memory, ports, the clock."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+
+import fogft
+from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
+
+_PYTHON_FIRST, _PYTHON_LAST = (3, 10), (3, 13)
+_NEEDED_MODULES = {"zenoh": "eclipse-zenoh", "cryptography": "cryptography", "yaml": "pyyaml"}
+_SHARED_MEMORY = Path("/dev/shm")
+# One segment of the shipped Fast DDS profile for each process, and a pool has a handful.
+_SHARED_MEMORY_WANTED_BYTES = 256 << 20
+_DISK_WANTED_BYTES = 200 << 20
+_DEFAULT_PORT = 7447
+
+
+def python(_: Situation) -> Iterator[Finding]:
+    """Python is of a version that is tested."""
+    text = ".".join(map(str, sys.version_info[:3]))
+    if not _PYTHON_FIRST <= sys.version_info[:2] <= _PYTHON_LAST:
+        yield fail("python", f"Python {text} is not supported", "use Python 3.10 to 3.13")
+    else:
+        yield ok("python", f"Python {text} at {sys.executable}")
+
+
+def installation(_: Situation) -> Iterator[Finding]:
+    """fogft and what it depends on are installed, and the command is found."""
+    missing = [name for module, name in _NEEDED_MODULES.items() if find_spec(module) is None]
+    if missing:
+        yield fail("fogft", f"not installed: {', '.join(missing)}", "run `pip install fogft`")
+        return
+    where = Path(fogft.__file__).parent
+    try:
+        version = metadata.version("fogft")
+    except metadata.PackageNotFoundError:
+        yield ok("fogft", f"fogft {fogft.__version__}, run from its sources at {where.parent}")
+        return
+    if shutil.which("fogft") is None:
+        beside = Path(sys.executable).parent
+        yield warn(
+            "fogft",
+            f"fogft {version} is installed, but `fogft` is not on the PATH",
+            f"activate the virtual environment, or add {beside} to PATH",
+        )
+    else:
+        yield ok("fogft", f"fogft {version} at {where}")
+
+
+def state_folder(situation: Situation) -> Iterator[Finding]:
+    """The state folder can be written, is private, and its disk has room."""
+    home = situation.home
+    existing = next(p for p in (home, *home.parents) if p.exists())
+    if not os.access(existing, os.W_OK | os.X_OK):
+        yield fail(
+            "state folder",
+            f"`{home}` cannot be written",
+            f"make `{existing}` yours, or set FOGFT_HOME to another folder",
+        )
+        return
+    if home.exists() and home.stat().st_mode & 0o077:
+        yield warn(
+            "state folder",
+            f"`{home}` can be read by other users; it holds private keys",
+            f"run `chmod 700 {home}`",
+        )
+    free = shutil.disk_usage(existing).free
+    if free < _DISK_WANTED_BYTES:
+        yield warn(
+            "state folder",
+            f"only {_megabytes(free)} free at `{existing}`",
+            "free some space: logs and credentials are written there",
+        )
+    else:
+        yield ok("state folder", f"`{home}`, {_megabytes(free)} free")
+
+
+def shared_memory(_: Situation) -> Iterator[Finding]:
+    """There is room in /dev/shm, through which ROS passes messages on one machine."""
+    advice = "in a container, start it with `--shm-size=1g` (or `--ipc=host`)"
+    if not _SHARED_MEMORY.is_dir() or not os.access(_SHARED_MEMORY, os.W_OK):
+        yield fail("shared memory", "there is no writable /dev/shm", advice)
+        return
+    usage = shutil.disk_usage(_SHARED_MEMORY)
+    text = f"{_megabytes(usage.free)} of {_megabytes(usage.total)} free in /dev/shm"
+    if usage.free < _SHARED_MEMORY_WANTED_BYTES:
+        yield warn("shared memory", f"only {text}; large messages will be slow", advice)
+    else:
+        yield ok("shared memory", text)
+
+
+def ports(_: Situation) -> Iterator[Finding]:
+    """Loopback can be bound, and the usual port of a server proxy is free."""
+    try:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+    except OSError as error:
+        yield fail(
+            "ports",
+            f"no TCP port can be bound on 127.0.0.1: {error.strerror}",
+            "bring the loopback interface up: `ip link set lo up`",
+        )
+        return
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(("0.0.0.0", _DEFAULT_PORT))
+    except OSError:
+        yield warn(
+            "ports",
+            f"TCP port {_DEFAULT_PORT} is taken; `fogft serve` uses it unless told otherwise",
+            "pass `--listen HOST:PORT` when you run `fogft serve` here; pools on the local "
+            "cloud choose free ports themselves",
+        )
+    else:
+        yield ok("ports", f"TCP ports can be bound on loopback; {_DEFAULT_PORT} is free")
+
+
+def clock(situation: Situation) -> Iterator[Finding]:
+    """The clock is not in the past, and agrees with the file system's."""
+    built = max(p.stat().st_mtime for p in Path(fogft.__file__).parent.rglob("*.py"))
+    shown = datetime.fromtimestamp(situation.now, timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
+    advice = "set the clock, for example with `sudo timedatectl set-ntp true`"
+    if situation.now < built - 86400:
+        yield fail("clock", f"it is {shown} here, before fogft itself was installed", advice)
+        return
+    existing = next(p for p in (situation.home, *situation.home.parents) if p.exists())
+    folder = str(existing) if os.access(existing, os.W_OK) else None
+    with tempfile.NamedTemporaryFile(dir=folder) as probe:
+        before = time.time()
+        os.utime(probe.fileno())
+        apart = Path(probe.name).stat().st_mtime - before
+    if abs(apart) > 1.0:
+        yield warn(
+            "clock",
+            f"the file system of `{existing}` is {abs(apart):.0f} s {_ahead(apart)} of this clock",
+            "use a local disk for FOGFT_HOME, or set both clocks by NTP: ages in `fogft status` "
+            "will be wrong",
+        )
+    else:
+        yield ok("clock", shown)
+
+
+def _ahead(seconds: float) -> str:
+    return "ahead" if seconds > 0 else "behind"
+
+
+def _megabytes(size: float) -> str:
+    return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.0f} MiB"
+
+
+CHECKS: tuple[Check, ...] = (python, installation, state_folder, shared_memory, ports, clock)

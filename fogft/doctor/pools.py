@@ -1,0 +1,164 @@
+"""Checks of a pool file and of the pools on this machine: credentials, manager, proxy, links."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+from fogft import disk
+from fogft.core.errors import CredentialError, FogftError
+from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
+from fogft.pool import credentials
+from fogft.pool.paths import PoolPaths
+
+_EXPIRY_WARNING = timedelta(days=3)
+# The client proxy reports twice a second.
+_REPORT_LIMIT_S = 10.0
+
+
+def pool_file(situation: Situation) -> Iterator[Finding]:
+    """The types of a pool file's services can be loaded here."""
+    if situation.spec is None:
+        return
+    from fogft.ros.types import check_service_type
+
+    for service in situation.spec.services:
+        problem = check_service_type(service.type)
+        if problem:
+            yield fail(
+                "pool file",
+                f"service `{service.name}`: {problem}",
+                "install the package of that type, or source its workspace",
+            )
+        else:
+            yield ok("pool file", f"service `{service.name}` of type `{service.type}`")
+
+
+def certificates(situation: Situation) -> Iterator[Finding]:
+    """Every pool's certificates are valid now, its keys private."""
+    now = datetime.fromtimestamp(situation.now, timezone.utc)
+    for pool in situation.pools:
+        folder = PoolPaths.of(pool, situation.home).credentials
+        if not folder.is_dir():
+            yield warn(
+                "credentials",
+                f"pool `{pool}` has none yet",
+                "its manager makes them; see `fogft logs`",
+            )
+            continue
+        problems = list(judge_folder(pool, folder, now))
+        yield from problems
+        if not problems:
+            count = len(list(folder.rglob("*.crt")))
+            yield ok("credentials", f"pool `{pool}`: {count} certificates valid, keys private")
+
+
+def judge_folder(pool: str, folder: Path, now: datetime) -> Iterator[Finding]:
+    """Judge the keys and certificates in a folder; yield nothing when all is well."""
+    for key in sorted(folder.rglob("*.key")):
+        if key.stat().st_mode & 0o077:
+            yield fail(
+                "credentials",
+                f"pool `{pool}`: `{key}` can be read by other users",
+                f"run `chmod 600 {key}`",
+            )
+    anew = f"run `fogft down {pool}` and `fogft up` again: that makes new ones"
+    for certificate in sorted(folder.rglob("*.crt")):
+        try:
+            said = credentials.describe(certificate)
+        except CredentialError as error:
+            yield fail("credentials", f"pool `{pool}`: {error.message}", anew)
+            continue
+        problem = said.problem(now)
+        if problem:
+            yield fail(
+                "credentials",
+                f"pool `{pool}`: `{certificate.name}` ({said.common_name}) is {problem}",
+                f"is this machine's clock right (see `clock`)? If so, {anew}",
+            )
+        elif said.not_after - now < _EXPIRY_WARNING:
+            yield warn(
+                "credentials",
+                f"pool `{pool}`: `{certificate.name}` expires at "
+                f"{said.not_after:%Y-%m-%d %H:%M} UTC",
+                anew,
+            )
+
+
+def processes(situation: Situation) -> Iterator[Finding]:
+    """Every pool has a manager and a client proxy."""
+    for pool in situation.pools:
+        paths = PoolPaths.of(pool, situation.home)
+        if disk.is_locked(paths.manager_lock):
+            yield ok("manager", f"pool `{pool}`: runs")
+        else:
+            yield warn(
+                "manager",
+                f"pool `{pool}` has none: requests go on, but nothing lost is replaced",
+                "start it with `fogft up FILE`, or end the pool with `fogft down`",
+            )
+        if disk.is_locked(paths.proxy_lock):
+            yield ok("client proxy", f"pool `{pool}`: runs")
+        else:
+            yield fail(
+                "client proxy",
+                f"pool `{pool}` has none: no request is answered",
+                f"its manager starts it; see `{paths.proxy_log}`",
+            )
+
+
+def links(situation: Situation) -> Iterator[Finding]:
+    """Every link of a running client proxy is up and its replica ready."""
+    for pool in situation.pools:
+        paths = PoolPaths.of(pool, situation.home)
+        try:
+            report = disk.read_json(paths.proxy_status) or {}
+        except FogftError as error:
+            yield fail("links", f"pool `{pool}`: {error.message}", "see its log")
+            continue
+        if not disk.is_locked(paths.proxy_lock):
+            continue
+        age_s = situation.now - float(report.get("written_at") or 0.0)
+        if age_s > _REPORT_LIMIT_S:
+            yield fail(
+                "links",
+                f"pool `{pool}`: its client proxy last reported {age_s:.0f} s ago",
+                f"it hangs or is stopped; end process {report.get('pid')}: "
+                "the manager starts another",
+            )
+            continue
+        yield from judge_links(pool, report.get("links") or [])
+
+
+def judge_links(pool: str, reported: list[dict[str, object]]) -> Iterator[Finding]:
+    """Judge the links that a client proxy reports."""
+    up = [link for link in reported if link.get("state") == "up"]
+    for link in reported:
+        name = f"{link.get('slot')}.{link.get('generation')}"
+        if link.get("state") == "up" and link.get("detail"):
+            yield warn(
+                "replicas",
+                f"pool `{pool}`: replica `{name}` is not ready: {link.get('detail')}",
+                f"`fogft logs {link.get('slot')}` shows what `run` says; is each `name` and `type` "
+                "in the pool file what the node offers?",
+            )
+        elif link.get("state") != "up":
+            detail = link.get("detail") or "it does not answer probes"
+            yield warn(
+                "links",
+                f"pool `{pool}`: replica `{name}` is {link.get('state')}: {detail}",
+                "it is replaced by itself if it stays silent; see `fogft status` and "
+                f"`fogft logs {link.get('slot')}`",
+            )
+    if reported and not up:
+        yield fail(
+            "links",
+            f"pool `{pool}`: no link is up",
+            "check this machine's own network first: all links went silent together",
+        )
+    elif up:
+        yield ok("links", f"pool `{pool}`: {len(up)} of {len(reported)} up")
+
+
+CHECKS: tuple[Check, ...] = (pool_file, certificates, processes, links)

@@ -1,0 +1,205 @@
+"""Checks of ROS 2: installed, its middleware, its domain, its profile, and that it works.
+
+rclpy is never imported here but in processes of their own: it may be broken, and a
+broken one can end the process that imports it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import fogft
+from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
+from fogft.ros import environment
+
+_LIMIT_S = 30.0
+_RMW_WITH_PROFILE = "rmw_fastrtps_cpp"
+# Above, the ports of DDS run into those that Linux gives to outgoing connections.
+_LAST_SAFE_DOMAIN, _LAST_DOMAIN = 101, 232
+_RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+_DISCOVERY_ADVICE = (
+    "if this machine has no multicast (many containers and networks have none), set "
+    "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or list peers in ROS_STATIC_PEERS; "
+    "also check the firewall for UDP"
+)
+
+
+def rclpy(_: Situation) -> Iterator[Finding]:
+    """ROS 2 can be imported, with a middleware that is known to work."""
+    described = _self_test("describe")
+    problem = described.get("error") or (not described["rmw"] and described["rclpy"])
+    if problem:
+        yield fail(
+            "rclpy",
+            f"ROS 2 cannot be used from this Python: {problem}",
+            "source your installation (`. /opt/ros/DISTRO/setup.bash`), or run "
+            "`pip install 'fogft[ros]'`",
+        )
+        return
+    yield ok(
+        "rclpy",
+        f"ROS 2 {described['distribution'].capitalize()}, rclpy {described['rclpy']}",
+    )
+    rmw = described["rmw"]
+    if rmw == _RMW_WITH_PROFILE:
+        yield ok("middleware", rmw)
+    else:
+        yield warn(
+            "middleware",
+            f"{rmw}: works, but is not what fogft is measured on",
+            f"for the speeds in the documentation set RMW_IMPLEMENTATION={_RMW_WITH_PROFILE}",
+        )
+
+
+def domain(_: Situation) -> Iterator[Finding]:
+    """The ROS domain and the range of discovery make sense."""
+    yield from judge_domain(os.environ)
+
+
+def judge_domain(environ: Mapping[str, str]) -> Iterator[Finding]:
+    """Judge the variables that decide who sees whom."""
+    text = environ.get("ROS_DOMAIN_ID", "") or "0"
+    if not text.isdecimal() or int(text) > _LAST_DOMAIN:
+        yield fail(
+            "ROS domain",
+            f"ROS_DOMAIN_ID is `{text}`",
+            f"set it to a number from 0 to {_LAST_SAFE_DOMAIN}, the same in every terminal",
+        )
+    elif int(text) > _LAST_SAFE_DOMAIN:
+        yield warn(
+            "ROS domain",
+            f"ROS_DOMAIN_ID is {text}; its ports may be taken by outgoing connections",
+            f"use a number from 0 to {_LAST_SAFE_DOMAIN}",
+        )
+    else:
+        yield ok("ROS domain", f"{text}; your nodes must use the same")
+    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
+    if reach and reach not in _RANGES:
+        yield fail(
+            "discovery range",
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE is `{reach}`",
+            f"set it to one of {', '.join(_RANGES[:3])}",
+        )
+    elif reach == "OFF" and not environ.get("ROS_STATIC_PEERS"):
+        yield fail(
+            "discovery range",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is `OFF` and there are no ROS_STATIC_PEERS: "
+            "no node finds any other",
+            "set it to LOCALHOST",
+        )
+    elif environ.get("ROS_LOCALHOST_ONLY"):
+        yield warn(
+            "discovery range",
+            "ROS_LOCALHOST_ONLY is set; newer ROS versions drop it",
+            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST instead",
+        )
+    else:
+        yield ok("discovery range", reach or "SUBNET (the default)")
+
+
+def profile(_: Situation) -> Iterator[Finding]:
+    """Fast DDS gets a profile with a shared-memory segment large enough for images."""
+    name = environment.PROFILE_VARIABLE
+    theirs = os.environ.get(name)
+    if theirs:
+        try:
+            ElementTree.parse(theirs)
+        except (OSError, ElementTree.ParseError) as error:
+            yield fail(
+                "Fast DDS profile",
+                f"{name} is `{theirs}`, which cannot be read: {error}",
+                "correct the path or unset the variable: fogft then uses its own profile",
+            )
+        else:
+            yield ok("Fast DDS profile", f"yours, {theirs}")
+        return
+    prepared = dict(os.environ)
+    if environment.prepare(prepared):
+        yield warn(
+            "Fast DDS profile",
+            "your nodes have none: messages over 0.5 MB take ten times as long",
+            f"export {name}={prepared[name]} where your nodes start, as fogft's processes do",
+        )
+    else:
+        yield ok("Fast DDS profile", "chosen by you")
+
+
+def discovery(_: Situation) -> Iterator[Finding]:
+    """Two processes find each other in this environment and one calls the other."""
+    name = f"fogft_doctor_{secrets.token_hex(4)}"
+    with subprocess.Popen(
+        _command("answer", name),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=_environ(),
+    ) as answering:
+        try:
+            result = _self_test("ask", name)
+        finally:
+            if answering.stdin:
+                answering.stdin.close()
+            try:
+                answering.wait(5)
+            except subprocess.TimeoutExpired:
+                answering.kill()
+    if "error" not in result:
+        found, called = result["discovery_s"], result["call_s"]
+        yield ok(
+            "discovery",
+            f"a node was found in {found:.1f} s and answered in {called * 1000:.1f} ms",
+        )
+    elif result.get("kind") == "TimeoutError" and result["error"] == "discovery":
+        yield fail("discovery", "two nodes here do not find each other", _DISCOVERY_ADVICE)
+    elif result.get("kind") == "TimeoutError":
+        yield fail(
+            "discovery",
+            "a node was found, but its service did not answer",
+            "check /dev/shm (two users or containers may see different ones) and the firewall",
+        )
+    else:
+        yield fail("discovery", f"could not be tried: {result['error']}", "see `rclpy` above")
+
+
+def _self_test(*arguments: str) -> dict[str, Any]:
+    """Run `fogft.ros.self_test`; return what it printed, or ``{"error": ...}``."""
+    try:
+        ended = subprocess.run(
+            _command(*arguments),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_LIMIT_S,
+            env=_environ(),
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return {"error": f"no answer within {_LIMIT_S:.0f} s"}
+    try:
+        result = json.loads(ended.stdout.strip().splitlines()[-1])
+    except (ValueError, IndexError):
+        said = ended.stderr.strip().splitlines() or ["nothing was said"]
+        return {"error": f"it ended with status {ended.returncode}: {said[-1]}"}
+    return result if isinstance(result, dict) else {"error": "no answer"}
+
+
+def _command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "fogft.ros.self_test", *arguments]
+
+
+def _environ() -> dict[str, str]:
+    """Return our environment, with fogft importable also when it is run from its sources."""
+    ours = str(Path(fogft.__file__).parent.parent)
+    path = [ours, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
+
+
+CHECKS: tuple[Check, ...] = (rclpy, domain, profile, discovery)

@@ -1,0 +1,163 @@
+"""What the manager writes for the proxies: their configurations and certificates.
+
+Owns: the values in `templates/proxy.yaml` and `templates/replica.yaml`, and who gets which
+certificate.
+Not here: reading them (`fogft.proxy.config`) and signing (`credentials`).
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.cloud.port import Launch
+from fogft.core import names
+from fogft.core.errors import CredentialError
+from fogft.core.model import ReplicaId
+from fogft.core.planner import PlannedLaunch
+from fogft.core.spec import PoolSpec
+from fogft.pool import credentials, templates
+from fogft.pool.paths import PoolPaths
+from fogft.pool.store import Identity
+
+# A dead manager renews nothing and must stop no traffic.
+CERTIFICATE_DAYS = 365.0
+RENEW_BEFORE = datetime.timedelta(days=60)
+
+
+def robot_name() -> str:
+    """Return this machine's name, fit for a certificate."""
+    return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:40] or "robot"
+
+
+def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> bool:
+    """Bring the client proxy's configuration up to date; return whether it changed.
+
+    Raises:
+        StateError: It cannot be written.
+    """
+    content = templates.render(
+        "proxy.yaml",
+        {
+            "pool": identity.name,
+            "pool_uid": identity.uid,
+            "robot": robot_name(),
+            "membership": paths.membership.name,
+            "status": paths.proxy_status.name,
+            "lease": paths.lease.name,
+            "lock": paths.proxy_lock.name,
+            "ca": f"{paths.credentials.name}/ca.crt",
+            "certificate": f"{paths.credentials.name}/robot.crt",
+            "key": f"{paths.credentials.name}/robot.key",
+            "services": [
+                {
+                    "name": service.name,
+                    "type": service.type,
+                    "timeout_s": service.timeout_s,
+                    "on_timeout": service.on_timeout.value,
+                    "ok_field": service.ok_field,
+                }
+                for service in spec.services
+            ],
+            "suspect_after_s": spec.health.suspect_after_s,
+        },
+    )
+    if paths.proxy_config.exists() and paths.proxy_config.read_text() == content:
+        return False
+    disk.write_whole(paths.proxy_config, content)
+    return True
+
+
+def certify_robot(paths: PoolPaths, identity: Identity, now: datetime.datetime) -> bool:
+    """See to it that the client proxy has a certificate that lasts; return whether it is new.
+
+    Raises:
+        CredentialError: The pool's CA cannot be used.
+    """
+    certificate = paths.credentials / "robot.crt"
+    try:
+        if not credentials.describe(certificate).problem(now + RENEW_BEFORE):
+            return False
+    except CredentialError:
+        pass  # there is none yet, or it is damaged: a new one is issued
+    name = names.robot_certificate_name(identity.uid, robot_name())
+    issued = credentials.issue(
+        paths.credentials, name, role=credentials.Role.ROBOT, days=CERTIFICATE_DAYS
+    )
+    credentials.write(issued, paths.credentials, "robot")
+    return True
+
+
+def build_order(
+    paths: PoolPaths, identity: Identity, spec: PoolSpec, planned: PlannedLaunch
+) -> Launch:
+    """Return the order of a planned launch, with all that its server proxy needs.
+
+    Raises:
+        CredentialError: The pool's CA cannot be used.
+    """
+    id = ReplicaId(identity.uid, planned.slot, planned.generation)
+    issued = credentials.issue(
+        paths.credentials,
+        names.replica_certificate_name(id),
+        role=credentials.Role.REPLICA,
+        days=CERTIFICATE_DAYS,
+    )
+    return Launch(
+        id=id,
+        pool=identity.name,
+        placement=planned.offer.placement,
+        usd_per_hour=planned.offer.usd_per_hour,
+        spec_hash=spec.replica_hash,
+        task=absolute(spec.task, Path(identity.file).parent),
+        files={
+            "replica.yaml": replica_config(identity, spec, id).encode(),
+            "ca.crt": issued.authority_pem,
+            "replica.crt": issued.certificate_pem,
+            "replica.key": issued.key_pem,
+        },
+    )
+
+
+def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
+    """Return a replica's configuration. Address, domain and folder are the machine's to add."""
+    envs: Mapping[str, Any] = spec.task.get("envs") or {}
+    return templates.render(
+        "replica.yaml",
+        {
+            "pool": identity.name,
+            "pool_uid": identity.uid,
+            "slot": id.slot,
+            "generation": id.generation,
+            "services": [{"name": s.name, "type": s.type} for s in spec.services],
+            "run": str(spec.task.get("run") or ""),
+            "envs": {str(k): "" if v is None else str(v) for k, v in envs.items()},
+            "orphan_after_s": spec.health.orphan_after_s,
+        },
+    )
+
+
+def absolute(task: Mapping[str, Any], base: Path) -> dict[str, Any]:
+    """Return a task whose local paths no longer depend on where a process runs.
+
+    Relative paths in a pool file are relative to the file's own folder.
+    """
+    out = dict(task)
+    if isinstance(out.get("workdir"), str):
+        out["workdir"] = _absolute(out["workdir"], base)
+    mounts = out.get("file_mounts")
+    if isinstance(mounts, Mapping):
+        out["file_mounts"] = {
+            target: _absolute(source, base) if isinstance(source, str) else source
+            for target, source in mounts.items()
+        }
+    return out
+
+
+def _absolute(path: str, base: Path) -> str:
+    return path if "://" in path else str((base / Path(path).expanduser()).resolve())

@@ -1,0 +1,216 @@
+"""The manager: one process a pool that ticks, once a second or when something changes.
+
+SIGTERM ends the managing, never the pool: replicas and the client proxy run on, and the
+next manager takes over what it finds.
+
+Owns: the loop, what wakes it, and the pool's status file.
+Not here: a tick's work (`reconciler`), the client proxy's life (`proxy_supervisor`).
+"""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from fogft import disk
+from fogft.cloud.port import Cloud
+from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
+from fogft.core.model import LinkReport
+from fogft.pool import configuration, proxy_report, status
+from fogft.pool.lease import Lease
+from fogft.pool.proxy_supervisor import ProxySupervisor
+from fogft.pool.reconciler import Reconciler, Tick
+from fogft.pool.store import PoolStore
+
+log = logging.getLogger(__name__)
+
+TICK_S = 1.0
+WATCH_S = 0.05
+CERTIFY_EVERY_S = 3600.0
+
+
+class Manager:
+    """Manages one pool until told to stop. Holds the pool's lease from the start.
+
+    Args:
+        store: The pool's folder.
+        cloud: Where its machines run.
+        proxy_command: What to start as client proxy, in place of our own.
+
+    Raises:
+        PoolBusy: The pool has a manager.
+        PoolNotFound: There is no such pool.
+    """
+
+    def __init__(
+        self, store: PoolStore, cloud: Cloud, *, proxy_command: Sequence[str] | None = None
+    ) -> None:
+        self._store = store
+        self._paths = store.paths
+        self._identity = store.identity()
+        published = store.membership()
+        self._lease = Lease.take(self._paths, at_least=published.epoch if published else 0)
+        self._wake = threading.Event()
+        self._proxy = ProxySupervisor(self._paths, time.monotonic, proxy_command)
+        self._certified_at: float | None = None
+        self._seen: dict[Path, tuple[int, int, int] | None] = {}
+        self._digest: object = None
+        self._trouble: list[str] = []
+        self._replicas: Sequence[status.ReplicaStatus] = ()
+        self._reconciler = Reconciler(
+            cloud,
+            store,
+            clock=time.time,
+            links=self._links,
+            build_order=lambda *order: configuration.build_order(self._paths, *order),
+            submit=lambda run: threading.Thread(target=run, daemon=True).start(),
+            epoch=self._lease.epoch,
+            on_done=self._wake.set,
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Manage until `stop` is set or the pool's folder is gone.
+
+        Raises:
+            PoolBusy: A later manager has taken over.
+        """
+        log.info("manager_started pool=%s epoch=%d", self._identity.name, self._lease.epoch)
+        try:
+            while not stop.is_set():
+                self._lease.beat()
+                self._work()
+                self._rest(stop)
+        except PoolNotFound:
+            log.info("manager_stopped pool=%s reason=ended", self._identity.name)
+        finally:
+            self._lease.release()
+        log.info("manager_stopped pool=%s", self._identity.name)
+
+    def _work(self) -> None:
+        """Do one round. What goes wrong is logged and tried again in the next one."""
+        self._trouble = []
+        self._attempt(self._keep_proxy)
+        tick = self._attempt_tick()
+        if tick is not None:
+            self._attempt(lambda: self._write_status(tick))
+
+    def _attempt(self, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except (PoolNotFound, PoolBusy):
+            raise
+        except FogftError as error:
+            log.error("manager_step_failed reason=%r", error.message)
+            self._trouble.append(error.message)
+
+    def _attempt_tick(self) -> Tick | None:
+        ticks: list[Tick] = []
+        self._attempt(lambda: ticks.append(self._reconciler.tick()))
+        return ticks[0] if ticks else None
+
+    def _keep_proxy(self) -> None:
+        now = time.time()
+        if self._certified_at is None or abs(now - self._certified_at) > CERTIFY_EVERY_S:
+            utc = datetime.datetime.now(datetime.timezone.utc)
+            configuration.certify_robot(self._paths, self._identity, utc)
+            self._certified_at = now
+        configuration.write_proxy_config(self._paths, self._identity, self._store.spec())
+        if not self._store.intent().stopping:
+            self._proxy.look()
+
+    def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...] | None:
+        report = proxy_report.read(self._paths.proxy_status, pool_uid)
+        return report.links if report is not None and report.fresh(now) else None
+
+    def _write_status(self, tick: Tick) -> None:
+        report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
+        fresh = report is not None and report.fresh(time.time())
+        notes = [*self._trouble, *([self._proxy.trouble] if self._proxy.trouble else [])]
+        if report is None or not fresh:
+            when = "lately" if report else "yet"
+            notes.append(f"the client proxy has not reported {when}")
+        seen = status.of_tick(
+            tick,
+            history=self._store.history(),
+            report=report if fresh else None,
+            recent=self._store.recent(),
+            epoch=self._lease.epoch,
+            manager_pid=os.getpid(),
+            proxy_alive=fresh,
+            notes=notes,
+        )
+        if seen.cloud_reachable:
+            self._replicas = seen.replicas
+        else:  # show what was seen last; `cloud_reachable` says how it is meant
+            seen = replace(seen, replicas=self._replicas)
+        disk.write_json(self._paths.status, seen.to_json(), durable=False)
+
+    # -- waiting ----------------------------------------------------------------------------
+
+    def _rest(self, stop: threading.Event) -> None:
+        """Wait for the next tick, or for something to react to."""
+        end = time.monotonic() + TICK_S
+        while time.monotonic() < end and not stop.is_set():
+            if self._wake.wait(WATCH_S) or self._something_changed():
+                self._wake.clear()
+                return
+
+    def _something_changed(self) -> bool:
+        paths = self._paths
+        changed = [p for p in (paths.spec, paths.intent) if self._is_new(p)]
+        if self._is_new(paths.proxy_status):
+            report = proxy_report.read(paths.proxy_status, self._identity.uid)
+            digest = report.digest() if report is not None else None
+            if digest != self._digest:
+                self._digest = digest
+                return True
+        return bool(changed)
+
+    def _is_new(self, path: Path) -> bool:
+        try:
+            stat = path.stat()
+            mark = (stat.st_mtime_ns, stat.st_ino, stat.st_size)
+        except OSError:
+            mark = None
+        known = path in self._seen
+        old, self._seen[path] = self._seen.get(path), mark
+        return known and mark != old
+
+
+def run(
+    store: PoolStore,
+    make_cloud: Callable[[str], Cloud],
+    *,
+    proxy_command: Sequence[str] | None = None,
+) -> None:
+    """Run a pool's manager in this process until a signal ends it, or the pool has ended.
+
+    Args:
+        store: The pool.
+        make_cloud: Returns a cloud by the name that the pool's identity has.
+        proxy_command: What to start as client proxy, in place of our own.
+
+    Raises:
+        PoolBusy: The pool has a manager, or a later one has taken over.
+        PoolNotFound: There is no such pool.
+    """
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=logging.INFO,
+        format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
+        datefmt="%Y-%m-%dT%H:%M:%S",
+        force=True,
+    )
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda *_: stop.set())
+    cloud = make_cloud(store.identity().cloud)
+    Manager(store, cloud, proxy_command=proxy_command).run(stop)

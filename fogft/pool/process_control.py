@@ -1,0 +1,83 @@
+"""Start processes that outlive us, find who holds a lock, and end a process for sure.
+
+Owns: detaching, and ending by process id. Never by name: only a process that holds one of
+our locks is ever signalled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from fogft import disk
+
+POLL_S = 0.05
+
+
+def start_detached(command: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
+    """Start a process in a session of its own, its output appended to a log (0600)."""
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    try:
+        return subprocess.Popen(
+            list(command),
+            stdin=subprocess.DEVNULL,
+            stdout=descriptor,
+            stderr=descriptor,
+            start_new_session=True,
+        )
+    finally:
+        os.close(descriptor)
+
+
+def lock_holder(lock: Path) -> int | None:
+    """Return the process that holds an flock, by the kernel's own list; None for nobody."""
+    try:
+        stat = lock.stat()
+        lines = Path("/proc/locks").read_text().splitlines()
+    except OSError:
+        return None
+    wanted = f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
+    for line in lines:
+        fields = line.split()
+        if len(fields) >= 6 and fields[1] == "FLOCK" and fields[5] == wanted:
+            pid = int(fields[4])
+            return pid if pid > 0 else None
+    return None
+
+
+def end_holder(lock: Path, *, suspected_pid: int | None, patience_s: float = 10.0) -> int | None:
+    """End the process that holds a lock: SIGTERM, then SIGKILL. Return its pid; None for nobody.
+
+    Args:
+        lock: The file.
+        suspected_pid: Who is said to hold it, where the kernel's list does not tell.
+        patience_s: How long to wait after SIGTERM.
+    """
+    if not disk.is_locked(lock):
+        return None
+    pid = lock_holder(lock) or suspected_pid
+    if pid is None or pid == os.getpid():
+        return None
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, number)
+            os.kill(pid, signal.SIGCONT)  # one that is stopped would never hear of it
+        end = time.monotonic() + patience_s
+        while disk.is_locked(lock) and time.monotonic() < end:
+            time.sleep(POLL_S)
+        if not disk.is_locked(lock):
+            break
+    return pid
+
+
+def log_tail(log: Path, lines: int = 5) -> str:
+    """Return the last lines of a log, for an error message."""
+    try:
+        return "\n".join(log.read_text(errors="replace").splitlines()[-lines:])
+    except OSError:
+        return ""

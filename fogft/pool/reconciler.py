@@ -1,0 +1,294 @@
+"""Observe, plan, apply: one tick at a time, each from the world as it is.
+
+Killed at any point it leaves nothing that its successor does not repair: a launch is in
+the history before the cloud is asked, and everything else is read again from the cloud.
+
+Owns: the order of reading and writing within a tick.
+Not here: the decisions (`fogft.core.planner`), the loop and the processes (`manager`).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from fogft.cloud.port import Cloud, Launch
+from fogft.core.errors import CloudError, FogftError, NoCapacity, QuotaExceeded
+from fogft.core.health import Health, Verdict, judge
+from fogft.core.history import Event, EventKind, History
+from fogft.core.intent import Intent
+from fogft.core.membership import members_of, successor
+from fogft.core.model import (
+    LinkReport,
+    LinkState,
+    Machine,
+    MachinePhase,
+    Membership,
+    Observed,
+    Offer,
+    ReplicaId,
+)
+from fogft.core.planner import Plan, PlannedLaunch, plan
+from fogft.core.spec import PoolSpec
+from fogft.pool.operations import Operations, Submit
+from fogft.pool.store import Identity, Store
+
+log = logging.getLogger(__name__)
+
+OFFERS_EVERY_S = 30.0
+
+Links = Callable[[str, float], "tuple[LinkReport, ...] | None"]
+BuildOrder = Callable[[Identity, PoolSpec, PlannedLaunch], Launch]
+
+
+@dataclass(frozen=True)
+class Tick:
+    """What one tick saw and decided."""
+
+    identity: Identity
+    spec: PoolSpec
+    intent: Intent
+    observed: Observed
+    plan: Plan
+    membership: Membership | None
+
+
+def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
+    """Return an order without files: all that a cloud needs, and nothing to serve with."""
+    return Launch(
+        id=ReplicaId(identity.uid, planned.slot, planned.generation),
+        pool=identity.name,
+        placement=planned.offer.placement,
+        usd_per_hour=planned.offer.usd_per_hour,
+        spec_hash=spec.replica_hash,
+        task=spec.task,
+    )
+
+
+class Reconciler:
+    """Brings one pool to what is wanted.
+
+    Args:
+        cloud: Where its machines run.
+        store: What it remembers.
+        clock: Seconds since the epoch.
+        links: ``links(pool_uid, now)``: a fresh report of the client proxy, or None.
+        build_order: Makes the order of a planned launch, files included.
+        submit: Runs a long cloud call, now or on another thread.
+        epoch: Of the lease; goes into every membership.
+        on_done: Called when a long cloud call has ended.
+    """
+
+    def __init__(
+        self,
+        cloud: Cloud,
+        store: Store,
+        *,
+        clock: Callable[[], float],
+        links: Links,
+        build_order: BuildOrder = bare_order,
+        submit: Submit = lambda run: run(),
+        epoch: int = 1,
+        on_done: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._cloud = cloud
+        self._store = store
+        self._clock = clock
+        self._links = links
+        self._build_order = build_order
+        self._epoch = epoch
+        # A planned launch is what a launch is about; None stands for a termination.
+        self._operations: Operations[Machine | None] = Operations(submit, on_done)
+        self._offers: tuple[Offer, ...] = ()
+        self._offers_for: tuple[str, float] | None = None
+        self._membership: Membership | None = store.membership()
+
+    def tick(self) -> Tick:
+        """Observe, plan and apply once.
+
+        Raises:
+            StateError: Something cannot be read or written; nothing was launched for it.
+        """
+        identity, spec, intent = self._store.identity(), self._store.spec(), self._store.intent()
+        history = self._store.history()
+        self._settle_outcomes()
+        observed, trouble = self._observe(identity, spec)
+        if observed.machines is not None:
+            self._remember_losses(observed)
+            health = judge(identity.uid, spec, observed, history)
+            self._remember_health(health, history)
+        decided = plan(identity.uid, spec, intent, observed, history)
+        if trouble:
+            decided = replace(decided, notes=(*decided.notes, *trouble))
+        if observed.machines is not None:
+            self._apply(identity, spec, observed, decided, history)
+        return Tick(identity, spec, intent, observed, decided, self._membership)
+
+    # -- observe ----------------------------------------------------------------------------
+
+    def _settle_outcomes(self) -> None:
+        for outcome in self._operations.collect():
+            id, error = outcome.id, outcome.error
+            if error is None:
+                continue
+            if outcome.subject is None:
+                log.warning("terminate_failed replica=%s reason=%r", id.short, str(error))
+            else:
+                log.warning(
+                    "launch_refused replica=%s zone=%s reason=%r",
+                    id.short,
+                    outcome.subject.placement.location,
+                    str(error),
+                )
+                cause = _refusal(error)
+                if cause:
+                    self._remember(EventKind.REFUSED, id, detail=f"{cause}: {error}")
+
+    def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[str]]:
+        trouble: list[str] = []
+        busy = self._operations.busy()  # before the cloud is asked: see `operations`
+        now = self._clock()
+        machines: tuple[Machine, ...] | None = None
+        try:
+            listed = {m.id: m for m in self._cloud.machines(identity.uid)}
+            for id, order in busy.items():
+                if order is not None:
+                    listed[id] = replace(listed.get(id, order), launched_at=now)
+            machines = tuple(listed[id] for id in sorted(listed))
+        except CloudError as error:
+            log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
+            trouble.append(f"the cloud did not answer: {error.message}")
+        offers = self._current_offers(spec, now, trouble) if machines is not None else ()
+        ending = frozenset(id for id, order in busy.items() if order is None)
+        links = self._links(identity.uid, now)
+        return Observed(now, machines, links, offers, ending), trouble
+
+    def _current_offers(self, spec: PoolSpec, now: float, trouble: list[str]) -> tuple[Offer, ...]:
+        resources = spec.task.get("resources") or {}
+        key = json.dumps(resources, sort_keys=True, default=str)
+        known = self._offers_for
+        if known is None or known[0] != key or not 0 <= now - known[1] < OFFERS_EVERY_S:
+            try:
+                self._offers = tuple(self._cloud.offers(resources))
+                self._offers_for = (key, now)
+            except FogftError as error:
+                trouble.append(f"no prices can be had: {error.message}")
+                if known is None or known[0] != key:
+                    return ()
+        return self._offers
+
+    # -- remember ---------------------------------------------------------------------------
+
+    def _remember(
+        self, kind: EventKind, id: ReplicaId, *, location: str = "", detail: str = ""
+    ) -> None:
+        self._store.append(Event(self._clock(), kind, id.slot, id.generation, location, detail))
+
+    def _remember_losses(self, observed: Observed) -> None:
+        uid = self._store.identity().uid
+        listed = {m.id for m in observed.machines or ()}
+        for record in self._store.history().open():
+            id = ReplicaId(uid, record.slot, record.generation)
+            if id not in listed:
+                kind = EventKind.ENDED if record.ending else EventKind.GONE
+                log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
+                self._remember(kind, id)
+
+    def _remember_health(self, health: Health, history: History) -> None:
+        for judged in health.replicas:
+            id, machine = judged.id, judged.machine
+            record = history.record(id.slot, id.generation)
+            if record is None or record.closed is not None:  # the cloud's list is the record
+                self._remember(EventKind.LAUNCH, id, location=machine.placement.location)
+                record = history.record(id.slot, id.generation)
+            if record is None:
+                continue
+            up = judged.link is not None and judged.link.state is LinkState.UP
+            if judged.serving and (record.first_ready_at is None or record.unready_since):
+                log.info("replica_ready replica=%s zone=%s", id.short, record.location)
+                self._remember(EventKind.READY, id)
+            elif up and not judged.serving and record.first_ready_at and not record.unready_since:
+                log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
+                self._remember(EventKind.UNREADY, id)
+            if judged.verdict is Verdict.FAILED and not record.failed:
+                log.warning("replica_failed replica=%s reason=%r", id.short, judged.why)
+                self._remember(EventKind.FAILED, id, detail=judged.why)
+
+    # -- apply ------------------------------------------------------------------------------
+
+    def _apply(
+        self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan, history: History
+    ) -> None:
+        self._mark_draining(plan, observed, history)
+        self._publish(identity, observed, plan)
+        for planned in plan.launches:
+            self._launch(identity, spec, planned)
+        for end in plan.terminations:
+            self._terminate(end.id, end.reason, history)
+
+    def _mark_draining(self, plan: Plan, observed: Observed, history: History) -> None:
+        ends = {end.id for end in plan.terminations} | observed.ending
+        for machine in observed.machines or ():
+            record = history.record(machine.id.slot, machine.id.generation)
+            if record is None or record.closed is not None:
+                continue
+            if machine.id in plan.draining:
+                if record.draining_since is None:
+                    self._remember(EventKind.DRAINING, machine.id)
+            elif record.draining_since is not None and machine.id not in ends:
+                self._remember(EventKind.UNDRAINED, machine.id)
+
+    def _publish(self, identity: Identity, observed: Observed, plan: Plan) -> None:
+        members = members_of(
+            observed.machines or (),
+            pool_uid=identity.uid,
+            draining=plan.draining,
+            ending={end.id for end in plan.terminations} | observed.ending,
+        )
+        membership = successor(
+            self._membership,
+            pool=identity.name,
+            pool_uid=identity.uid,
+            epoch=self._epoch,
+            members=members,
+        )
+        if membership is not None:
+            self._store.write_membership(membership)
+            self._membership = membership
+
+    def _launch(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> None:
+        order = self._build_order(identity, spec, planned)
+        location = order.placement.location
+        self._remember(EventKind.LAUNCH, order.id, location=location, detail=planned.reason)
+        log.info("launch_ordered replica=%s zone=%s %s", order.id.short, location, planned.reason)
+        expected = Machine(
+            id=order.id,
+            placement=order.placement,
+            phase=MachinePhase.PROVISIONING,
+            launched_at=self._clock(),
+            usd_per_hour=order.usd_per_hour,
+            spec_hash=order.spec_hash,
+        )
+        self._operations.start(order.id, expected, lambda: self._cloud.launch(order))
+
+    def _terminate(self, id: ReplicaId, reason: str, history: History) -> None:
+        if id in self._operations.busy():
+            return  # its launch is under way: a later tick ends it
+        record = history.record(id.slot, id.generation)
+        if record is None or not record.ending:
+            self._remember(EventKind.ENDING, id, detail=reason)
+            log.info("terminate_ordered replica=%s reason=%r", id.short, reason)
+        self._operations.start(id, None, lambda: self._cloud.terminate(id))
+
+
+def _refusal(error: Exception) -> str:
+    """Return the cause of a refused launch; empty when it may have been launched all the same."""
+    if isinstance(error, NoCapacity):
+        return "capacity"
+    if isinstance(error, QuotaExceeded):
+        return "quota"
+    if isinstance(error, CloudError) and type(error) is not CloudError:
+        return ""  # unreachable: the cloud's list will tell
+    return "error"

@@ -1,0 +1,222 @@
+"""`status.json`: what the manager last saw of its pool, for people and programs.
+
+Owns: the schema, and turning one tick of the manager into it.
+Not here: how it is shown (`fogft.cli`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from fogft.core.errors import StateError
+from fogft.core.history import Event, EventKind, History
+from fogft.core.model import Phase, ReplicaId
+
+if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
+    from fogft.core.health import Judged
+    from fogft.core.spec import PoolSpec
+    from fogft.pool.proxy_report import ProxyReport
+    from fogft.pool.reconciler import Tick
+
+WORDS = {
+    EventKind.LAUNCH: "launched",
+    EventKind.REFUSED: "refused",
+    EventKind.READY: "ready",
+    EventKind.UNREADY: "not ready",
+    EventKind.DRAINING: "draining",
+    EventKind.UNDRAINED: "kept after all",
+    EventKind.FAILED: "failed",
+    EventKind.ENDING: "ending",
+    EventKind.ENDED: "ended",
+    EventKind.GONE: "gone",
+}
+
+
+@dataclass(frozen=True)
+class ReplicaStatus:
+    """One replica. Ages and durations in seconds; None for unknown.
+
+    Attributes:
+        link: ``connecting``, ``up`` or ``suspect``; empty when there is no link.
+        verdict: ``good``, ``failed``, ``leaving``, ``unresponsive`` or ``stuck``.
+        age_s: Since its launch.
+    """
+
+    slot: int
+    generation: int
+    phase: str
+    verdict: str
+    location: str
+    instance: str
+    spot: bool
+    usd_per_hour: float
+    endpoint: str | None
+    link: str
+    rtt_s: float | None
+    silent_for_s: float
+    won: int
+    in_flight: int
+    restarts: int
+    age_s: float
+    detail: str
+
+
+@dataclass(frozen=True)
+class ServiceStatus:
+    """One service: how many replicas answer it, and the proxy's counters (0 when unknown)."""
+
+    name: str
+    type: str
+    ready_replicas: int
+    counters: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PoolStatus:
+    """The whole pool.
+
+    Attributes:
+        observed_at: Seconds since the epoch.
+        cloud_reachable: Whether the cloud could say what exists; if not, `replicas` is
+            what was seen last and `ready` is 0.
+        target: Replicas wanted now.
+        ready: Replicas whose services answer and that are to stay.
+        notes: Why the pool is not yet as wanted, in sentences.
+        events: The last things that happened: ``{at, event, replica, location, detail}``.
+    """
+
+    pool: str
+    uid: str
+    cloud: str
+    file: str
+    epoch: int
+    manager_pid: int
+    observed_at: float
+    cloud_reachable: bool
+    stopping: bool
+    target: int
+    ready: int
+    uplink_suspected: bool
+    usd_per_hour: float
+    proxy_pid: int | None
+    proxy_alive: bool
+    excluded: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    replicas: Sequence[ReplicaStatus] = ()
+    services: Sequence[ServiceStatus] = ()
+    events: Sequence[Mapping[str, Any]] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the JSON form."""
+        return asdict(self)
+
+
+def from_json(raw: Any) -> PoolStatus:
+    """Read a status back.
+
+    Raises:
+        StateError: It is none, or of another version of fogft.
+    """
+    try:
+        replicas = [ReplicaStatus(**replica) for replica in raw["replicas"]]
+        services = [ServiceStatus(**service) for service in raw["services"]]
+        return PoolStatus(**{**raw, "replicas": replicas, "services": services})
+    except (KeyError, TypeError, AttributeError) as error:
+        raise StateError(f"not a status: {error}", "is the manager of another version?") from error
+
+
+def of_tick(
+    tick: Tick,
+    *,
+    history: History,
+    report: ProxyReport | None,
+    recent: Sequence[Event],
+    epoch: int,
+    manager_pid: int,
+    proxy_alive: bool,
+    notes: Sequence[str] = (),
+) -> PoolStatus:
+    """Return the status after a tick."""
+    health, observed, plan = tick.plan.health, tick.observed, tick.plan
+    judged = health.replicas if health is not None else ()
+    leaving = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
+    replicas = [_replica(one, leaving, history, observed.now) for one in judged]
+    return PoolStatus(
+        pool=tick.identity.name,
+        uid=tick.identity.uid,
+        cloud=tick.identity.cloud,
+        file=tick.identity.file,
+        epoch=epoch,
+        manager_pid=manager_pid,
+        observed_at=observed.now,
+        cloud_reachable=observed.machines is not None,
+        stopping=tick.intent.stopping,
+        target=plan.wanted,
+        ready=sum(replica.phase == Phase.READY.value for replica in replicas),
+        uplink_suspected=bool(health and health.uplink_suspected),
+        usd_per_hour=sum(one.machine.usd_per_hour for one in judged),
+        proxy_pid=report.pid if report is not None and proxy_alive else None,
+        proxy_alive=proxy_alive,
+        excluded=sorted(tick.intent.excluded),
+        notes=[*plan.notes, *notes],
+        replicas=replicas,
+        services=_services(tick.spec, judged, report),
+        events=[_event(event) for event in recent],
+    )
+
+
+def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float) -> ReplicaStatus:
+    machine, link = one.machine, one.link
+    record = history.record(one.id.slot, one.id.generation)
+    launched_at = record.launched_at if record is not None else machine.launched_at
+    phase = one.phase
+    if one.id in leaving and phase is not Phase.GONE:
+        phase = Phase.DRAINING
+    return ReplicaStatus(
+        slot=one.id.slot,
+        generation=one.id.generation,
+        phase=phase.value,
+        verdict=one.verdict.value,
+        location=machine.placement.location,
+        instance=machine.placement.instance,
+        spot=machine.placement.spot,
+        usd_per_hour=machine.usd_per_hour,
+        endpoint=machine.endpoint,
+        link=link.state.value if link is not None else "",
+        rtt_s=link.rtt_s if link is not None else None,
+        silent_for_s=link.silent_for_s if link is not None else 0.0,
+        won=link.won if link is not None else 0,
+        in_flight=link.in_flight if link is not None else 0,
+        restarts=link.restarts if link is not None else 0,
+        age_s=max(0.0, now - launched_at),
+        detail=one.why or (link.detail if link is not None else ""),
+    )
+
+
+def _services(
+    spec: PoolSpec, judged: Sequence[Judged], report: ProxyReport | None
+) -> list[ServiceStatus]:
+    counters = report.services if report is not None else {}
+    return [
+        ServiceStatus(
+            name=service.name,
+            type=service.type,
+            ready_replicas=sum(
+                one.link is not None and service.name in one.link.ready for one in judged
+            ),
+            counters=counters.get(service.name, {}),
+        )
+        for service in spec.services
+    ]
+
+
+def _event(event: Event) -> dict[str, Any]:
+    return {
+        "at": event.at,
+        "event": WORDS[event.kind],
+        "replica": f"{event.slot}.{event.generation}",
+        "location": event.location,
+        "detail": event.detail,
+    }

@@ -1,0 +1,252 @@
+"""What a pool remembers on disk, as the manager and the commands read and write it.
+
+Owns: identity, spec, intent, history, lease and membership: their files and their order
+of writing. A launch is in the history, on disk, before the cloud is asked.
+Not here: what to remember (`fogft.core`) and how a file is replaced (`fogft.disk`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from fogft import disk
+from fogft.core import intent as intents
+from fogft.core import membership as memberships
+from fogft.core.errors import PoolNotFound, StateError
+from fogft.core.history import Event, History, compacted
+from fogft.core.intent import Intent
+from fogft.core.model import Membership
+from fogft.core.names import POOL_UID_PATTERN
+from fogft.core.spec import PoolSpec
+from fogft.pool.paths import PoolPaths
+
+COMPACT_AFTER = 20_000
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a pool is, for good.
+
+    Attributes:
+        uid: 16 random hexadecimal digits.
+        file: Absolute path of the pool file.
+        created_at: Seconds since the epoch.
+    """
+
+    name: str
+    uid: str
+    cloud: str
+    file: str
+    created_at: float
+
+
+class Store(Protocol):
+    """What the reconciler needs to remember and to be told."""
+
+    def identity(self) -> Identity:
+        """Return what the pool is."""
+
+    def spec(self) -> PoolSpec:
+        """Return the pool file as last applied."""
+
+    def intent(self) -> Intent:
+        """Return what the user wants besides the file."""
+
+    def history(self) -> History:
+        """Return what happened so far, `append`ed events included."""
+
+    def append(self, event: Event) -> None:
+        """Remember an event; when this returns it survives a crash."""
+
+    def membership(self) -> Membership | None:
+        """Return the membership as last written."""
+
+    def write_membership(self, membership: Membership) -> None:
+        """Publish a membership."""
+
+
+class PoolStore:
+    """A pool's folder. Safe to use from several threads; one process writes each file.
+
+    Args:
+        paths: Where.
+        parse: Reads a pool file's text: ``parse(text, file) -> PoolSpec``.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(
+        self,
+        paths: PoolPaths,
+        parse: Callable[[str, str], PoolSpec],
+        clock: Callable[[], float],
+    ) -> None:
+        self.paths = paths
+        self._parse = parse
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._history: History | None = None
+        self._appended = 0
+        self._spec: tuple[bytes, PoolSpec] | None = None
+
+    def identity(self) -> Identity:
+        """Return what the pool is.
+
+        Raises:
+            PoolNotFound: There is none.
+            StateError: Its file is damaged.
+        """
+        return read_identity(self.paths)
+
+    def spec(self) -> PoolSpec:
+        """Return the pool file as last applied.
+
+        Raises:
+            PoolNotFound: There is none.
+            SpecError: It is wrong (`up` never stores such a file).
+        """
+        try:
+            raw = self.paths.spec.read_bytes()
+        except FileNotFoundError:
+            raise PoolNotFound(f"pool `{self.paths.folder.name}` has no spec") from None
+        if self._spec is None or self._spec[0] != raw:
+            spec = self._parse(raw.decode(), self.identity().file)
+            self._spec = (raw, spec)
+        return self._spec[1]
+
+    def intent(self) -> Intent:
+        """Return what the user wants besides the file; nothing where nothing was asked."""
+        raw = disk.read_json(self.paths.intent)
+        return Intent() if raw is None else intents.from_json(raw)
+
+    def write_intent(self, intent: Intent) -> None:
+        """Store the user's wishes; the caller holds `intent_lock`."""
+        disk.write_json(self.paths.intent, intents.to_json(intent))
+
+    def history(self) -> History:
+        """Return what happened so far."""
+        with self._lock:
+            if self._history is None:
+                self._history = History(self._load())
+            return self._history
+
+    def append(self, event: Event) -> None:
+        """Remember an event, on disk before this returns.
+
+        Raises:
+            StateError: It cannot be written. The event did not happen.
+        """
+        history = self.history()
+        with self._lock:
+            line = json.dumps(event.to_json()) + "\n"
+            try:
+                _append_durably(self.paths.history, line.encode())
+            except OSError as error:
+                raise StateError(
+                    f"`{self.paths.history}` cannot be written: {error.strerror}",
+                    "check the disk's free space and the folder's owner",
+                ) from error
+            history.add(event)
+            self._appended += 1
+            if self._appended >= COMPACT_AFTER:
+                self._history = History(self._load())
+
+    def recent(self, count: int = 20) -> list[Event]:
+        """Return the last events, oldest first."""
+        return _read_events(self.paths.history)[-count:]
+
+    def _load(self) -> list[Event]:
+        events = _read_events(self.paths.history)
+        kept = compacted(events, self._clock())
+        self._appended = 0
+        if len(kept) < len(events):
+            lines = "".join(json.dumps(event.to_json()) + "\n" for event in kept)
+            disk.write_whole(self.paths.history, lines)
+        return kept
+
+    def membership(self) -> Membership | None:
+        """Return the membership as last written; None where it is missing or damaged."""
+        try:
+            raw = disk.read_json(self.paths.membership)
+            return None if raw is None else memberships.from_dict(raw)
+        except StateError:
+            return None
+
+    def write_membership(self, membership: Membership) -> None:
+        """Publish a membership."""
+        disk.write_json(self.paths.membership, memberships.to_dict(membership))
+
+
+def read_identity(paths: PoolPaths) -> Identity:
+    """Return what the pool in a folder is.
+
+    Raises:
+        PoolNotFound: There is none.
+        StateError: Its file is damaged.
+    """
+    raw = disk.read_json(paths.identity)
+    if raw is None:
+        raise PoolNotFound(f"there is no pool `{paths.folder.name}`", "`fogft up FILE` starts one")
+    try:
+        identity = Identity(
+            name=str(raw["name"]),
+            uid=str(raw["uid"]),
+            cloud=str(raw["cloud"]),
+            file=str(raw["file"]),
+            created_at=float(raw["created_at"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise StateError(f"`{paths.identity}` is damaged: {error!r}") from error
+    if not POOL_UID_PATTERN.fullmatch(identity.uid):
+        raise StateError(f"`{paths.identity}` is damaged: `uid` is not 16 hexadecimal digits")
+    return identity
+
+
+def write_identity(paths: PoolPaths, identity: Identity) -> None:
+    """Store what a pool is; the caller holds `intent_lock`."""
+    disk.write_json(paths.identity, asdict(identity))
+
+
+def _append_durably(path: Path, line: bytes) -> None:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    try:
+        size = os.fstat(descriptor).st_size
+        if size and os.pread(descriptor, 1, size - 1) != b"\n":
+            line = b"\n" + line  # a crash left a torn last line: it stays alone on its own
+        if os.write(descriptor, line) != len(line):
+            os.ftruncate(descriptor, size)
+            raise OSError(28, "No space left on device")
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _read_events(path: Path) -> list[Event]:
+    """Return the events of a file, without a torn last line and what else is damaged.
+
+    A line that cannot be read is skipped but its generation cannot be: the cloud's list
+    then still keeps generations from being used twice.
+    """
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return []
+    events: list[Event] = []
+    for line in lines:
+        event = _event(line)
+        if event is not None:
+            events.append(event)
+    return events
+
+
+def _event(line: bytes) -> Event | None:
+    try:
+        value: Any = json.loads(line)
+        return Event.from_json(value)
+    except (ValueError, StateError):
+        return None

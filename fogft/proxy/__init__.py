@@ -1,0 +1,1 @@
+"""The client proxy (robot) and the server proxy (replica)."""

@@ -1,0 +1,251 @@
+"""The client proxy: the robot's side of every proxied service.
+
+It follows the membership (one link a member), advertises each service as if it were local
+once a replica can answer it, and hands requests to that service's `Dispatcher`.
+
+Owns: which links exist, and which of them each service uses now.
+Not here: files and signals (`client_process`), requests (`dispatcher`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from fogft.core import names
+from fogft.core.errors import RosError
+from fogft.core.model import LinkState, Member, Membership, ReplicaId
+from fogft.core.spec import ServiceSpec
+from fogft.proxy.dispatcher import Dispatcher
+from fogft.ros.port import RosNode, RosServer
+from fogft.wire.port import Answer, Dialer, Link, Peer
+
+log = logging.getLogger(__name__)
+
+
+class _Service:
+    """A service, its dispatcher, and its ROS server once advertised."""
+
+    def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher) -> None:
+        self.spec = spec
+        self.dispatcher = dispatcher
+        self.server: RosServer | None = None
+        self.trouble = ""  # why it cannot be advertised; empty when it can
+
+
+class ClientProxy:
+    """Sends each request to all replicas and returns the first success.
+
+    Args:
+        pool_uid: The pool's uid, part of every key.
+        node: The robot's side of ROS.
+        dialer: Makes links.
+        make_dispatcher: Makes the dispatcher of a service, given how to respond.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        pool_uid: str,
+        node: RosNode,
+        dialer: Dialer,
+        make_dispatcher: Callable[[ServiceSpec, Callable[[Any, bytes], None]], Dispatcher],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._pool_uid = pool_uid
+        self._node = node
+        self._dialer = dialer
+        self._make_dispatcher = make_dispatcher
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._services: dict[str, _Service] = {}
+        self._links: dict[ReplicaId, Link] = {}
+        self._members: dict[ReplicaId, Member] = {}
+        self._version = (0, 0)
+        self._changed = threading.Event()
+
+    # -- configuration --------------------------------------------------------------------
+
+    def serve(self, specs: Iterable[ServiceSpec]) -> None:
+        """Proxy these services and no others. Unchanged ones go on undisturbed.
+
+        A service whose policy changed keeps its ROS server; requests under way end under
+        the policy they began with.
+        """
+        with self._lock:
+            wanted = {spec.name: spec for spec in specs}
+            for name in [n for n in self._services if n not in wanted]:
+                gone = self._services.pop(name)
+                if gone.server is not None:
+                    gone.server.close()
+            keys_changed = False
+            for spec in wanted.values():
+                old = self._services.get(spec.name)
+                if old is not None and old.spec.type == spec.type:
+                    old.dispatcher.spec = old.spec = spec
+                    continue
+                if old is not None and old.server is not None:
+                    old.server.close()
+                self._services[spec.name] = self._new_service(spec)
+                keys_changed = True
+            if keys_changed:
+                for id in list(self._links):
+                    self._redial(id)
+        self._changed.set()
+
+    def _new_service(self, spec: ServiceSpec) -> _Service:
+        service: _Service
+
+        def respond(handle: Any, payload: bytes) -> None:
+            if service.server is not None:
+                service.server.respond(handle, payload)
+
+        service = _Service(spec, self._make_dispatcher(spec, respond))
+        return service
+
+    # -- membership -----------------------------------------------------------------------
+
+    def follow(self, membership: Membership) -> bool:
+        """Hold one link to each member. An older membership, or another pool's, is refused."""
+        version = (membership.epoch, membership.version)
+        with self._lock:
+            if membership.pool_uid != self._pool_uid or version < self._version:
+                log.warning("membership_refused version=%s have=%s", version, self._version)
+                return False
+            self._version = version
+            members = {member.id: member for member in membership.members}
+            for id in [id for id in self._links if id not in members]:
+                self._drop(id)
+            for id, member in members.items():
+                old = self._members.get(id)
+                self._members[id] = member
+                if old is None or old.endpoint != member.endpoint:
+                    self._redial(id)
+        self._changed.set()
+        return True
+
+    def _redial(self, id: ReplicaId) -> None:
+        member = self._members[id]
+        old = self._links.get(id)
+        peer = Peer(id, member.endpoint, names.replica_certificate_name(id))
+        keys = {
+            s.spec.name: names.service_key(self._pool_uid, id.slot, s.spec.name, s.spec.type)
+            for s in self._services.values()
+        }
+        self._links[id] = self._dialer.dial(peer, keys, self)
+        log.info("link_dialled replica=%s endpoint=%s", id.short, member.endpoint)
+        if old is not None:
+            old.close()
+
+    def _drop(self, id: ReplicaId) -> None:
+        self._members.pop(id, None)
+        link = self._links.pop(id)
+        self._route()  # first out of every route, then closed: what was open there is LOST
+        link.close()
+        log.info("link_dropped replica=%s", id.short)
+
+    # -- events of links (their threads) --------------------------------------------------
+
+    def answered(self, link: Link, answer: Answer) -> None:
+        """Pass the end of an attempt to its service: the one that knows the request."""
+        service = self._services.get(answer.service)
+        if service is not None:
+            service.dispatcher.answered(link, answer)
+
+    def changed(self, link: Link) -> None:
+        """Wake `run_once`: routes are worked out there, not on a link's thread."""
+        self._changed.set()
+
+    # -- the proxy's own thread -----------------------------------------------------------
+
+    def run_once(self, timeout_s: float = 0.02) -> bool:
+        """Wait for a change or a moment, then route, advertise and tick.
+
+        Returns:
+            Whether something had changed.
+
+        Raises:
+            RosError: The node's thread has ended: nothing would be taken any more.
+        """
+        if not self._node.alive:
+            raise RosError("ROS does not go on; the log says why", "start the proxy again")
+        changed = self._changed.wait(timeout_s)
+        self._changed.clear()
+        with self._lock:
+            if changed:
+                self._route()
+            for service in self._services.values():
+                service.dispatcher.tick()
+        return changed
+
+    def _route(self) -> None:
+        for service in self._services.values():
+            name = service.spec.name
+            able = [link for link in self._links.values() if name in link.ready]
+            fresh = [link for link in able if not self._draining(link)]
+            if able and service.server is None:
+                self._advertise(service)
+            service.dispatcher.route(fresh or able)
+
+    def _advertise(self, service: _Service) -> None:
+        spec = service.spec
+        try:
+            service.server = self._node.serve(spec.name, spec.type, service.dispatcher.submit)
+        except RosError as error:  # it shall not take the other services with it
+            if service.trouble != error.message:
+                service.trouble = error.message
+                log.error("service_not_advertised service=%s reason=%r", spec.name, error.message)
+        else:
+            service.trouble = ""
+            log.info("service_advertised service=%s type=%s", spec.name, spec.type)
+
+    def _draining(self, link: Link) -> bool:
+        member = self._members.get(link.peer.id)
+        return link.draining or (member is not None and member.draining)
+
+    # -- what people see ------------------------------------------------------------------
+
+    @property
+    def uplink_suspected(self) -> bool:
+        """Whether all links that ever answered (two at least) have fallen silent together."""
+        states = [link.status() for link in self._links.values()]
+        heard = [status for status in states if status.heard_age_s is not None]
+        return len(heard) > 1 and all(status.state is not LinkState.UP for status in heard)
+
+    def report(self) -> dict[str, Any]:
+        """Return links and services as `proxy-status.json` has them."""
+        with self._lock:
+            links = [self._link_report(link) for _, link in sorted(self._links.items())]
+            services: Mapping[str, Any] = {
+                name: service.dispatcher.report() for name, service in self._services.items()
+            }
+        return {"links": links, "services": services, "uplink_suspected": self.uplink_suspected}
+
+    def _link_report(self, link: Link) -> dict[str, Any]:
+        status = link.status()
+        answer = status.probe_answer
+        id = link.peer.id
+        return {
+            "slot": id.slot,
+            "generation": id.generation,
+            "state": status.state.value,
+            "ready": sorted(link.ready),
+            "draining": self._draining(link),
+            "heard_age_s": status.heard_age_s,
+            "silent_for_s": status.silent_for_s,
+            "rtt_s": status.rtt_s,
+            "in_flight": status.in_flight,
+            "reopened": status.reopened,
+            "won": sum(s.dispatcher.won(id) for s in self._services.values()),
+            "restarts": answer.restarts if answer else 0,
+            "detail": status.detail or (answer.detail if answer else ""),
+        }
+
+    def close(self) -> None:
+        """Close every link. The ROS node is its owner's to close."""
+        with self._lock:
+            for id in list(self._links):
+                self._drop(id)

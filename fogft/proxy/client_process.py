@@ -1,0 +1,188 @@
+"""``fogft proxy --config FILE``: the client proxy as a process.
+
+It follows two files, the configuration and the membership, and writes one, its report. It
+needs no manager: started alone it goes on with the last membership on disk.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.core import membership
+from fogft.core.errors import FogftError, PoolBusy, StateError
+from fogft.core.spec import OnTimeout, ServiceSpec
+from fogft.proxy.client import ClientProxy
+from fogft.proxy.config import ClientProxyConfig, read_client
+from fogft.proxy.dispatcher import Dispatcher
+from fogft.proxy.process import Watched, start_log, stop_on_signal
+from fogft.ros import environment, memory_tuning
+
+log = logging.getLogger(__name__)
+
+_REPORT_EVERY_S = 0.5
+_REPORT_AFTER_CHANGE_S = 0.05
+
+
+class ManagerSign:
+    """How long ago the pool's manager last gave a sign of life, by our own clock.
+
+    The lease's `beat` counts up while the manager works; comparing counts instead of
+    times makes it immune to a clock that jumps.
+    """
+
+    def __init__(self, lease: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        self._watched = Watched(lease)
+        self._clock = clock
+        self._beat: Any = None
+        self._seen_at: float | None = None
+
+    def look(self) -> None:
+        """Read the lease if it has changed."""
+        if not self._watched.changed():
+            return
+        try:
+            lease = disk.read_json(self._watched.path)
+        except StateError:
+            return
+        beat = (lease.get("epoch"), lease.get("beat")) if isinstance(lease, dict) else None
+        if beat is not None and beat != self._beat:
+            if self._beat is not None:  # the first reading may be of a manager long dead
+                self._seen_at = self._clock()
+            self._beat = beat
+
+    def age_s(self) -> float | None:
+        """Seconds since the last sign; None if there was none yet."""
+        return None if self._seen_at is None else self._clock() - self._seen_at
+
+
+def run(config_path: Path) -> None:
+    """Run until a signal ends it.
+
+    Raises:
+        PoolBusy: This pool's client proxy runs already.
+        FogftError: The configuration, the credentials or ROS cannot be used.
+    """
+    start_log()
+    stop = stop_on_signal()
+    config = read_client(config_path)
+    lock = disk.Lock(config.lock)
+    if not lock.acquire(wait=False):
+        raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
+    environment.prepare(os.environ)
+    from fogft.ros.node import SerialisedNode
+
+    memory_tuning.tune()
+    sign = ManagerSign(config.lease)
+    node = SerialisedNode(_node_name("fogft", config.pool), config.domain_id)
+    proxy = ClientProxy(config.pool_uid, node, _dialer(config, sign), make_dispatcher)
+    proxy.serve(config.services)
+    log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
+    try:
+        _loop(config_path, config, proxy, sign, stop)
+    finally:
+        proxy.close()
+        node.close()
+        lock.release()
+        log.info("proxy_stopped pool=%s", config.pool)
+
+
+def _dialer(config: ClientProxyConfig, sign: ManagerSign) -> Any:
+    from fogft.wire.zenoh_link import ZenohDialer
+
+    return ZenohDialer(
+        config.credentials,
+        robot=config.robot,
+        pool_uid=config.pool_uid,
+        suspect_after_s=config.suspect_after_s,
+        manager_age=sign.age_s,
+    )
+
+
+def make_dispatcher(spec: ServiceSpec, respond: Callable[[Any, bytes], None]) -> Dispatcher:
+    """Make the dispatcher of a service, with what its policy needs of its ROS type."""
+    from fogft.ros import types
+
+    return Dispatcher(
+        spec,
+        respond,
+        is_ok=types.bool_field(spec.type, spec.ok_field) if spec.ok_field else None,
+        empty_response=(
+            types.default_response(spec.type) if spec.on_timeout is OnTimeout.EMPTY else None
+        ),
+    )
+
+
+def _loop(
+    config_path: Path,
+    config: ClientProxyConfig,
+    proxy: ClientProxy,
+    sign: ManagerSign,
+    stop: threading.Event,
+) -> None:
+    memory = memory_tuning.Trimmer()
+    watched_config, watched_members = Watched(config_path), Watched(config.membership)
+    watched_config.changed()
+    started = reported = time.monotonic()
+    while not stop.is_set():
+        changed = proxy.run_once()
+        memory.look()
+        sign.look()
+        if watched_config.changed():
+            _apply(functools.partial(_reconfigure, config_path, config, proxy), config_path)
+        if watched_members.changed():
+            _apply(functools.partial(_follow, config.membership, proxy), config.membership)
+        now = time.monotonic()
+        if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
+            reported = now
+            _apply(functools.partial(_report, config, proxy, now - started), config.status)
+
+
+_troubles: dict[Path, str] = {}
+
+
+def _apply(step: Callable[[], None], path: Path) -> None:
+    """Do one step; a bad file, or a full disk, is logged once and changes nothing."""
+    try:
+        step()
+    except FogftError as error:
+        if _troubles.get(path) != error.message:
+            _troubles[path] = error.message
+            log.error("file_failed path=%s reason=%r", path, error.message)
+    else:
+        _troubles.pop(path, None)
+
+
+def _reconfigure(path: Path, old: ClientProxyConfig, proxy: ClientProxy) -> None:
+    new = read_client(path)
+    if (new.pool_uid, new.domain_id) != (old.pool_uid, old.domain_id):
+        raise StateError(f"`{path}`: pool_uid and domain_id cannot change while the proxy runs")
+    proxy.serve(new.services)
+    log.info("config_applied services=%d", len(new.services))
+
+
+def _follow(path: Path, proxy: ClientProxy) -> None:
+    raw = disk.read_json(path)
+    if raw is not None:
+        proxy.follow(membership.from_dict(raw))
+
+
+def _report(config: ClientProxyConfig, proxy: ClientProxy, uptime_s: float) -> None:
+    header = {
+        "pid": os.getpid(),
+        "written_at": time.time(),
+        "uptime_s": uptime_s,
+        "robot": config.robot,
+    }
+    disk.write_json(config.status, {**header, **proxy.report()}, durable=False)
+
+
+def _node_name(prefix: str, pool: str) -> str:
+    return f"{prefix}_{pool.replace('-', '_')}"

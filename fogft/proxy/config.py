@@ -1,0 +1,176 @@
+"""The proxies' configuration files: what they hold, and how they are read.
+
+Both are YAML that a person can read, rendered by the manager from `templates/`. Paths in
+them are relative to the file's own folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fogft.core import names
+from fogft.core.errors import StateError
+from fogft.core.model import ReplicaId
+from fogft.core.spec import OnTimeout, ServiceSpec
+from fogft.wire.frame import REMAINING_LIMIT_S, ROBOT_BYTES_LIMIT
+
+
+@dataclass(frozen=True)
+class CredentialFiles:
+    """Where a process finds its certificate, its key and the pool's CA."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True)
+class ClientProxyConfig:
+    """All that `fogft proxy` needs to know."""
+
+    pool: str
+    pool_uid: str
+    robot: str
+    membership: Path
+    status: Path
+    lease: Path
+    lock: Path
+    credentials: CredentialFiles
+    services: tuple[ServiceSpec, ...]
+    suspect_after_s: float = 2.0
+    domain_id: int | None = None
+
+
+@dataclass(frozen=True)
+class ServerProxyConfig:
+    """All that `fogft serve` needs to know."""
+
+    pool: str
+    id: ReplicaId
+    listen: str
+    services: tuple[ServiceSpec, ...]
+    run: str
+    workdir: Path
+    credentials: CredentialFiles
+    envs: Mapping[str, str] = field(default_factory=dict)
+    domain_id: int | None = None
+    orphan_after_s: float = 3600.0
+    notice_file: Path | None = None
+    max_in_flight: int = 512
+    log_level: str = "info"
+
+
+def read_client(path: Path) -> ClientProxyConfig:
+    """Read a client proxy's configuration.
+
+    Raises:
+        StateError: It cannot be read, or a key is missing or of the wrong type.
+    """
+    with _Reading(path) as (raw, base):
+        return ClientProxyConfig(
+            pool=str(raw["pool"]),
+            pool_uid=_uid(raw["pool_uid"]),
+            robot=_robot(raw["robot"]),
+            membership=base / raw["membership"],
+            status=base / raw["status"],
+            lease=base / raw["lease"],
+            lock=base / raw["lock"],
+            credentials=_credentials(raw["credentials"], base),
+            services=tuple(_service(s) for s in raw["services"]),
+            suspect_after_s=_seconds((raw.get("health") or {}).get("suspect_after_s") or 2.0),
+            domain_id=_optional_int(raw.get("domain_id")),
+        )
+    raise AssertionError("unreachable")
+
+
+def read_server(path: Path, **override: Any) -> ServerProxyConfig:
+    """Read a server proxy's configuration; options that are not None replace what it says.
+
+    Raises:
+        StateError: It cannot be read, or a key is missing or of the wrong type.
+    """
+    with _Reading(path) as (in_file, base):
+        raw = {**in_file, **{key: value for key, value in override.items() if value is not None}}
+        notice = raw.get("notice_file")
+        return ServerProxyConfig(
+            pool=str(raw["pool"]),
+            id=ReplicaId(_uid(raw["pool_uid"]), int(raw["slot"]), int(raw["generation"])),
+            listen=str(raw.get("listen") or "0.0.0.0:7447"),
+            services=tuple(_service(s) for s in raw["services"]),
+            run=str(raw["run"]),
+            workdir=base / (raw.get("workdir") or "."),
+            credentials=_credentials(raw["credentials"], base),
+            envs={str(k): str(v) for k, v in (raw.get("envs") or {}).items()},
+            domain_id=_optional_int(raw.get("domain_id")),
+            orphan_after_s=_seconds(raw.get("orphan_after_s") or 3600.0),
+            notice_file=base / notice if notice else None,
+            max_in_flight=int(raw.get("max_in_flight") or 512),
+            log_level=str(raw.get("log_level") or "info"),
+        )
+    raise AssertionError("unreachable")
+
+
+class _Reading:
+    """Turn whatever goes wrong while a configuration is read into one clear error."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> tuple[dict[str, Any], Path]:
+        import yaml
+
+        try:
+            raw = yaml.safe_load(self._path.read_text())
+        except Exception as error:  # PyYAML passes on what its constructors raise
+            raise StateError(f"`{self._path}` cannot be read: {error}") from error
+        if not isinstance(raw, dict):
+            raise StateError(f"`{self._path}` is not a configuration: it holds no keys")
+        return raw, self._path.resolve().parent
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        hint = "it is written by `fogft up`; run that again, or compare it with `templates/`"
+        if isinstance(error, KeyError):
+            raise StateError(f"`{self._path}`: key {error} is missing", hint) from error
+        if isinstance(error, (TypeError, ValueError, OverflowError, AttributeError)):
+            raise StateError(f"`{self._path}` is not usable: {error}", hint) from error
+
+
+def _credentials(raw: Mapping[str, str], base: Path) -> CredentialFiles:
+    return CredentialFiles(base / raw["ca"], base / raw["certificate"], base / raw["key"])
+
+
+def _service(raw: Mapping[str, Any]) -> ServiceSpec:
+    return ServiceSpec(
+        name=str(raw["name"]),
+        type=str(raw["type"]),
+        timeout_s=_seconds(raw.get("timeout_s") or 10.0),
+        on_timeout=OnTimeout(raw.get("on_timeout") or "silent"),
+        ok_field=str(raw.get("ok_field") or ""),
+    )
+
+
+def _seconds(raw: Any) -> float:
+    seconds = float(raw)
+    if not 0 < seconds <= REMAINING_LIMIT_S:  # false for NaN too
+        raise ValueError(f"{raw!r:.40} is not a time in seconds")
+    return seconds
+
+
+def _uid(raw: Any) -> str:
+    if not isinstance(raw, str) or not names.POOL_UID_PATTERN.fullmatch(raw):
+        raise ValueError(f"{raw!r:.40} is not a pool's uid: quote 16 hexadecimal digits")
+    return raw
+
+
+def _robot(raw: Any) -> str:
+    robot = str(raw)
+    if not robot.isprintable() or not 0 < len(robot.encode()) <= ROBOT_BYTES_LIMIT:
+        raise ValueError(f"a robot's name has 1 to {ROBOT_BYTES_LIMIT} printable bytes")
+    return robot
+
+
+def _optional_int(raw: Any) -> int | None:
+    return None if raw is None else int(raw)

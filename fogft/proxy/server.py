@@ -1,0 +1,172 @@
+"""The server proxy: the replica's side. Takes requests off the wire to the local services.
+
+It supervises the user's command, says "ready" for a service only while the command lives
+and discovery finds the service, and answers probes at once whatever the services do.
+
+When the command dies, the proxy leaves ROS and joins it anew: discovery would go on
+listing the dead service until its lease ends (20 s with Fast DDS), and requests sent to it
+would be lost. A new node knows only the living. When a service goes and the command lives (it may
+restart its own nodes), what was passed on to that service is refused, to be sent again.
+
+Owns: the replica's state as probes tell it. Not here: requests (`responder`), the command
+(`supervisor`), files and signals (`server_process`).
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from collections.abc import Callable
+
+from fogft.core import names
+from fogft.core.model import ReplicaId
+from fogft.core.spec import ServiceSpec
+from fogft.proxy.responder import Responder
+from fogft.proxy.supervisor import Supervisor
+from fogft.ros.port import RosClient, RosNode
+from fogft.wire.port import Incoming, Listener, Probe, ProbeAnswer
+
+log = logging.getLogger(__name__)
+
+
+class ServerProxy:
+    """Answers for one replica.
+
+    Args:
+        id: Which replica this is.
+        services: What it answers.
+        listener: Its end of the wire; `serve` is called here.
+        make_node: Joins ROS; called again after each death of the command.
+        supervisor: The user's command.
+        max_in_flight: Requests held at once.
+        orphan_after_s: With no sign of the pool's manager for so long, `orphaned` is true.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        id: ReplicaId,
+        services: tuple[ServiceSpec, ...],
+        listener: Listener,
+        make_node: Callable[[], RosNode],
+        supervisor: Supervisor,
+        *,
+        max_in_flight: int = 512,
+        orphan_after_s: float = 3600.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._id = id
+        self._services = services
+        self._listener = listener
+        self._make_node = make_node
+        self._supervisor = supervisor
+        self._orphan_after_s = orphan_after_s
+        self._clock = clock
+        self._incarnation = secrets.token_hex(8)
+        self._ready: frozenset[str] = frozenset()
+        self._manager_seen = clock()
+        self._node: RosNode | None = None
+        self._clients: dict[str, RosClient] = {}
+        self._servers: dict[str, int] = {}
+        self.draining = False
+        self.responder = Responder(
+            lambda name: name in self._ready, max_in_flight=max_in_flight, clock=clock
+        )
+
+    def start(self) -> None:
+        """Begin to listen and start the user's command."""
+        keys = {
+            s.name: names.service_key(self._id.pool_uid, self._id.slot, s.name, s.type)
+            for s in self._services
+        }
+        self._join_ros()
+        self._listener.serve(keys, self._request, self._probe)
+        self._supervisor.poll()
+        log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
+
+    def run_once(self) -> None:
+        """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
+        died = self._supervisor.poll()
+        if died or self._node is None or not self._node.alive:
+            self._ready = frozenset()
+            self.responder.crashed()
+            self._leave_ros()
+            self._join_ros()
+        self._look_for_services()
+        self.responder.tick()
+
+    def _look_for_services(self) -> None:
+        ready = frozenset(
+            name
+            for name, client in self._clients.items()
+            if self._supervisor.alive and client.available()
+        )
+        gone = self._ready - ready
+        if ready != self._ready:
+            log.info("services_ready replica=%s ready=%s", self._id, sorted(ready))
+            self._ready = ready
+        for name in gone | self._replaced():
+            log.warning("service_lost replica=%s service=%s", self._id, name)
+            self.responder.crashed(name)
+
+    def _replaced(self) -> set[str]:
+        """Return the services that have one more server than before.
+
+        It took the place of one that died: discovery lists the dead one beside it for long.
+        """
+        before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
+        return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
+
+    @property
+    def orphaned(self) -> bool:
+        """Whether nothing was heard of a manager for `orphan_after_s`."""
+        return self._clock() - self._manager_seen > self._orphan_after_s
+
+    def _join_ros(self) -> None:
+        self._node = self._make_node()
+        self._clients = {s.name: self._node.client(s.name, s.type) for s in self._services}
+        self._servers = {}
+        self.responder.use(self._clients)
+
+    def _leave_ros(self) -> None:
+        node, self._node, self._clients = self._node, None, {}
+        self.responder.use({})
+        if node is not None:
+            node.close()
+
+    def _request(self, incoming: Incoming) -> None:
+        self.responder.request(incoming)
+
+    def _probe(self, probe: Probe) -> ProbeAnswer:
+        if probe.manager_age_s is not None:
+            seen = self._clock() - probe.manager_age_s
+            self._manager_seen = max(self._manager_seen, seen)
+        return ProbeAnswer(
+            slot=self._id.slot,
+            generation=self._id.generation,
+            incarnation=self._incarnation,
+            ready=self._ready,
+            draining=self.draining,
+            restarts=max(self._supervisor.restarts, 0),
+            in_flight=self.responder.in_flight,
+            detail=self._detail(),
+        )
+
+    def _detail(self) -> str:
+        if len(self._ready) == len(self._services):
+            return ""
+        if not self._supervisor.alive:
+            if not self._supervisor.last_exit:
+                return "`run` has not started"
+            return f"`run` {self._supervisor.last_exit}: see `fogft logs {self._id.slot}`"
+        missing = sorted({s.name for s in self._services} - self._ready)
+        return f"`run` does not offer {', '.join(missing)} yet"
+
+    def close(self) -> None:
+        """Stop the command, leave the wire and ROS."""
+        self._ready = frozenset()
+        self._supervisor.stop()
+        self.responder.crashed()
+        self._listener.close()
+        self._leave_ros()

@@ -1,0 +1,117 @@
+"""``fogft serve --config FILE``: the server proxy as a process, one a replica.
+
+It ends with status 0 when it was told to or when it is orphaned; whoever started it (a VM's
+job, the local cloud's machine) then ends the machine.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+from pathlib import Path
+
+from fogft.proxy.config import ServerProxyConfig, read_server
+from fogft.proxy.process import Watched, start_log, stop_on_signal
+from fogft.proxy.server import ServerProxy
+from fogft.proxy.supervisor import Supervisor
+from fogft.ros import environment, memory_tuning
+from fogft.ros.port import RosNode
+from fogft.wire import runtime
+
+log = logging.getLogger(__name__)
+
+_TICK_S = 0.05
+
+
+def run(
+    config_path: Path,
+    *,
+    listen: str | None = None,
+    domain_id: int | None = None,
+    workdir: Path | None = None,
+    notice_file: Path | None = None,
+) -> None:
+    """Run until a signal ends it, or until no manager was heard of for `orphan_after_s`.
+
+    Args:
+        config_path: A `replica.yaml`.
+        listen: ``host:port`` instead of the file's.
+        domain_id: ROS domain instead of the file's.
+        workdir: Folder in which `run` starts, instead of the file's.
+        notice_file: File that appears when the machine is about to be preempted.
+
+    Raises:
+        FogftError: The configuration, the credentials or ROS cannot be used.
+    """
+    config = read_server(
+        config_path,
+        listen=listen,
+        domain_id=domain_id,
+        workdir=str(workdir.resolve()) if workdir else None,
+        notice_file=str(notice_file.resolve()) if notice_file else None,
+    )
+    start_log(config.log_level)
+    stop = stop_on_signal()
+    environment.prepare(os.environ)
+    memory_tuning.tune()
+    proxy = _make(config)
+    try:
+        proxy.start()
+        _loop(config, proxy, stop)
+    finally:
+        proxy.close()
+        log.info("replica_stopped replica=%s", config.id)
+
+
+def _make(config: ServerProxyConfig) -> ServerProxy:
+    from fogft.ros.node import SerialisedNode
+    from fogft.wire.zenoh_listener import ZenohListener
+
+    def make_node() -> RosNode:
+        return SerialisedNode(f"fogft_replica_{config.id.slot}", config.domain_id)
+
+    environ = run_environment(config)
+    return ServerProxy(
+        config.id,
+        config.services,
+        ZenohListener(config.listen, config.credentials, config.id),
+        make_node,
+        Supervisor(config.run, config.workdir, environ),
+        max_in_flight=config.max_in_flight,
+        orphan_after_s=config.orphan_after_s,
+    )
+
+
+def run_environment(config: ServerProxyConfig) -> dict[str, str]:
+    """Return what the user's command finds in its environment.
+
+    In a virtual environment its own `python3` comes first, as if it were activated, so that
+    ``run: python3 node.py`` finds the same ROS as the proxy.
+    """
+    environ = environment.child_environment(os.environ)
+    runtime.forget(environ)
+    if sys.prefix != sys.base_prefix:
+        environ["VIRTUAL_ENV"] = sys.prefix
+        environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
+    environ.update(config.envs)
+    if config.domain_id is not None:
+        environ["ROS_DOMAIN_ID"] = str(config.domain_id)
+    return environ
+
+
+def _loop(config: ServerProxyConfig, proxy: ServerProxy, stop: threading.Event) -> None:
+    memory = memory_tuning.Trimmer()
+    notice = Watched(config.notice_file) if config.notice_file else None
+    while not stop.wait(_TICK_S):
+        proxy.run_once()
+        memory.look()
+        if notice is not None and not proxy.draining and notice.changed():
+            proxy.draining = True
+            log.warning("notice_received replica=%s file=%s", config.id, notice.path)
+        if proxy.orphaned:
+            log.error(
+                "replica_orphaned replica=%s orphan_after_s=%.0f", config.id, config.orphan_after_s
+            )
+            return

@@ -1,0 +1,132 @@
+"""Run the user's command as a child: start it, see it die, start it again, end it.
+
+The command gets a session of its own and dies with this process, whatever ends it
+(`fogft.child`). It is started through ``bash -c``, as SkyPilot does.
+
+Owns: one child process. Not here: whether its services answer (`server`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from fogft.child import tied
+
+log = logging.getLogger(__name__)
+
+
+class Supervisor:
+    """One command, kept running. All methods are called from the main thread only.
+
+    The kernel ties the child's life to the *thread* that started it, hence that rule.
+
+    Args:
+        command: A shell command; ``exec`` in it saves a process.
+        workdir: Where it runs.
+        environ: Its whole environment.
+        clock: Monotonic seconds.
+        backoff_s: First and longest wait between a death and the next start. A run
+            longer than the longest wait resets it.
+    """
+
+    def __init__(
+        self,
+        command: str,
+        workdir: Path,
+        environ: Mapping[str, str],
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        backoff_s: tuple[float, float] = (0.5, 15.0),
+    ) -> None:
+        self._command = command
+        self._workdir = workdir
+        self._environ = dict(environ)
+        self._clock = clock
+        self._backoff_s = backoff_s
+        self._wait_s = backoff_s[0]
+        self._start_at = 0.0
+        self._started_at = 0.0
+        self._child: subprocess.Popen[bytes] | None = None
+        self.restarts = -1  # the first start is no restart
+        self.last_exit = ""
+
+    @property
+    def alive(self) -> bool:
+        """Whether the command runs."""
+        return self._child is not None
+
+    def poll(self) -> bool:
+        """See whether the command died, and start it when its time has come.
+
+        Returns:
+            Whether it has died since the last call.
+        """
+        died = False
+        if self._child is not None:
+            status = self._child.poll()
+            if status is None:
+                return False
+            died = True
+            self._note_death(status)
+        if self._clock() >= self._start_at:
+            self._start()
+        return died
+
+    def _note_death(self, status: int) -> None:
+        assert self._child is not None
+        self._kill_group(self._child.pid)  # what it left behind in its group
+        ran_s = self._clock() - self._started_at
+        if ran_s > self._backoff_s[1]:
+            self._wait_s = self._backoff_s[0]
+        self.last_exit = (
+            f"died of {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        )
+        log.warning("run_ended status=%d ran_s=%.1f again_in_s=%.1f", status, ran_s, self._wait_s)
+        self._child = None
+        self._start_at = self._clock() + self._wait_s
+        self._wait_s = min(self._wait_s * 2, self._backoff_s[1])
+
+    def _start(self) -> None:
+        self._started_at = self._clock()
+        self.restarts += 1
+        try:
+            self._child = subprocess.Popen(
+                tied(["bash", "-c", self._command]),
+                cwd=self._workdir,
+                env=self._environ,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        except OSError as error:
+            self.last_exit = f"cannot be started: {error}"
+            self._start_at = self._clock() + self._wait_s
+            self._wait_s = min(self._wait_s * 2, self._backoff_s[1])
+            log.error("run_not_started reason=%r", str(error))
+            return
+        log.info("run_started pid=%d command=%r", self._child.pid, self._command)
+
+    def stop(self, grace_s: float = 3.0) -> None:
+        """End the command: SIGINT as ROS nodes expect, then SIGKILL. Repeatable."""
+        child, self._child = self._child, None
+        self._start_at = float("inf")
+        if child is None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(grace_s)
+        self._kill_group(child.pid)
+        child.wait()
+        log.info("run_stopped")
+
+    @staticmethod
+    def _kill_group(pid: int) -> None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(pid, signal.SIGKILL)

@@ -1,0 +1,99 @@
+"""The slow way: rclpy's own messages, turned into bytes and back by `rclpy.serialization`.
+
+Used where `serialised` fails its test. Same bytes, same errors, no ctypes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.ros.port import Unreadable
+
+
+def _to_bytes(message: Any) -> bytes:
+    from rclpy.serialization import serialize_message
+
+    return bytes(serialize_message(message))
+
+
+def _from_bytes(payload: bytes, message_type: Any) -> Any:
+    from rclpy.serialization import deserialize_message
+
+    try:
+        return deserialize_message(payload, message_type)
+    except Exception as error:  # rclpy's own error types are private and vary by release
+        raise Unreadable(
+            f"{len(payload)} bytes are not a serialised {message_type.__name__}: {error}"
+        ) from error
+
+
+class ConvertedServiceEnd:
+    """`ServiceEnd` over rclpy's messages."""
+
+    def __init__(self, service: Any, service_type: Any) -> None:
+        self._handle = service.handle
+        self._type = service_type
+
+    def take(self) -> tuple[bytes, Any] | None:
+        """Return the next serialised request and its request id."""
+        try:
+            request, header = self._handle.service_take_request(self._type.Request)
+        except Exception as error:
+            raise RosError(f"a request cannot be taken: {error}") from error
+        return None if header is None else (_to_bytes(request), header.request_id)
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        """Send a serialised response."""
+        response = _from_bytes(payload, self._type.Response)
+        try:
+            self._handle.service_send_response(response, handle)
+        except Exception as error:
+            raise RosError(f"a response cannot be sent: {error}") from error
+
+    def close(self) -> None:
+        """Hold nothing; nothing to free."""
+
+
+class ConvertedClientEnd:
+    """`ClientEnd` over rclpy's messages."""
+
+    def __init__(self, client: Any, service_type: Any) -> None:
+        self._handle = client.handle
+        self._type = service_type
+
+    def take(self) -> tuple[int, bytes] | None:
+        """Return the next response: sequence number and bytes."""
+        try:
+            header, response = self._handle.take_response(self._type.Response)
+        except Exception as error:
+            raise RosError(f"a response cannot be taken: {error}") from error
+        if header is None:
+            return None
+        return header.request_id.sequence_number, _to_bytes(response)
+
+    def send(self, payload: bytes) -> int:
+        """Send a serialised request; return its sequence number."""
+        request = _from_bytes(payload, self._type.Request)
+        try:
+            return int(self._handle.send_request(request))
+        except Exception as error:
+            raise RosError(f"a request cannot be sent: {error}") from error
+
+    def close(self) -> None:
+        """Hold nothing; nothing to free."""
+
+
+class ConvertedTransfer:
+    """`Transfer` over rclpy's messages."""
+
+    def __init__(self, service_type: Any) -> None:
+        self._service_type = service_type
+
+    def service_end(self, service: Any) -> ConvertedServiceEnd:
+        """Return the end of an rclpy service."""
+        return ConvertedServiceEnd(service, self._service_type)
+
+    def client_end(self, client: Any) -> ConvertedClientEnd:
+        """Return the end of an rclpy client."""
+        return ConvertedClientEnd(client, self._service_type)

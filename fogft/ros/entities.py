@@ -1,0 +1,192 @@
+"""The services and clients of a node: what may be called from which thread.
+
+A take loop calls `drain` and `destroy`; everything else may come from any thread. Each
+entity has one lock: over *send and insert*, so that a response never comes before its
+request is known, and over the C message that sending uses.
+
+Owns: pending requests, the order of sending and closing.
+Not here: the loop (`node`), bytes (`transfer`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.ros.pacing import Pacer
+from fogft.ros.transfer import ClientEnd, ServiceEnd
+
+log = logging.getLogger(__name__)
+
+BURST = 128  # messages taken from one entity before the others get their turn
+
+
+class _Unreadable:
+    """Counts what could not be taken; logs the 1st, 2nd, 4th, 8th, ..."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._count = 0
+
+    def __call__(self, error: RosError) -> None:
+        self._count += 1
+        if self._count & (self._count - 1) == 0:
+            log.warning("%s: %s (%d so far)", self._name, error.message, self._count)
+
+
+class Server:
+    """A service of a node (`fogft.ros.port.RosServer`)."""
+
+    def __init__(
+        self,
+        service: Any,
+        end: ServiceEnd,
+        on_request: Callable[[bytes, Any], None],
+        withdraw: Callable[[Server], None],
+    ) -> None:
+        self.handle = service.handle
+        self._service = service
+        self._end: ServiceEnd | None = end
+        self._take = end.take
+        self._on_request = on_request
+        self._withdraw = withdraw
+        self._unreadable = _Unreadable(service.srv_name)
+        self._lock = threading.Lock()
+        self._pacer = Pacer(self._send)
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        """Send the serialised response; in a burst, when the client can bear it.
+
+        Nothing happens once the service is withdrawn.
+
+        Raises:
+            RosError: It was sent at once, and it is no such response, or ROS refused it.
+        """
+        self._pacer.respond(handle, payload)
+
+    def _send(self, handle: Any, payload: bytes) -> None:
+        with self._lock:
+            if self._end is not None:
+                self._end.respond(handle, payload)
+
+    def close(self) -> None:
+        """Withdraw the service; repeatable. On return it is gone, unless the take loop called."""
+        self._withdraw(self)
+
+    def drain(self) -> None:
+        """Deliver what has arrived. Take loop only."""
+        for _ in range(BURST):
+            try:
+                taken = self._take()
+            except RosError as error:
+                self._unreadable(error)
+                return
+            if taken is None:
+                return
+            self._pacer.requested(taken[1])
+            try:
+                self._on_request(*taken)
+            except Exception:
+                log.exception("%s: a request was lost", self._service.srv_name)
+
+    def destroy(self, node: Any) -> None:
+        """Free everything. Take loop only, once, when no wait set holds the handle."""
+        self._pacer.close()
+        with self._lock:
+            end, self._end = self._end, None
+        if end is not None:
+            end.close()
+            node.destroy_service(self._service)
+
+
+class Client:
+    """A client of a node (`fogft.ros.port.RosClient`)."""
+
+    def __init__(
+        self,
+        client: Any,
+        end: ClientEnd,
+        withdraw: Callable[[Client], None],
+        count: Callable[[str], int],
+    ) -> None:
+        self.handle = client.handle
+        self._count = count
+        self._client = client
+        self._end: ClientEnd | None = end
+        self._take = end.take
+        self._withdraw = withdraw
+        self._pending: dict[int, Callable[[bytes], None]] = {}
+        self._unreadable = _Unreadable(client.srv_name)
+        self._lock = threading.Lock()
+
+    def available(self) -> bool:
+        """Whether discovery has found a server."""
+        if self._end is None:
+            return False
+        try:
+            return bool(self._client.service_is_ready())
+        except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
+            return False
+
+    def servers(self) -> int:
+        """Count the servers that discovery lists, dead ones included until their lease ends."""
+        if self._end is None:
+            return 0
+        try:
+            return self._count(self._client.srv_name)
+        except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
+            return 0
+
+    def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
+        """Send a serialised request; return its ticket.
+
+        Raises:
+            RosError: The client is closed, the bytes are no such request, or ROS refused them.
+        """
+        with self._lock:
+            if self._end is None:
+                raise RosError(f"the client of `{self._client.srv_name}` is closed")
+            ticket = self._end.send(payload)
+            self._pending[ticket] = on_response
+        return ticket
+
+    def forget(self, ticket: int) -> None:
+        """Drop what is kept for a request; unknown tickets are fine."""
+        with self._lock:
+            self._pending.pop(ticket, None)
+
+    def close(self) -> None:
+        """Withdraw the client; repeatable. On return it is gone, unless the take loop called."""
+        self._withdraw(self)
+
+    def drain(self) -> None:
+        """Deliver what has arrived. Take loop only."""
+        for _ in range(BURST):
+            try:
+                taken = self._take()
+            except RosError as error:
+                self._unreadable(error)
+                return
+            if taken is None:
+                return
+            ticket, payload = taken
+            with self._lock:
+                on_response = self._pending.pop(ticket, None)
+            if on_response is None:
+                continue
+            try:
+                on_response(payload)
+            except Exception:
+                log.exception("%s: a response was lost", self._client.srv_name)
+
+    def destroy(self, node: Any) -> None:
+        """Free everything. Take loop only, once, when no wait set holds the handle."""
+        with self._lock:
+            end, self._end = self._end, None
+            self._pending.clear()
+        if end is not None:
+            end.close()
+            node.destroy_client(self._client)

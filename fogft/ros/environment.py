@@ -1,0 +1,166 @@
+"""The environment that ROS 2 processes need here, and what is in force.
+
+`prepare` must run before the first node is made, best before rclpy is imported.
+Settings of the user are never overridden; ``ROS_DOMAIN_ID``, ``ROS_LOCALHOST_ONLY`` and
+``ROS_AUTOMATIC_DISCOVERY_RANGE`` are left to ROS itself.
+
+Owns: the shared-memory profile's place, variables of ROS and of its Python wheels.
+Not here: judging what is found (`fogft doctor`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Mapping, MutableMapping
+from importlib import metadata
+from pathlib import Path
+
+from fogft.core.errors import RosError
+
+PROFILE_VARIABLE = "FASTDDS_DEFAULT_PROFILES_FILE"
+_CHOSEN_BY_USER = (
+    PROFILE_VARIABLE,
+    "FASTRTPS_DEFAULT_PROFILES_FILE",  # its name before Fast DDS 2.12
+    "FASTDDS_BUILTIN_TRANSPORTS",
+)
+# Each participant takes 35 MB for its segment: room for the two ends of a call, twice.
+_ROOM_NEEDED_BYTES = 140_000_000
+# Fast DDS reads these from the working folder where no variable names a file.
+_LOCAL_PROFILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
+
+# The wheels' start-up hook runs Python again with another LD_LIBRARY_PATH, once: this
+# variable, inherited by a child in another environment, would keep its hook from running.
+_WHEELS_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
+
+_DISTRIBUTIONS = {"3.3": "humble", "7.1": "jazzy", "9.1": "kilted"}  # by rclpy's version
+
+
+def profile_path() -> Path:
+    """Return the shipped Fast DDS profile, in a checkout or in an installed package.
+
+    Raises:
+        RosError: The installation is incomplete.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "templates", package.parent / "templates"):
+        path = folder / "fastdds_shm.xml"
+        if path.is_file():
+            return path
+    raise RosError("fogft's own `templates/fastdds_shm.xml` is missing", "install fogft again")
+
+
+def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
+    """Choose the shared-memory profile where the user has chosen none. Returns whether it did.
+
+    It does not where /dev/shm is small, as containers have it by default (64 MB): Fast DDS
+    would report errors and fall back to UDP.
+
+    Raises:
+        RosError: The installation is incomplete.
+    """
+    if any(environ.get(name) for name in _CHOSEN_BY_USER):
+        return False
+    if any(Path(name).is_file() for name in _LOCAL_PROFILES):
+        return False
+    if _shared_memory_free_bytes() < _ROOM_NEEDED_BYTES:
+        return False
+    environ[PROFILE_VARIABLE] = str(profile_path())
+    return True
+
+
+def child_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the environment for a command of the user's, in whatever installation it lives.
+
+    Undoes what the ROS wheels' start-up hook did for this process: a child in the same
+    virtual environment does it again for itself, and any other child must not find our
+    libraries before its own.
+    """
+    child = dict(environ)
+    if child.pop(_WHEELS_GUARD, None) is None:
+        return child
+    kept = [
+        part
+        for part in child.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+        if part and not _added_by_wheels(Path(part))
+    ]
+    child.pop("LD_LIBRARY_PATH", None)
+    if kept:
+        child["LD_LIBRARY_PATH"] = os.pathsep.join(kept)
+    return child
+
+
+def _added_by_wheels(folder: Path) -> bool:
+    ours = Path(sys.prefix, "lib")
+    return folder == ours or (
+        folder.name.startswith("ros_") and folder.suffix == ".libs" and ours in folder.parents
+    )
+
+
+def describe(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return what ROS 2 there is and what is in force, for people. Imports rclpy; never raises.
+
+    Keys: ``rclpy`` (version and place, or why it is missing), ``distribution``, ``source``,
+    ``rmw``, ``domain``, ``discovery``, ``profile``, ``shared_memory_free_mb``.
+    """
+    found = {
+        "domain": environ.get("ROS_DOMAIN_ID") or "0",
+        "discovery": _discovery(environ),
+        "profile": _profile(environ),
+        "shared_memory_free_mb": str(_shared_memory_free_bytes() // 1_000_000),
+    }
+    try:
+        import rclpy
+        from rclpy.utilities import get_rmw_implementation_identifier
+
+        place = Path(rclpy.__file__).parent
+        version = _rclpy_version(place)
+        release = ".".join(version.split(".")[:2])
+        found |= {
+            "rclpy": f"{version} in {place}",
+            "rmw": get_rmw_implementation_identifier(),
+            "distribution": environ.get("ROS_DISTRO") or _DISTRIBUTIONS.get(release, "unknown"),
+            "source": _source(place),
+        }
+    except Exception as error:  # a half-installed ROS fails in its own ways
+        found |= {"rclpy": f"not usable: {error}", "rmw": "", "distribution": "", "source": ""}
+    return found
+
+
+def _discovery(environ: Mapping[str, str]) -> str:
+    if environ.get("ROS_LOCALHOST_ONLY") == "1":
+        return "LOCALHOST (ROS_LOCALHOST_ONLY=1)"
+    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
+    peers = environ.get("ROS_STATIC_PEERS")
+    return f"{reach}, peers {peers}" if peers else reach
+
+
+def _profile(environ: Mapping[str, str]) -> str:
+    for name in _CHOSEN_BY_USER:
+        if environ.get(name):
+            return f"{name}={environ[name]}"
+    for name in _LOCAL_PROFILES:
+        if Path(name).is_file():
+            return str(Path(name).resolve())
+    return "none: Fast DDS's default transports, slow above 0.5 MB"
+
+
+def _shared_memory_free_bytes() -> int:
+    try:
+        return shutil.disk_usage("/dev/shm").free
+    except OSError:
+        return 0
+
+
+def _rclpy_version(place: Path) -> str:
+    for name in ("rclpy", "ros-rclpy"):
+        for distribution in metadata.distributions(name=name, path=[str(place.parent)]):
+            return distribution.version
+    return "unknown"
+
+
+def _source(place: Path) -> str:
+    if "site-packages" in place.parts and Path(sys.prefix) in place.parents:
+        return f"wheels in {sys.prefix}"
+    return f"ROS installation {place.parents[3] if len(place.parents) > 3 else place}"

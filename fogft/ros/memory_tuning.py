@@ -1,0 +1,89 @@
+"""Keep glibc from giving large message buffers back to the system after each message.
+
+A 0.9 MB buffer lies above malloc's threshold for mapping memory of its own; taking and
+dropping one costs hundreds of page faults: 0.75 ms against 0.05 ms when it is kept. So it
+is kept, and given back now and then (`Trimmer`), or one burst would hold its memory for ever.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
+_M_ARENA_MAX = -8
+_MMAP_THRESHOLD_BYTES = 64 * 1024 * 1024
+_TRIM_THRESHOLD_BYTES = 512 * 1024 * 1024
+_ARENAS = 2  # each thread would have its own, and each keep what its own burst took
+
+
+def tune() -> bool:
+    """Tune this process's malloc. Returns whether it took effect: only glibc has the knobs."""
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return False
+    mallopt.argtypes = (ctypes.c_int, ctypes.c_int)
+    mallopt.restype = ctypes.c_int
+    mapped = mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)
+    trimmed = mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD_BYTES)
+    arenas = mallopt(_M_ARENA_MAX, _ARENAS)
+    return bool(mapped and trimmed and arenas)
+
+
+def own_bytes() -> int:
+    """Return this process's own memory: what no file stands behind (RssAnon)."""
+    found = re.search(r"RssAnon:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return int(found[1]) * 1024 if found else 0
+
+
+def give_back() -> None:
+    """Give all memory that is free back to the system; some milliseconds. Only with glibc."""
+    try:
+        trim = ctypes.CDLL(None).malloc_trim
+    except (OSError, AttributeError):
+        return
+    trim(0)
+
+
+class Trimmer:
+    """Gives memory back when a process holds much more than it did.
+
+    Args:
+        above_bytes: What the process may keep.
+        every_s: Look no more often.
+        clock: Monotonic seconds.
+        own: Returns the process's own memory, in bytes.
+        give: Gives free memory back.
+    """
+
+    def __init__(
+        self,
+        above_bytes: int = 64 << 20,
+        every_s: float = 5.0,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        own: Callable[[], int] = own_bytes,
+        give: Callable[[], None] = give_back,
+    ) -> None:
+        self._above_bytes = above_bytes
+        self._every_s = every_s
+        self._clock = clock
+        self._own = own
+        self._give = give
+        self._looked_at = clock()
+
+    def look(self) -> bool:
+        """Give memory back if it is time and there is much. Returns whether it did."""
+        now = self._clock()
+        if now - self._looked_at < self._every_s:
+            return False
+        self._looked_at = now
+        if self._own() <= self._above_bytes:
+            return False
+        self._give()
+        return True

@@ -1,0 +1,244 @@
+"""A node of the proxy's own: one context, one thread, one wait set over all it serves and calls.
+
+Two rules:
+1. Only the take loop touches the wait set, and only it destroys. Other threads put their
+   change into a list and trigger the guard condition.
+2. Callbacks run on the take loop. They must not block; what they raise is logged.
+
+Owns: the context, the node, the thread, quality of service.
+Not here: pending requests (`entities`), bytes (`transfer`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.ros import transfer
+from fogft.ros.entities import Client, Server
+
+log = logging.getLogger(__name__)
+
+_CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
+_NO_LIMIT = -1  # of rcl_wait: until something happens
+
+# A process that proxies must not leave files in ~/.ros/log; it has a log of its own.
+_ROS_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs"]
+
+
+class SerialisedNode:
+    """Serialised services and clients in one ROS domain (`fogft.ros.port.RosNode`).
+
+    Args:
+        name: The node's name: letters, digits and underscores.
+        domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
+
+    Raises:
+        RosError: ROS 2 is not usable here, or refuses the name.
+    """
+
+    def __init__(self, name: str, domain_id: int | None = None) -> None:
+        self._entities: tuple[Server | Client, ...] = ()
+        self._changes: list[tuple[Server | Client, bool, threading.Event]] = []
+        self._create_lock = threading.Lock()  # rcl wants one creation at a time
+        self._transfers: dict[str, transfer.Transfer] = {}
+        self._stopping = False
+        self._ended = threading.Event()
+        try:
+            self._start_ros(name, domain_id)
+        except ImportError as error:
+            raise RosError(
+                f"ROS 2 is not usable here: {error}",
+                "source a ROS 2 installation, or install `fogft[ros]`",
+            ) from error
+        except Exception as error:
+            raise RosError(f"the ROS node `{name}` cannot be made: {error}") from error
+        self._thread = threading.Thread(target=self._run, name=f"ros-{name}", daemon=True)
+        self._thread.start()
+
+    def _start_ros(self, name: str, domain_id: int | None) -> None:
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.guard_condition import GuardCondition
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+        from rclpy.parameter import Parameter
+        from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+        from rclpy.signals import SignalHandlerOptions
+
+        self._new_wait_set: Any = rclpy_implementation.WaitSet
+        self._quality = QoSProfile(
+            history=HistoryPolicy.KEEP_ALL,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.VOLATILE,
+        )
+        self._context: Any = Context()
+        rclpy.init(
+            args=_ROS_ARGUMENTS,
+            context=self._context,
+            domain_id=domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        try:
+            self._node = rclpy.create_node(
+                name,
+                context=self._context,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+                parameter_overrides=[Parameter("start_type_description_service", value=False)],
+            )
+            self._guard = GuardCondition(None, None, context=self._context)
+        except BaseException:
+            self._context.try_shutdown()
+            raise
+
+    @property
+    def alive(self) -> bool:
+        """Whether the take loop runs. It ends by `close`, or by an error that was logged."""
+        return not self._ended.is_set()
+
+    def serve(self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]) -> Server:
+        """Offer a service. A first request may come before this returns.
+
+        Raises:
+            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
+        """
+
+        def create(way: transfer.Transfer, service_type: Any) -> Server:
+            service: Any = self._node.create_service(
+                service_type, name, lambda _, response: response, qos_profile=self._quality
+            )
+            try:
+                return Server(service, way.service_end(service), on_request, self._withdraw)
+            except BaseException:
+                self._node.destroy_service(service)
+                raise
+
+        server: Server = self._create(name, type_name, create)
+        return server
+
+    def client(self, name: str, type_name: str) -> Client:
+        """Make a client of a service.
+
+        Raises:
+            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
+        """
+
+        # ROS 2 Humble cannot count: there, whether one is available must do.
+        count: Any = getattr(self._node, "count_services", lambda _: 0)
+
+        def create(way: transfer.Transfer, service_type: Any) -> Client:
+            client: Any = self._node.create_client(service_type, name, qos_profile=self._quality)
+            try:
+                return Client(client, way.client_end(client), self._withdraw, count)
+            except BaseException:
+                self._node.destroy_client(client)
+                raise
+
+        client: Client = self._create(name, type_name, create)
+        return client
+
+    def _create(
+        self, name: str, type_name: str, create: Callable[[transfer.Transfer, Any], Any]
+    ) -> Any:
+        from fogft.ros.types import load_service_type
+
+        service_type = load_service_type(type_name)
+        with self._create_lock:
+            if self._stopping or self._ended.is_set():
+                raise RosError("the ROS node is closed")
+            way = self._transfers.get(type_name)
+            if way is None:
+                way = self._transfers[type_name] = transfer.choose(type_name)
+            try:
+                entity = create(way, service_type)
+            except RosError:
+                raise
+            except Exception as error:
+                raise RosError(f"`{name}` cannot be made: {error}") from error
+            self._changes.append((entity, True, threading.Event()))
+            self._guard.trigger()
+        return entity
+
+    def _withdraw(self, entity: Server | Client) -> None:
+        done = threading.Event()
+        with self._create_lock:
+            if self._ended.is_set():
+                return  # the loop destroyed everything at its end
+            self._changes.append((entity, False, done))
+            self._guard.trigger()
+        if threading.current_thread() is not self._thread:
+            done.wait(_CLOSE_LIMIT_S)
+
+    def close(self) -> None:
+        """Stop the thread and leave ROS. Repeatable; from a callback it only asks for the end."""
+        with self._create_lock:
+            self._stopping = True
+            if not self._ended.is_set():
+                self._guard.trigger()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_CLOSE_LIMIT_S)
+            if self._thread.is_alive():
+                log.warning("the take loop of ROS does not end: a callback blocks")
+
+    def _run(self) -> None:
+        try:
+            wait_set, waiting = self._apply_changes()
+            while not self._stopping:
+                if self._changes:
+                    wait_set, waiting = self._apply_changes()
+                wait_set.clear_entities()
+                wait_set.add_guard_condition(self._guard.handle)
+                for add, _, entity in waiting:
+                    add(entity.handle)
+                wait_set.wait(_NO_LIMIT)
+                is_ready = wait_set.is_ready
+                ready = [entity for (_, where, entity) in waiting if is_ready(*where)]
+                for entity in ready:
+                    entity.drain()
+        except Exception:
+            log.exception("the take loop of ROS ended")
+        finally:
+            self._end_ros()
+
+    def _apply_changes(self) -> tuple[Any, list[tuple[Any, tuple[str, int], Server | Client]]]:
+        """Return a new wait set and, for each entity, how to add it and where it then stands."""
+        with self._create_lock:
+            changes, self._changes = self._changes, []
+        entities = dict.fromkeys(self._entities)
+        for entity, added, _ in changes:
+            if added:
+                entities[entity] = None
+            else:
+                entities.pop(entity, None)
+        self._entities = tuple(entities)
+        for entity, added, done in changes:
+            if not added:
+                entity.destroy(self._node)
+            done.set()
+        services = [entity for entity in self._entities if isinstance(entity, Server)]
+        clients = [entity for entity in self._entities if isinstance(entity, Client)]
+        context = self._context.handle
+        with context:  # 0 subscriptions, 1 guard condition, 0 timers, ..., 0 events
+            wait_set = self._new_wait_set(0, 1, 0, len(clients), len(services), 0, context)
+        waiting: list[tuple[Any, tuple[str, int], Server | Client]] = [
+            *((wait_set.add_service, ("service", i), entity) for i, entity in enumerate(services)),
+            *((wait_set.add_client, ("client", i), entity) for i, entity in enumerate(clients)),
+        ]
+        return wait_set, waiting
+
+    def _end_ros(self) -> None:
+        with self._create_lock:
+            self._ended.set()
+            changes, self._changes = self._changes, []
+        for entity in {*self._entities, *(entity for entity, _, _ in changes)}:
+            entity.destroy(self._node)
+        self._entities = ()
+        for _, _, done in changes:
+            done.set()
+        self._guard.destroy()
+        self._node.destroy_node()
+        self._context.try_shutdown()

@@ -1,0 +1,186 @@
+"""Respond in no denser bursts than an ordinary client bears.
+
+An ordinary ROS client keeps the last ten responses that it has not taken yet and silently
+loses more. A service answers one request after another, but a proxy answers in bursts: all
+that a failover held up, at once. Nobody tells how deep a client's queue is or whether it
+takes, but a client that asks again after it was answered does. So `WINDOW` responses may be
+on their way to a client; each request of one that has no more open than it usually has, or
+else each `EVERY_S`, makes room for another. A client that proves quick gets a wider window.
+
+Owns: when a response is sent. Not here: sending it (`entities`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from fogft.core.errors import RosError
+
+log = logging.getLogger(__name__)
+
+WINDOW = 5  # of the ten in rmw_qos_profile_services_default
+WINDOW_LIMIT = 64
+EVERY_S = 0.005  # so a burst may meet a client that takes nothing for 25 ms
+_QUIET_S = 0.05  # after so long without a request a client must prove anew that it is quick
+_USUAL_GROWS = 4  # each `EVERY_S`, and by a twentieth of what is open: faster is a burst
+_CLIENTS_KEPT = 64
+_GUID_BYTES = 16
+
+
+class Pace:
+    """One client: how many responses it may not have taken yet. Pure; seconds come in."""
+
+    def __init__(self, now: float) -> None:
+        self.waiting: deque[tuple[Any, bytes]] = deque()
+        self._open = 0  # asked and not answered; one that is never answered stays: no harm
+        self._usual = WINDOW  # no more open than this is nothing new
+        self._untaken = 0
+        self._window = WINDOW
+        self._proofs = 0
+        self._refilled_at = self._grown_at = now
+        self.asked_at = now
+
+    def requested(self, now: float) -> None:
+        """Note a request. Where it takes the place of another, that one's response was taken."""
+        self._refill(now)
+        if now - self.asked_at > _QUIET_S:
+            self._window, self._proofs, self._usual = WINDOW, 0, WINDOW
+        if self._open == 0:
+            self._usual = min(self._usual, WINDOW)
+        self.asked_at = now
+        self._open += 1
+        if self._open > self._usual:
+            # It only asks for more, and who asks in a burst does not take meanwhile.
+            self._proofs, self._refilled_at = 0, now
+        elif self._untaken:
+            self._untaken -= 1
+            self._proofs += 1
+            if self._proofs >= 4 * self._window:
+                self._window, self._proofs = min(2 * self._window, WINDOW_LIMIT), 0
+
+    def take(self, now: float) -> bool:
+        """Whether a response may be sent now; if so, it counts as sent."""
+        self._refill(now)
+        if self._untaken >= self._window:
+            return False
+        self._untaken += 1
+        self._open = max(self._open - 1, 0)
+        return True
+
+    def wait_s(self, now: float) -> float:
+        """Return how long until there is room, should no request come."""
+        return max(self._refilled_at + EVERY_S - now, 0.0)
+
+    def _refill(self, now: float) -> None:
+        steps = int((now - self._refilled_at) / EVERY_S)
+        if steps > 0:
+            self._refilled_at += steps * EVERY_S
+            self._untaken = max(self._untaken - steps, 0)
+        steps = int((now - self._grown_at) / EVERY_S)
+        if steps > 0:
+            self._grown_at += steps * EVERY_S
+            grown = self._usual + steps * (_USUAL_GROWS + self._open // 20)
+            self._usual = max(self._usual, min(grown, self._open + self._open // 4))
+
+
+class Pacer:
+    """Sends the responses of one service, at each client's pace. Any thread.
+
+    Args:
+        send: Sends a response; may raise RosError.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self, send: Callable[[Any, bytes], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._send = send
+        self._clock = clock
+        self._paces: dict[bytes, Pace] = {}
+        self._held: dict[bytes, Pace] = {}  # those whose responses wait
+        self._wake = threading.Condition()
+        self._thread: threading.Thread | None = None  # made when the first response waits
+        self._closed = False
+
+    def requested(self, handle: Any) -> None:
+        """Note a request as it is taken."""
+        now = self._clock()
+        client = _client(handle)
+        with self._wake:
+            pace = self._paces.get(client) or self._new(client, now)
+            pace.requested(now)
+            if pace.waiting:
+                self._wake.notify()
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        """Send a response now, or as soon as its client can bear it.
+
+        Raises:
+            RosError: It was sent now, and ROS refused it.
+        """
+        now = self._clock()
+        client = _client(handle)
+        with self._wake:
+            pace = self._paces.get(client) or self._new(client, now)
+            if pace.waiting or not pace.take(now):
+                pace.waiting.append((handle, payload))
+                self._held[client] = pace
+                self._begin()
+                return
+        self._send(handle, payload)
+
+    def _new(self, client: bytes, now: float) -> Pace:
+        if len(self._paces) >= _CLIENTS_KEPT:
+            idle = [c for c, p in self._paces.items() if not p.waiting]
+            idle.sort(key=lambda c: self._paces[c].asked_at)
+            for gone in idle[: _CLIENTS_KEPT // 2]:
+                del self._paces[gone]
+        pace = self._paces[client] = Pace(now)
+        return pace
+
+    def _begin(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="ros-pacer", daemon=True)
+            self._thread.start()
+        self._wake.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while not (due := self._due()) and not self._closed:
+                    now = self._clock()
+                    waits = [pace.wait_s(now) for pace in self._held.values()]
+                    self._wake.wait(min(waits, default=None))
+                if self._closed:
+                    return
+            for handle, payload in due:
+                try:
+                    self._send(handle, payload)
+                except RosError as error:
+                    log.warning("response_refused reason=%r", error.message)
+
+    def _due(self) -> list[tuple[Any, bytes]]:
+        now = self._clock()
+        due = []
+        for client, pace in list(self._held.items()):
+            while pace.waiting and pace.take(now):
+                due.append(pace.waiting.popleft())
+            if not pace.waiting:
+                del self._held[client]
+        return due
+
+    def close(self) -> None:
+        """Send no more; what waits is dropped. Repeatable."""
+        with self._wake:
+            self._closed = True
+            self._wake.notify()
+
+
+def _client(handle: Any) -> bytes:
+    """Return who asked. rclpy's own handles do not tell: those clients share a pace."""
+    return handle[:_GUID_BYTES] if isinstance(handle, bytes) else b""

@@ -1,0 +1,83 @@
+"""The port to ROS 2: serialised services and clients, for any type, never a Python message.
+
+One context, one node and one thread that takes (one wait set) for each `RosNode`.
+Callbacks come from that thread and must not block. Responses and requests may be sent
+from any thread.
+
+Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.ros.memory` (tests).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from fogft.core.errors import RosError
+
+
+class Unreadable(RosError):
+    """These bytes are no message of the type: sending them again cannot help."""
+
+
+class RosServer(Protocol):
+    """A service that this node offers."""
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        """Send the serialised response to the request that came with `handle`.
+
+        Any thread. A client that is gone is no error. At most once for each handle.
+        """
+
+    def close(self) -> None:
+        """Withdraw the service."""
+
+
+class RosClient(Protocol):
+    """A client of a local service."""
+
+    def available(self) -> bool:
+        """Whether discovery has found a server. Cheap; never blocks."""
+
+    def servers(self) -> int:
+        """Count the servers that discovery lists: one that died stays listed for a while."""
+
+    def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
+        """Send a serialised request; `on_response` comes at most once. Returns a ticket.
+
+        Raises:
+            Unreadable: The bytes are no request of this type.
+            RosError: ROS refused the request (its queue is full, the client is closed).
+        """
+
+    def forget(self, ticket: int) -> None:
+        """Drop what is kept for a request whose response is no longer awaited."""
+
+    def close(self) -> None:
+        """Withdraw the client."""
+
+
+class RosNode(Protocol):
+    """A node of the proxy's own, in one ROS domain."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether its thread runs. It ends by `close`, or by an error, which was logged."""
+
+    def serve(
+        self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]
+    ) -> RosServer:
+        """Offer a service; `on_request` gets the serialised request and a handle.
+
+        Raises:
+            RosError: The type cannot be loaded.
+        """
+
+    def client(self, name: str, type_name: str) -> RosClient:
+        """Make a client of a service.
+
+        Raises:
+            RosError: The type cannot be loaded.
+        """
+
+    def close(self) -> None:
+        """Stop the thread and leave ROS. Repeatable."""

@@ -1,0 +1,152 @@
+"""The few functions of rcl and rmw that serialised services need, through ctypes.
+
+These are C interfaces that ROS 2 documents and keeps; rclpy stands on the same ones.
+One handle on ``librcl`` finds them all, whatever middleware is loaded, because the
+dynamic linker searches a library's dependencies too.
+
+Each function exists twice: one keeps the global interpreter lock, one gives it up while
+the call runs.
+
+Owns: names, argument types, return codes, C structures, error texts.
+Not here: when to call them (`serialised`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import (
+    CDLL,
+    POINTER,
+    PYFUNCTYPE,
+    PyDLL,
+    Structure,
+    c_char,
+    c_char_p,
+    c_int32,
+    c_int64,
+    c_size_t,
+    c_void_p,
+    py_object,
+)
+from typing import Any
+
+from fogft.core.errors import RosError
+
+OK = 0
+CLIENT_TAKE_FAILED = 501  # nothing was there to take
+SERVICE_TAKE_FAILED = 601
+
+
+class RequestHeader(Structure):
+    """``rmw_request_id_t``: which client asked, and its sequence number."""
+
+    _fields_ = (("writer_guid", c_char * 16), ("sequence_number", c_int64))
+
+
+class _Allocator(Structure):
+    _fields_ = tuple(
+        (name, c_void_p)
+        for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")
+    )
+
+
+class InputBytes(Structure):
+    """``rcutils_uint8_array_t`` over the bytes of a Python object, which it keeps alive."""
+
+    _fields_ = (
+        ("buffer", c_char_p),
+        ("length", c_size_t),
+        ("capacity", c_size_t),
+        ("allocator", _Allocator),
+    )
+
+
+class OutputBytes(Structure):
+    """``rcutils_uint8_array_t`` that rmw grows as it needs."""
+
+    _fields_ = (
+        ("buffer", c_void_p),
+        ("length", c_size_t),
+        ("capacity", c_size_t),
+        ("allocator", _Allocator),
+    )
+
+
+class _ErrorString(Structure):
+    _fields_ = (("text", c_char * 1024),)
+
+
+_SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "rcl_take_request": (c_int32, (c_void_p, POINTER(RequestHeader), c_void_p)),
+    "rcl_take_response": (c_int32, (c_void_p, POINTER(RequestHeader), c_void_p)),
+    "rcl_send_request": (c_int32, (c_void_p, c_void_p, POINTER(c_int64))),
+    "rcl_send_response": (c_int32, (c_void_p, c_char_p, c_void_p)),
+    "rcl_service_get_service_name": (c_char_p, (c_void_p,)),
+    "rcl_client_get_service_name": (c_char_p, (c_void_p,)),
+    "rmw_serialize": (c_int32, (c_void_p, c_void_p, c_void_p)),
+    "rmw_deserialize": (c_int32, (c_void_p, c_void_p, c_void_p)),
+    "rcutils_get_default_allocator": (_Allocator, ()),
+    "rcutils_uint8_array_fini": (c_int32, (c_void_p,)),
+    "rcutils_get_error_string": (_ErrorString, ()),
+    "rcutils_reset_error": (None, ()),
+}
+
+
+class Rcl:
+    """The functions of `_SIGNATURES` as attributes."""
+
+    def __init__(self, library: CDLL) -> None:
+        for name, (result, arguments) in _SIGNATURES.items():
+            function = getattr(library, name)
+            function.restype = result
+            function.argtypes = arguments
+            setattr(self, name, function)
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(name)
+
+
+_loaded: tuple[Rcl, Rcl] | None = None
+
+
+def load() -> tuple[Rcl, Rcl]:
+    """Return the functions, first those that hold the interpreter lock, then those that do not.
+
+    Raises:
+        RosError: The library or one of its functions is missing.
+    """
+    global _loaded  # noqa: PLW0603
+    if _loaded is None:
+        try:
+            import rclpy.impl.implementation_singleton  # noqa: F401  loads librcl itself
+
+            _loaded = Rcl(PyDLL("librcl.so")), Rcl(CDLL("librcl.so"))
+        except (OSError, AttributeError, ImportError) as error:
+            raise RosError(f"the C library of ROS 2 cannot be used: {error}") from error
+    return _loaded
+
+
+def error_text() -> str:
+    """Return rcl's last error of this thread, and clear it."""
+    held, _ = load()
+    text: bytes = held.rcutils_get_error_string().text
+    held.rcutils_reset_error()
+    return text.decode(errors="replace").strip()
+
+
+_capsule_name = PYFUNCTYPE(c_char_p, py_object)(("PyCapsule_GetName", ctypes.pythonapi))
+_capsule_pointer = PYFUNCTYPE(c_void_p, py_object, c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
+
+
+def address(capsule: Any) -> int:
+    """Return the C pointer that a Python capsule holds."""
+    pointer: int | None = _capsule_pointer(capsule, _capsule_name(capsule))
+    if not pointer:
+        raise RosError("a type support of ROS 2 is empty")
+    return pointer
+
+
+create_function = PYFUNCTYPE(c_void_p)
+destroy_function = PYFUNCTYPE(None, c_void_p)

@@ -1,0 +1,217 @@
+"""Take and send the serialised bytes of any service, with no Python message between.
+
+Theory of operation: rclpy makes the service or client; its address goes to rcl's own take
+and send functions, with a C message made by the type's own functions. rmw turns that
+message into bytes and back. Why so: docs/design/serialised-services.md.
+
+Interpreter lock: held below `LARGE_BYTES`, where a call takes a few microseconds;
+released above, and while ROS may wait for room. Takes cannot know their size beforehand
+and go by the last one.
+
+Owns: C messages and buffers, which live as long as their end.
+Not here: threads and locks (`node`), loading types (`types`), C signatures (`rcl`).
+"""
+
+from __future__ import annotations
+
+from ctypes import addressof, byref, c_int64, string_at
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.ros import rcl
+from fogft.ros.port import Unreadable
+
+LARGE_BYTES = 256 * 1024
+ENCAPSULATION_BYTES = 4  # the shortest CDR there is: its header
+
+
+class CMessage:
+    """One C message of a type, and its way from and to bytes. Not for two threads at once."""
+
+    def __init__(self, message_type: Any) -> None:
+        kind = type(message_type)
+        self._held, self._released = rcl.load()
+        self._type_support = rcl.address(kind._TYPE_SUPPORT)
+        self._destroy = rcl.destroy_function(rcl.address(kind._DESTROY_ROS_MESSAGE))
+        self._name = message_type.__name__
+        allocator = self._held.rcutils_get_default_allocator()
+        self._input = rcl.InputBytes(None, 0, 0, allocator)
+        self._input_address = addressof(self._input)
+        self._output = rcl.OutputBytes(None, 0, 0, allocator)
+        self._output_address = addressof(self._output)
+        self.address: int = rcl.create_function(rcl.address(kind._CREATE_ROS_MESSAGE))()
+        if not self.address:
+            raise RosError(f"no memory for a {self._name}")
+
+    def read(self, payload: bytes) -> None:
+        """Fill the message from serialised bytes.
+
+        Raises:
+            Unreadable: They are no such message; what the message holds now is undefined.
+        """
+        size = len(payload)
+        source = self._input
+        source.buffer = payload
+        source.length = source.capacity = size
+        functions = self._held if size < LARGE_BYTES else self._released
+        code = (
+            functions.rmw_deserialize(self._input_address, self._type_support, self.address)
+            if size >= ENCAPSULATION_BYTES
+            else -1
+        )
+        source.buffer = None
+        if code != rcl.OK:
+            reason = rcl.error_text() if code != -1 else "too short"
+            raise Unreadable(f"{size} bytes are not a serialised {self._name}: {reason}")
+
+    def write(self, functions: rcl.Rcl) -> bytes:
+        """Return the message as serialised bytes. Raises RosError when memory is short."""
+        code = functions.rmw_serialize(self.address, self._type_support, self._output_address)
+        if code != rcl.OK:
+            raise RosError(f"a {self._name} cannot be serialised: {rcl.error_text()}")
+        output = self._output
+        return string_at(output.buffer, output.length)
+
+    def close(self) -> None:
+        """Free the message and the buffer. Repeatable."""
+        if self.address:
+            self._destroy(self.address)
+            self.address = 0
+            self._held.rcutils_uint8_array_fini(self._output_address)
+
+
+class _End:
+    """What both ends share: the rcl handle, one message to take into, one to send from."""
+
+    def __init__(self, entity: Any, taken_type: Any, sent_type: Any) -> None:
+        self._held, self._released = rcl.load()
+        self._functions = self._held
+        self._handle = entity.handle  # keeps the rcl handle alive
+        self._pointer: int = entity.handle.pointer
+        self._taken = CMessage(taken_type)
+        self._taken_address = self._taken.address
+        self._sent = CMessage(sent_type)
+        self._sent_address = self._sent.address
+        self._refused = False  # the last send: the next may wait for room, up to 0.1 s
+        self._header = rcl.RequestHeader()
+        self._header_reference = byref(self._header)
+
+    def _write_taken(self) -> bytes:
+        payload = self._taken.write(self._functions)
+        self._functions = self._held if len(payload) < LARGE_BYTES else self._released
+        return payload
+
+    def _functions_for(self, payload: bytes) -> rcl.Rcl:
+        small = len(payload) < LARGE_BYTES and not self._refused
+        return self._held if small else self._released
+
+    def _check_sent(self, code: int, what: str) -> None:
+        self._refused = code != rcl.OK
+        if self._refused:
+            raise RosError(f"a {what} cannot be sent: {rcl.error_text()}")
+
+    def _check_name(self, found: bytes | None, name: str) -> None:
+        """Make sure that the address is what we take it for."""
+        if found is None or not found.decode().endswith(name.lstrip("~/")):
+            raise RosError(f"rclpy's handle of `{name}` is not rcl's")
+
+    def close(self) -> None:
+        """Free the C messages."""
+        self._taken.close()
+        self._sent.close()
+
+
+class SerialisedServiceEnd(_End):
+    """`ServiceEnd` over rcl."""
+
+    def __init__(self, service: Any, service_type: Any) -> None:
+        super().__init__(service, service_type.Request, service_type.Response)
+        name = self._held.rcl_service_get_service_name(self._pointer)
+        self._check_name(name, service.srv_name)
+
+    def take(self) -> tuple[bytes, bytes] | None:
+        """Return the next serialised request and the bytes of its header."""
+        code = self._functions.rcl_take_request(
+            self._pointer, self._header_reference, self._taken_address
+        )
+        if code == rcl.OK:
+            return self._write_taken(), bytes(self._header)
+        if code == rcl.SERVICE_TAKE_FAILED:
+            return None
+        raise RosError(f"a request cannot be taken: {rcl.error_text()}")
+
+    def respond(self, handle: bytes, payload: bytes) -> None:
+        """Send a serialised response."""
+        self._sent.read(payload)
+        code = self._functions_for(payload).rcl_send_response(
+            self._pointer, handle, self._sent_address
+        )
+        self._check_sent(code, "response")
+
+
+class SerialisedClientEnd(_End):
+    """`ClientEnd` over rcl."""
+
+    def __init__(self, client: Any, service_type: Any) -> None:
+        super().__init__(client, service_type.Response, service_type.Request)
+        name = self._held.rcl_client_get_service_name(self._pointer)
+        self._check_name(name, client.srv_name)
+        self._ticket = c_int64()
+        self._ticket_reference = byref(self._ticket)
+
+    def take(self) -> tuple[int, bytes] | None:
+        """Return the next response: sequence number and bytes."""
+        code = self._functions.rcl_take_response(
+            self._pointer, self._header_reference, self._taken_address
+        )
+        if code == rcl.OK:
+            return self._header.sequence_number, self._write_taken()
+        if code == rcl.CLIENT_TAKE_FAILED:
+            return None
+        raise RosError(f"a response cannot be taken: {rcl.error_text()}")
+
+    def send(self, payload: bytes) -> int:
+        """Send a serialised request; return its sequence number."""
+        self._sent.read(payload)
+        code = self._functions_for(payload).rcl_send_request(
+            self._pointer, self._sent_address, self._ticket_reference
+        )
+        self._check_sent(code, "request")
+        return self._ticket.value
+
+
+class SerialisedTransfer:
+    """`Transfer` over rcl. Run `self_test` for the type first."""
+
+    def __init__(self, service_type: Any) -> None:
+        self._service_type = service_type
+
+    def service_end(self, service: Any) -> SerialisedServiceEnd:
+        """Return the end of an rclpy service."""
+        return SerialisedServiceEnd(service, self._service_type)
+
+    def client_end(self, client: Any) -> SerialisedClientEnd:
+        """Return the end of an rclpy client."""
+        return SerialisedClientEnd(client, self._service_type)
+
+
+def self_test(service_type: Any) -> None:
+    """Send default messages of a service type through this path and through rclpy's; compare.
+
+    Compared after deserialising: the padding between fields is whatever lay in memory.
+
+    Raises:
+        RosError: This path is not usable here for this type.
+    """
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    for message_type in (service_type.Request, service_type.Response):
+        expected = message_type()
+        message = CMessage(message_type)
+        try:
+            message.read(bytes(serialize_message(expected)))
+            written = message.write(rcl.load()[0])
+        finally:
+            message.close()
+        if deserialize_message(written, message_type) != expected:
+            raise RosError(f"a {message_type.__name__} came back changed from its bytes")

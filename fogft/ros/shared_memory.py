@@ -1,0 +1,195 @@
+"""Remove the shared memory that killed ROS processes left in /dev/shm. Never what is in use.
+
+Fast DDS makes, for each participant, a *segment* (random name) and, for each port of a
+domain, a *port* (its number as the name), with lock files beside them::
+
+    fastdds_8d5e2bd0a1c7f3e4      a segment    fastdds_8d5e2bd0a1c7f3e4_el  held while it lives
+    fastdds_port22911             a port       fastdds_port22911_el / _sl   held by its readers
+                                               sem.fastdds_port22911_mutex  held while opening
+
+A group of such files goes when no process maps or holds open any of them, none of its
+lock files is locked (which also tells of processes that /proc hides: another container),
+it is this user's, and nothing touched it for `SETTLED_S`. A port's name is used again by
+the next process, so a port goes under its own mutex, as Fast DDS does it.
+
+Names begin with ``fastrtps`` before Fast DDS 3. The ROS wheels' tracing library leaves
+``lttng-ust-wait-*``; the same rules hold. Needs neither rclpy nor Fast DDS.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+SETTLED_S = 2.0
+FOLDER = Path("/dev/shm")
+
+_TURN_LIMIT_S = 5.0
+_OURS = re.compile(
+    r"(?:sem\.)?(?P<group>fast(?:dds|rtps)_(?:port\d+|[0-9a-f]+)|fast_datasharing_[^/]+?"
+    r"|lttng-ust-wait-[\w-]+?)(?:_el|_sl|_mutex)?"
+)
+
+
+def sweep() -> list[str]:
+    """Remove what no living process uses; return the names of the files removed, sorted.
+
+    Takes tens of milliseconds. Safe to run beside anything, itself included; files that
+    cannot be judged stay.
+    """
+    with _one_at_a_time() as my_turn:
+        candidates = _groups() if my_turn else {}
+        used = _used_names() if candidates else set()
+        unused = {group for group, names in candidates.items() if used.isdisjoint(names)}
+        return sorted(_remove(unused)) if unused else []
+
+
+@contextlib.contextmanager
+def _one_at_a_time() -> Iterator[bool]:
+    """Wait for other sweeps, by a lock on the folder; False if they take too long."""
+    try:
+        descriptor = os.open(FOLDER, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError:  # no shared memory here
+        yield False
+        return
+    try:
+        yield _lock(descriptor, time.monotonic() + _TURN_LIMIT_S)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, deadline: float) -> bool:
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
+        else:
+            return True
+
+
+def abandoned() -> list[Path]:
+    """Return the files that `sweep` would remove now, sorted; remove nothing."""
+    candidates = _groups()
+    used = _used_names() if candidates else set()
+    unused = [names for names in candidates.values() if used.isdisjoint(names)]
+    return sorted(FOLDER / n for names in unused if not any(map(_locked, names)) for n in names)
+
+
+def _groups() -> dict[str, list[str]]:
+    """Return the settled groups of this user's files, by what they belong to."""
+    groups: dict[str, list[str]] = {}
+    fresh: set[str] = set()
+    now = time.time()
+    for entry in _entries():
+        match = _OURS.fullmatch(entry.name)
+        if match is None:
+            continue
+        try:
+            status = entry.stat(follow_symlinks=False)
+        except FileNotFoundError:
+            continue
+        group = match["group"]
+        touched = max(status.st_mtime, status.st_ctime)
+        if status.st_uid != os.getuid() or abs(now - touched) < SETTLED_S:
+            fresh.add(group)
+        groups.setdefault(group, []).append(entry.name)
+    return {group: names for group, names in groups.items() if group not in fresh}
+
+
+def _entries() -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(FOLDER) as found:
+            return list(found)
+    except OSError:
+        return []  # not Linux, or no shared memory at all
+
+
+def _used_names() -> set[str]:
+    """Return the names in /dev/shm that a process of ours maps or holds open."""
+    prefix = f"{FOLDER}/".encode()
+    used: set[str] = set()
+    for process in filter(str.isdigit, os.listdir("/proc")):
+        with contextlib.suppress(OSError):
+            for line in Path("/proc", process, "maps").read_bytes().splitlines():
+                _, found, name = line.partition(prefix)
+                if found:
+                    used.add(name.removesuffix(b" (deleted)").decode(errors="replace"))
+        with contextlib.suppress(OSError):
+            descriptors = f"/proc/{process}/fd"
+            for descriptor in os.listdir(descriptors):
+                with contextlib.suppress(OSError):
+                    target = os.readlink(f"{descriptors}/{descriptor}")
+                    if target.startswith(f"{FOLDER}/"):
+                        used.add(target.removeprefix(f"{FOLDER}/").removesuffix(" (deleted)"))
+    return used
+
+
+def _remove(unused: set[str]) -> list[str]:
+    """Remove groups after a second look, taken while nobody can open them as a port.
+
+    The mutexes are held without being mapped, so that a process that waits for one shows
+    in /proc. One that cannot be had is mapped by a living process, or its holder was
+    killed. They go last: until then they keep others from the port.
+    """
+    held = [group for group in unused if "_port" in group and _semaphore(group, "sem_trywait")]
+    going: list[str] = []
+    try:
+        used = _used_names()
+        for group, names in _groups().items():
+            if group in unused and used.isdisjoint(names) and not any(map(_locked, names)):
+                going += names
+        removed = [name for name in going if not name.startswith("sem.") and _unlink(name)]
+    finally:
+        for group in held:
+            _semaphore(group, "sem_post")
+    return removed + [name for name in going if name.startswith("sem.") and _unlink(name)]
+
+
+def _unlink(name: str) -> bool:
+    try:
+        (FOLDER / name).unlink()
+    except OSError:
+        return False
+    return True
+
+
+def _semaphore(group: str, operation: str) -> bool:
+    """Do something to the POSIX semaphore of a port; whether there is one and it worked."""
+    libc = ctypes.CDLL(None)
+    libc.sem_open.restype = ctypes.c_void_p
+    semaphore = libc.sem_open(f"/{group}_mutex".encode(), 0)
+    if not semaphore:  # SEM_FAILED
+        return False
+    try:
+        return bool(getattr(libc, operation)(ctypes.c_void_p(semaphore)) == 0)
+    finally:
+        libc.sem_close(ctypes.c_void_p(semaphore))
+
+
+def _locked(name: str) -> bool:
+    """Whether some process, be it hidden from us, holds a lock on a lock file."""
+    if not name.endswith(("_el", "_sl")):
+        return False
+    try:
+        descriptor = os.open(FOLDER / name, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    else:
+        return False
+    finally:
+        os.close(descriptor)  # frees the lock

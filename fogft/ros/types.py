@@ -1,0 +1,183 @@
+"""Service types by name: loading them, and the little that is asked of them.
+
+Needs the interface package, not rclpy, to load a type; so the pool file's reader can
+check one without starting ROS.
+
+Owns: names of types, their errors and hints, default responses, boolean fields.
+Not here: moving messages (`serialised`, `converted`).
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fogft.core.errors import RosError
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*/srv/[A-Z][A-Za-z0-9]*")
+_PRIMITIVE_BYTES = {
+    **dict.fromkeys(("boolean", "octet", "char", "uint8", "int8"), 1),
+    **dict.fromkeys(("uint16", "int16"), 2),
+    **dict.fromkeys(("uint32", "int32", "float"), 4),
+    **dict.fromkeys(("uint64", "int64", "double"), 8),
+}
+_XCDR1_HEADERS = (b"\x00\x00", b"\x00\x01")  # big and little endian
+
+
+def load_service_type(name: str) -> Any:
+    """Return the Python class of a service type with its type support loaded.
+
+    Args:
+        name: ``package/srv/Type``.
+
+    Raises:
+        RosError: There is no such type here, or it cannot be loaded; with a hint.
+    """
+    if not _NAME.fullmatch(name):
+        raise RosError(
+            f"`{name}` is not the name of a service type",
+            f"write `package/srv/Type`, as in `std_srvs/srv/SetBool`{_did_you_mean(name)}",
+        )
+    package, _, type_name = name.split("/")
+    try:
+        service_type = getattr(importlib.import_module(f"{package}.srv"), type_name)
+    except ModuleNotFoundError as error:
+        if error.name not in (package, f"{package}.srv"):
+            raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
+        raise RosError(
+            f"there is no package `{package}` with services here, so `{name}` cannot be loaded",
+            f"is the package installed, and its workspace sourced?{_did_you_mean(name)}",
+        ) from error
+    except AttributeError as error:
+        raise RosError(
+            f"package `{package}` has no service type `{type_name}`",
+            f"does the sourced workspace hold its newest build?{_did_you_mean(name)}",
+        ) from error
+    except Exception as error:  # generated code: anything may go wrong in it
+        raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
+    _load_type_support(name, service_type)
+    return service_type
+
+
+_SOURCE_HINT = "source the ROS 2 installation and the workspace that this type was built with"
+
+
+def _load_type_support(name: str, service_type: Any) -> None:
+    for part in (service_type, service_type.Request, service_type.Response):
+        try:
+            if type(part)._TYPE_SUPPORT is None:
+                type(part).__import_type_support__()
+        except Exception as error:
+            raise RosError(
+                f"the C library of `{name}` is missing: {error}", _SOURCE_HINT
+            ) from error
+        if type(part)._TYPE_SUPPORT is None:
+            raise RosError(f"the C library of `{name}` cannot be loaded", _SOURCE_HINT)
+
+
+def check_service_type(name: str) -> str | None:
+    """Return why a service type cannot be loaded, with what to do about it; None if it can."""
+    try:
+        load_service_type(name)
+    except RosError as error:
+        return f"{error.message}; {error.hint}" if error.hint else error.message
+    return None
+
+
+def check_ok_field(name: str, field: str) -> str | None:
+    """Return why a type's response has no such boolean field, with what to do; None if it has."""
+    try:
+        bool_field(name, field)
+    except RosError as error:
+        return f"{error.message}; {error.hint}" if error.hint else error.message
+    return None
+
+
+def installed_service_types() -> list[str]:
+    """Return the names of the service types that the ament index lists here, sorted."""
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    found: set[str] = set()
+    for prefix in filter(None, prefixes):
+        index = Path(prefix, "share", "ament_index", "resource_index", "rosidl_interfaces")
+        try:
+            for package in index.iterdir():
+                found.update(
+                    f"{package.name}/{line.removesuffix('.srv')}"
+                    for line in package.read_text().split()
+                    if line.startswith("srv/") and line.endswith(".srv")
+                )
+        except OSError:
+            continue
+    return sorted(found)
+
+
+def _did_you_mean(name: str) -> str:
+    known = installed_service_types()
+    by_type = [full for full in known if full.rsplit("/", 1)[1] == name.rsplit("/", 1)[-1]]
+    close = by_type[:1] or difflib.get_close_matches(name, known, n=1, cutoff=0.75)
+    return f" Did you mean `{close[0]}`?" if close else ""
+
+
+def default_response(name: str) -> bytes:
+    """Return the serialised default response of a service type. Raises RosError."""
+    from rclpy.serialization import serialize_message
+
+    return bytes(serialize_message(load_service_type(name).Response()))
+
+
+def bool_field(name: str, field: str) -> Callable[[bytes], bool]:
+    """Return a function that reads a boolean field of a serialised response.
+
+    The function raises RosError for bytes that are no such response. Where only numbers
+    stand before the field, it looks at one byte; else it deserialises the response.
+
+    Raises:
+        RosError: The type cannot be loaded, or its response has no such boolean field.
+    """
+    from rclpy.serialization import deserialize_message
+
+    response_type = load_service_type(name).Response
+    fields: dict[str, str] = response_type.get_fields_and_field_types()
+    if fields.get(field) != "boolean":
+        booleans = [key for key, kind in fields.items() if kind == "boolean"]
+        raise RosError(
+            f"the response of `{name}` has no boolean field `{field}`",
+            f"its boolean fields: {', '.join(booleans) or 'none'}",
+        )
+
+    def read_all(payload: bytes) -> bool:
+        try:
+            return bool(getattr(deserialize_message(payload, response_type), field))
+        except Exception as error:  # rclpy's own error types are private and vary by release
+            raise RosError(f"{len(payload)} bytes are not a response of `{name}`") from error
+
+    offset = _fixed_offset(fields, field)
+    if offset is None:
+        return read_all
+
+    def read_byte(payload: bytes) -> bool:
+        if payload[:2] in _XCDR1_HEADERS and offset < len(payload):
+            return payload[offset] != 0
+        return read_all(payload)
+
+    return read_byte
+
+
+def _fixed_offset(fields: dict[str, str], field: str) -> int | None:
+    """Return where a field lies in every serialised message; None if that varies."""
+    offset = 0
+    for name, kind in fields.items():
+        size = _PRIMITIVE_BYTES.get(kind)
+        if size is None:
+            return None
+        offset += -offset % size
+        if name == field:
+            return 4 + offset  # after the header, from which alignment is counted
+        offset += size
+    return None

@@ -1,0 +1,1 @@
+"""How proxies reach each other: one link a replica, mutual TLS, serialised bytes."""

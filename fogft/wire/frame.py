@@ -1,0 +1,254 @@
+"""What travels besides the serialised messages: headers, refusals, probes. Pure.
+
+Whatever bytes come in, a decoder returns a value or raises `FrameError`, nothing else: the
+peer is another process, perhaps of another version. Each frame begins with its version.
+
+Owns: the bytes. Not here: sending them, and what they mean.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from fogft.core.names import REQUEST_ID_BYTES
+from fogft.wire.port import Probe, ProbeAnswer
+
+VERSION = 1
+TOKEN_BYTES = 8
+ROBOT_BYTES_LIMIT = 64
+REASON_LIMIT = 64
+PROBE_LIMIT = 1024
+PROBE_ANSWER_LIMIT = 65536
+DETAIL_LIMIT = 500
+REMAINING_LIMIT_S = 1e7
+
+_REQUEST = struct.Struct(f">B{REQUEST_ID_BYTES}sd")
+_ANSWER = struct.Struct(f">B{REQUEST_ID_BYTES}s")
+_ORIGIN_AT = _REQUEST.size
+_ROBOT_AT = _ORIGIN_AT + TOKEN_BYTES
+
+
+class FrameError(ValueError):
+    """These bytes are not a frame of this version."""
+
+
+@dataclass(frozen=True)
+class RequestHeader:
+    """What precedes a request.
+
+    Attributes:
+        request_id: 16 bytes, made by the client proxy.
+        remaining_s: Time left when it was sent, in seconds.
+        token: Names the robot's connection, so that replies queue apart.
+        robot: Who asks.
+    """
+
+    request_id: bytes
+    remaining_s: float
+    token: bytes
+    robot: str
+
+
+def origin(robot: str, token: bytes) -> bytes:
+    """Return the part of a request's header that is the same for a whole connection.
+
+    Raises:
+        ValueError: The token is not 8 bytes, or the name not 1 to 64 printable bytes.
+    """
+    name = robot.encode()
+    if len(token) != TOKEN_BYTES:
+        raise ValueError(f"a token has {TOKEN_BYTES} bytes")
+    if not 0 < len(name) <= ROBOT_BYTES_LIMIT or not robot.isprintable():
+        raise ValueError(f"a robot's name has 1 to {ROBOT_BYTES_LIMIT} printable bytes: {robot!r}")
+    return token + name
+
+
+def encode_request(request_id: bytes, remaining_s: float, origin: bytes) -> bytes:
+    """Return a request's header; `origin` comes from the function of that name."""
+    return _REQUEST.pack(VERSION, request_id, remaining_s) + origin
+
+
+def decode_request(frame: bytes) -> RequestHeader:
+    """Read a request's header.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if not _ROBOT_AT < len(frame) <= _ROBOT_AT + ROBOT_BYTES_LIMIT:
+        raise FrameError(f"a request's header of {len(frame)} bytes")
+    version, request_id, remaining_s = _REQUEST.unpack_from(frame)
+    _check_version(version)
+    if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
+        raise FrameError(f"a remaining time of {remaining_s} s")
+    try:
+        robot = frame[_ROBOT_AT:].decode()
+    except UnicodeDecodeError as error:
+        raise FrameError("a robot's name that is not UTF-8") from error
+    if not robot.isprintable():
+        raise FrameError("a robot's name that is not printable")
+    return RequestHeader(request_id, remaining_s, frame[_ORIGIN_AT:_ROBOT_AT], robot)
+
+
+def encode_answer(request_id: bytes) -> bytes:
+    """Return an answer's header."""
+    return _ANSWER.pack(VERSION, request_id)
+
+
+def decode_answer(frame: bytes) -> bytes:
+    """Return the request id of an answer's header.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if len(frame) != _ANSWER.size:
+        raise FrameError(f"an answer's header of {len(frame)} bytes")
+    version, request_id = _ANSWER.unpack(frame)
+    _check_version(version)
+    return bytes(request_id)
+
+
+def encode_refusal(request_id: bytes, reason: str) -> bytes:
+    """Return a refusal; `reason` is one of `port.Refusal`, or any short ASCII text."""
+    return _ANSWER.pack(VERSION, request_id) + reason.encode("ascii")
+
+
+def decode_refusal(frame: bytes) -> tuple[bytes, str]:
+    """Return the request id and the reason of a refusal.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if not _ANSWER.size < len(frame) <= _ANSWER.size + REASON_LIMIT:
+        raise FrameError(f"a refusal of {len(frame)} bytes")
+    request_id = decode_answer(frame[: _ANSWER.size])
+    try:
+        reason = frame[_ANSWER.size :].decode("ascii")
+    except UnicodeDecodeError as error:
+        raise FrameError("a reason that is not ASCII") from error
+    if not reason.isprintable():
+        raise FrameError("a reason that is not printable")
+    return request_id, reason
+
+
+def encode_probe(probe: Probe) -> bytes:
+    """Return a probe as compact JSON."""
+    return _to_json({"v": VERSION, "robot": probe.robot, "manager_age_s": probe.manager_age_s})
+
+
+def decode_probe(frame: bytes) -> Probe:
+    """Read a probe.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    raw = _from_json(frame, PROBE_LIMIT)
+    age = raw.get("manager_age_s")
+    return Probe(_text(raw, "robot"), None if age is None else _seconds(raw, "manager_age_s"))
+
+
+def encode_probe_answer(answer: ProbeAnswer) -> bytes:
+    """Return a probe's answer as compact JSON; a long `detail` is cut.
+
+    Raises:
+        ValueError: It names too many services for one frame (64 KiB).
+    """
+    frame = _to_json(
+        {
+            "v": VERSION,
+            "slot": answer.slot,
+            "generation": answer.generation,
+            "incarnation": answer.incarnation,
+            "ready": sorted(answer.ready),
+            "draining": answer.draining,
+            "restarts": answer.restarts,
+            "in_flight": answer.in_flight,
+            "detail": answer.detail[:DETAIL_LIMIT].encode(errors="replace").decode(),
+        }
+    )
+    if len(frame) > PROBE_ANSWER_LIMIT:
+        raise ValueError(f"a probe's answer of {len(frame)} bytes")
+    return frame
+
+
+def decode_probe_answer(frame: bytes) -> ProbeAnswer:
+    """Read a probe's answer.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    raw = _from_json(frame, PROBE_ANSWER_LIMIT)
+    ready = raw.get("ready")
+    if not isinstance(ready, list):
+        raise FrameError("`ready` is not a list of names")
+    draining = raw.get("draining")
+    if not isinstance(draining, bool):
+        raise FrameError("`draining` is neither true nor false")
+    return ProbeAnswer(
+        slot=_count(raw, "slot"),
+        generation=_count(raw, "generation"),
+        incarnation=_text(raw, "incarnation"),
+        ready=frozenset(_check_text(name, "ready") for name in ready),
+        draining=draining,
+        restarts=_count(raw, "restarts"),
+        in_flight=_count(raw, "in_flight"),
+        detail=_text(raw, "detail"),
+    )
+
+
+def _check_version(version: Any) -> None:
+    if version is True or version != VERSION:
+        raise FrameError(f"version {version!r}, where {VERSION} is spoken here")
+
+
+def _to_json(value: dict[str, Any]) -> bytes:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _no_constant(text: str) -> float:
+    raise FrameError(f"the number {text}")
+
+
+def _from_json(frame: bytes, limit: int) -> dict[str, Any]:
+    if len(frame) > limit:
+        raise FrameError(f"a frame of {len(frame)} bytes")
+    try:
+        raw = json.loads(frame.decode(), parse_constant=_no_constant)
+    except FrameError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise FrameError("a frame that is not JSON") from error
+    if not isinstance(raw, dict):
+        raise FrameError("a frame that is not a JSON object")
+    _check_version(raw.get("v"))
+    return raw
+
+
+def _text(raw: dict[str, Any], key: str) -> str:
+    return _check_text(raw.get(key), key)
+
+
+def _check_text(value: Any, key: str) -> str:
+    if not isinstance(value, str):
+        raise FrameError(f"`{key}` is not a text")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:  # a lone surrogate, which no log can write
+        raise FrameError(f"`{key}` is not a text") from error
+    return value
+
+
+def _count(raw: dict[str, Any], key: str) -> int:
+    value = raw.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**53:
+        raise FrameError(f"`{key}` is not a count")
+    return value
+
+
+def _seconds(raw: dict[str, Any], key: str) -> float:
+    value = raw.get(key)
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not abs(value) < 1e18:
+        raise FrameError(f"`{key}` is not a time in seconds")
+    return float(value)

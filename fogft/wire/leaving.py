@@ -1,0 +1,31 @@
+"""End the process without threads inside Zenoh.
+
+A daemon thread that returns from Zenoh while the interpreter shuts down aborts the process
+(SIGABRT: the interpreter ends the thread by unwinding it, which Rust does not allow). So
+what closes a session is waited for at exit, though not for long: towards a frozen peer it
+takes ten seconds.
+"""
+
+from __future__ import annotations
+
+import atexit
+import threading
+import time
+import weakref
+
+WAIT_S = 2.0
+
+_leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
+
+
+def see_off(thread: threading.Thread) -> None:
+    """Have the process wait for this thread when it ends. The thread must be about to end."""
+    _leaving.add(thread)
+
+
+@atexit.register
+def _wait() -> None:
+    end = time.monotonic() + WAIT_S
+    for thread in list(_leaving):
+        if thread is not threading.current_thread():
+            thread.join(max(0.0, end - time.monotonic()))

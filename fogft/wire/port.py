@@ -1,0 +1,222 @@
+"""The port between proxies: a robot's links on one side, a replica's listener on the other.
+
+What flows: a request (id, service, remaining time, bytes) from the robot; one answer
+(bytes, or a refusal with a reason) from the replica; probes, which the server proxy
+answers at once whatever the service does.
+
+Law of this port: `Link.offer` never blocks, whatever the peer does; a slow or dead peer
+costs its own link only. Callbacks come from the wire's threads; they must not block.
+Implementations: `fogft.wire.zenoh_link` and `zenoh_listener`, `fogft.wire.memory`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from fogft.core.model import LinkState, ReplicaId
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a robot tells a replica with each probe.
+
+    Attributes:
+        manager_age_s: Since the robot last saw a sign of the pool's manager; None if
+            it never did.
+    """
+
+    robot: str
+    manager_age_s: float | None = None
+
+
+@dataclass(frozen=True)
+class ProbeAnswer:
+    """What a replica says of itself with each probe.
+
+    Attributes:
+        ready: Names of the services that it can answer now.
+        incarnation: Random text made when the server proxy started. A new one at the
+            same id means that it forgot every request.
+        restarts: How often it restarted the user's `run` command.
+        in_flight: Requests that it holds.
+        detail: Why it is not ready, in words; empty when it is.
+    """
+
+    slot: int
+    generation: int
+    incarnation: str
+    ready: frozenset[str] = frozenset()
+    draining: bool = False
+    restarts: int = 0
+    in_flight: int = 0
+    detail: str = ""
+
+
+class Refusal:
+    """Reasons of a refusal, as they travel. The robot tries elsewhere, or again later."""
+
+    NOT_READY = "not-ready"  # the local service is not there
+    OVERLOADED = "overloaded"  # the replica's own window is full
+    CRASHED = "crashed"  # the service died while it worked on this
+    EXPIRED = "expired"  # its deadline had passed on arrival
+    FORGOTTEN = "forgotten"  # it was run, but the answer is no longer kept
+    MALFORMED = "malformed"  # the request could not be read
+    LOST = "lost"  # made locally: the link died before an answer came
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The end of one attempt: `payload` if the service answered, else a `refusal`.
+
+    Attributes:
+        service: The name given to `Link.offer`.
+    """
+
+    request_id: bytes
+    payload: bytes | None = None
+    refusal: str = ""
+    service: str = ""
+
+
+class LinkEvents(Protocol):
+    """What a link tells its owner. Called from the link's threads; must not block."""
+
+    def answered(self, link: Link, answer: Answer) -> None:
+        """One attempt has ended. Exactly one call for each accepted `offer`.
+
+        An attempt whose link dies ends with ``Refusal.LOST``; a later answer of the
+        old connection is dropped by the link.
+        """
+
+    def changed(self, link: Link) -> None:
+        """The link's `state`, `probe_answer` or room in its window has changed."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A replica to dial: its endpoint (``host:port``) and the name its certificate must have."""
+
+    id: ReplicaId
+    endpoint: str
+    certificate_name: str
+
+
+@dataclass(frozen=True)
+class LinkStatus:
+    """A snapshot of a link. Durations in seconds."""
+
+    state: LinkState
+    probe_answer: ProbeAnswer | None
+    heard_age_s: float | None
+    silent_for_s: float
+    rtt_s: float | None
+    in_flight: int
+    in_flight_bytes: int
+    reopened: int
+    detail: str
+
+
+class Link(Protocol):
+    """A robot's connection to one replica: own session, own sender thread, bounded window."""
+
+    @property
+    def peer(self) -> Peer:
+        """Whom it talks to."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether requests may be offered: state UP. Cheap, called for each request."""
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that the last probe answer called ready; empty unless UP. Cheap."""
+
+    @property
+    def draining(self) -> bool:
+        """Whether the replica asked to be left alone. Cheap."""
+
+    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+        """Take one attempt, or return False when the window is full or the link not usable.
+
+        Never blocks. `service` is the name in the pool; its key was set by `services`.
+        Not to be called from within a `LinkEvents` callback: it may send.
+        """
+
+    def forget(self, request_id: bytes) -> None:
+        """Free the window of a request whose answer is no longer wanted. Unknown ids are fine."""
+
+    def status(self) -> LinkStatus:
+        """Return a snapshot, for people and for the manager."""
+
+    def close(self) -> None:
+        """End the link. Attempts still open end with `Refusal.LOST`. Repeatable, quick."""
+
+
+class Dialer(Protocol):
+    """Makes links. One for each client proxy."""
+
+    def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
+        """Start a link; return at once, in state CONNECTING.
+
+        Args:
+            peer: Whom to reach.
+            services: Service name -> key (from `names.service_key`).
+            events: Whom to tell.
+        """
+
+    def close(self) -> None:
+        """Close every link."""
+
+
+class Incoming(Protocol):
+    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing."""
+
+    @property
+    def service(self) -> str:
+        """Name of the service asked for."""
+
+    @property
+    def request_id(self) -> bytes:
+        """16 bytes, made by the client proxy."""
+
+    @property
+    def robot(self) -> str:
+        """Who asks; replies to one robot never wait for another."""
+
+    @property
+    def remaining_s(self) -> float:
+        """Time that was left when the robot sent it."""
+
+    @property
+    def payload(self) -> bytes:
+        """The serialised request (CDR)."""
+
+    def reply(self, payload: bytes) -> None:
+        """Send the serialised response. Never blocks."""
+
+    def refuse(self, reason: str) -> None:
+        """Send a refusal. Never blocks."""
+
+
+class Listener(Protocol):
+    """A replica's end: it hears requests and probes of robots that its CA admits."""
+
+    @property
+    def endpoint(self) -> str:
+        """``host:port`` as bound; the port is the real one where 0 was asked for."""
+
+    def serve(
+        self,
+        services: Mapping[str, str],
+        on_request: Callable[[Incoming], None],
+        on_probe: Callable[[Probe], ProbeAnswer],
+    ) -> None:
+        """Begin to listen. Callbacks come from the wire's threads and must not block."""
+
+    def counters(self) -> Mapping[str, int]:
+        """Counts by event name: ``malformed``, ``refused``, ``reply_dropped``, ..."""
+
+    def close(self) -> None:
+        """Stop. Repeatable."""

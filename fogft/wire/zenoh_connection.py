@@ -1,0 +1,324 @@
+"""One Zenoh session of a robot towards one replica, used once and thrown away.
+
+Everything of Zenoh's that can block (`get`, `close`) is called by the connection's own
+sender thread, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's
+threads.
+
+Owns: a session, its sender thread, the attempts open on it.
+Not here: when to open and when to give up (`zenoh_link`).
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from queue import SimpleQueue
+from typing import Any
+
+import zenoh
+from zenoh import handlers
+
+from fogft.core.errors import WireError
+from fogft.wire import frame
+from fogft.wire.credit import Credit
+from fogft.wire.diagnosis import wrong_name
+from fogft.wire.leaving import see_off
+from fogft.wire.link_window import ATTEMPTS_LIMIT, LinkWindow
+from fogft.wire.port import Answer, Peer, Refusal
+from fogft.wire.timer_budget import TimerBudget
+from fogft.wire.turns import LARGE_BYTES, Turns
+
+log = logging.getLogger(__name__)
+
+_ALL = zenoh.QueryTarget.ALL
+# NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
+# last replica has answered. Kept true by tests/wire/test_first_reply_is_not_held_back.
+_AT_ONCE = zenoh.ConsolidationMode.NONE
+# Attempts that wait for the sender, forgotten ones included: those have freed their room in the
+# window, so without a bound of its own the queue of a sender that is stuck would grow.
+_QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
+# A `get` that took this long was stuck behind a full queue: see whether the session survived.
+_STUCK_S = 0.1
+
+
+class OpenAttempt:
+    """A request on its way through one connection."""
+
+    __slots__ = ("deadline", "key", "mark", "payload", "request_id", "service", "size")
+
+    def __init__(
+        self, service: str, key: zenoh.KeyExpr, request_id: bytes, payload: bytes, deadline: float
+    ) -> None:
+        self.service = service
+        self.key = key
+        self.request_id = request_id
+        self.payload: bytes | None = payload  # None once it was sent, or is not wanted
+        self.size = len(payload)
+        self.deadline = deadline
+        self.mark = 0  # what the connection had sent once this was sent (`credit`)
+
+
+class Connection:
+    """An open session whose peer was found to be the right one.
+
+    Args:
+        config: Zenoh's configuration of the session.
+        peer: Whom it must reach.
+        robot: Who we are.
+        keys: Service name -> key.
+        turns: Shared with the robot's other connections.
+        answered: Called with each attempt's end, once. Must not block.
+        lost: Called, from any thread and perhaps more than once, when it is no longer of use.
+        room: Called when a window that was full has room again.
+
+    Raises:
+        zenoh.ZError: Nothing was reached.
+        WireError: Somebody else was reached. Nothing was sent to them.
+    """
+
+    def __init__(
+        self,
+        config: zenoh.Config,
+        peer: Peer,
+        robot: str,
+        keys: Mapping[str, str],
+        *,
+        turns: Turns,
+        answered: Callable[[Answer], None],
+        lost: Callable[[], None],
+        room: Callable[[], None],
+    ) -> None:
+        self._turns = turns
+        self._answered = answered
+        self._on_lost = lost
+        self._room = room
+        self._keys = {name: zenoh.KeyExpr(key) for name, key in keys.items()}
+        self._timers = {name: TimerBudget() for name in keys}
+        self._origin = frame.origin(robot, secrets.token_bytes(frame.TOKEN_BYTES))
+        self._queue: SimpleQueue[OpenAttempt | None] = SimpleQueue()
+        self._credit = Credit()
+        self.window: LinkWindow[OpenAttempt] = LinkWindow()
+        self.lost_because = ""
+        self._session = zenoh.open(config)
+        try:
+            self._listener = self._session.info.declare_link_events_listener(
+                handlers.Callback(self._link_event, indirect=False)
+            )
+            self._check_peer(peer)
+        except BaseException:
+            _close_aside(self._session, peer)
+            raise
+        self._thread = threading.Thread(
+            target=self._run, name=f"fogft-send-{peer.id.short}", daemon=True
+        )
+        self._thread.start()
+
+    def _check_peer(self, peer: Peer) -> None:
+        names = {link.auth_identifier for link in self._session.info.links()}
+        if not names:
+            raise WireError(f"`{peer.endpoint}` was lost as soon as it was reached")
+        for name in names - {peer.certificate_name}:
+            raise WireError(wrong_name(name, peer), "another machine has this address now")
+
+    # -- requests (any thread) ------------------------------------------------------------
+
+    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+        """Take an attempt, or return False. Never blocks."""
+        key = self._keys.get(service)
+        if key is None or self._queue.qsize() >= _QUEUE_LIMIT:
+            return False
+        attempt = OpenAttempt(service, key, request_id, payload, time.monotonic() + remaining_s)
+        if not self.window.admit(attempt):
+            return False
+        mark = self._credit.take(attempt.size)
+        if mark is None:
+            attempt.mark = self._credit.queue(attempt.size)
+            self._queue.put(attempt)
+        else:  # it cannot block: the hop to another thread is saved
+            attempt.mark = mark
+            self._send_or_lose(attempt)
+        return True
+
+    def forget(self, request_id: bytes) -> None:
+        """Free the room and the bytes of a request, also where its sender is stuck."""
+        attempt = self.window.forget(request_id)
+        if attempt is None:
+            return
+        attempt.payload = None
+        if self.window.regained_room():
+            self._room()
+
+    def _end(self, attempt: OpenAttempt, payload: bytes | None, refusal: str = "") -> None:
+        if self.window.remove(attempt):
+            attempt.payload = None
+            self._answered(Answer(attempt.request_id, payload, refusal, attempt.service))
+            if self.window.regained_room():
+                self._room()
+
+    # -- the sender thread ----------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            attempt = self._queue.get()
+            if attempt is None:
+                break
+            self._send_or_lose(attempt)
+            self._credit.dequeued()
+        _close(self._session)
+
+    def _send_or_lose(self, attempt: OpenAttempt) -> None:
+        try:
+            self._send(attempt)
+        except Exception as error:  # whatever it is, the attempt must end
+            self._lose(f"sending failed: {error}")
+            self._end(attempt, None, Refusal.LOST)
+
+    def _send(self, attempt: OpenAttempt) -> None:
+        payload = attempt.payload  # read once: `forget` may take it away at any moment
+        if payload is None or not self.window.holds(attempt):
+            return  # forgotten while it waited
+        remaining_s = attempt.deadline - time.monotonic()
+        if remaining_s <= 0:
+            self._end(attempt, None, Refusal.LOST)
+            return
+        attempt.payload = None
+        turn = self._turns.take() if attempt.size >= LARGE_BYTES else None
+        began = time.monotonic()
+        try:
+            self._get(attempt, payload, remaining_s)
+        finally:
+            self._turns.give(turn)
+        if time.monotonic() - began > _STUCK_S and not self.alive():
+            self._lose("it took nothing more, and Zenoh gave the session up")
+
+    def _get(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
+        self._session.get(
+            attempt.key,
+            # No callback at the end of the query: it would cost every answer a second turn with
+            # the interpreter lock (20 us). Each query gets a reply: the listener refuses what
+            # its owner forgets, Zenoh tells of a time-out, and `sweep` finds the rest.
+            handlers.Callback(partial(self._replied, attempt), indirect=False),
+            payload=payload,
+            attachment=frame.encode_request(attempt.request_id, remaining_s, self._origin),
+            timeout=self._timers[attempt.service].timeout_s(remaining_s, time.monotonic()),
+            target=_ALL,
+            consolidation=_AT_ONCE,
+        )
+
+    # -- Zenoh's threads ------------------------------------------------------------------
+
+    def _replied(self, attempt: OpenAttempt, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._credit.heard(attempt.mark)  # requests of one connection arrive in order
+        if not self.window.holds(attempt):
+            return  # late: it was forgotten, or has ended
+        try:
+            payload, refusal = _read_reply(reply, attempt.request_id)
+        except frame.FrameError as error:
+            log.warning("answer_malformed request=%s reason=%r", attempt.request_id.hex(), error)
+            payload, refusal = None, Refusal.MALFORMED
+        self._end(attempt, payload, refusal)
+
+    def _link_event(self, event: zenoh.LinkEvent) -> None:
+        if event.kind == zenoh.SampleKind.DELETE:
+            self._lose("the connection was lost")
+
+    def _lose(self, because: str) -> None:
+        self.lost_because = self.lost_because or because
+        self._on_lost()
+
+    # -- the keeper -----------------------------------------------------------------------
+
+    def alive(self) -> bool:
+        """Whether Zenoh still has a link beneath this session."""
+        try:
+            return bool(self._session.info.links())
+        except zenoh.ZError:
+            return False
+
+    def probe(
+        self, key: str, payload: bytes, timeout_s: float, heard: Callable[[bytes], None]
+    ) -> None:
+        """Send a probe ahead of all requests; `heard` gets the answer's bytes, if one comes.
+
+        Raises:
+            zenoh.ZError: It could not be sent.
+        """
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                heard(reply.ok.payload.to_bytes())
+
+        self._session.get(
+            key,
+            handlers.Callback(on_reply, indirect=False),
+            payload=payload,
+            timeout=timeout_s,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+            target=_ALL,
+            consolidation=_AT_ONCE,
+        )
+
+    def sweep(self) -> None:
+        """End the attempts whose time is up and of which Zenoh told nothing."""
+        now = time.monotonic()
+        for attempt in self.window.attempts():
+            if attempt.deadline <= now:
+                self._end(attempt, None, Refusal.LOST)
+
+    def close(self) -> None:
+        """End it: what is open is lost. Returns at once; the sender thread closes the session."""
+        ended = self.window.close()
+        see_off(self._thread)
+        self._queue.put(None)
+        for attempt in ended:
+            attempt.payload = None
+            self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
+        self._thread.join(timeout_s)
+
+
+def _read_reply(reply: zenoh.Reply, request_id: bytes) -> tuple[bytes | None, str]:
+    """Return payload and refusal of a reply: one of both.
+
+    Raises:
+        FrameError: It is an answer to another request, or none at all.
+    """
+    payload, refusal = None, ""
+    if reply.ok is not None:
+        if reply.ok.attachment is None:
+            raise frame.FrameError("an answer without a header")
+        answered_id = frame.decode_answer(reply.ok.attachment.to_bytes())
+        payload = reply.ok.payload.to_bytes()
+    elif reply.err is not None:
+        content = reply.err.payload.to_bytes()
+        if content == b"Timeout":  # Zenoh's own, in place of an answer
+            return None, Refusal.LOST
+        answered_id, refusal = frame.decode_refusal(content)
+    else:
+        raise frame.FrameError("neither an answer nor a refusal")
+    if answered_id != request_id:
+        raise frame.FrameError("an answer to another request")
+    return payload, refusal
+
+
+def _close(session: Any) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:  # the peer is frozen with data in flight; Zenoh waits 10 s
+        log.debug("session_closed_late reason=%r", str(error))
+
+
+def _close_aside(session: Any, peer: Peer) -> None:
+    closer = threading.Thread(
+        target=_close, args=(session,), name=f"fogft-close-{peer.id.short}", daemon=True
+    )
+    closer.start()
+    see_off(closer)

@@ -1,0 +1,394 @@
+"""Links over Zenoh: keep a connection to each replica, probe it, and doubt it in time.
+
+A keeper thread for each link opens the connection, sends probes, and replaces the
+connection when it is lost or when probes go unanswered: never because a service is slow.
+`offer` only puts the attempt into the connection's queue.
+
+Owns: the state of a link. Not here: sessions and attempts (`zenoh_connection`), what a
+replica's silence means for the pool (`fogft.core`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+
+import zenoh
+
+from fogft.core import names
+from fogft.core.errors import WireError
+from fogft.core.model import LinkState
+from fogft.wire import config, diagnosis, frame
+from fogft.wire.config import CredentialPaths, LinkSettings
+from fogft.wire.leaving import see_off
+from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.wire.silence import Silence
+from fogft.wire.turns import Turns
+from fogft.wire.zenoh_connection import Connection
+
+log = logging.getLogger(__name__)
+
+_PROBE_EVERY_S = 1.0
+_FIRST_PROBES_EVERY_S = 0.1
+_BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
+_EXPLAIN_EVERY_S = 5.0
+_EXPLAIN_TIMEOUT_S = 0.5
+_CLOSE_WAIT_S = 3.0
+
+
+@dataclass(frozen=True)
+class _Heard:
+    """A probe's answer as it came, and when."""
+
+    connection: Connection
+    content: bytes
+    sent_at: float
+    at: float
+
+
+class ZenohLink:
+    """A link to one replica; see `port.Link`. Made by `ZenohDialer`."""
+
+    def __init__(
+        self, dialer: ZenohDialer, peer: Peer, services: Mapping[str, str], events: LinkEvents
+    ) -> None:
+        self._dialer = dialer
+        self._peer = peer
+        self._services = dict(services)
+        self._events = events
+        self._suspect_after_s = dialer.suspect_after_s
+        self._probe_every_s = min(_PROBE_EVERY_S, dialer.suspect_after_s / 2)
+        self._probe_key = names.probe_key(peer.id.pool_uid, peer.id.slot)
+        self._config = config.robot_settings(peer, dialer.credentials, dialer.settings)
+        self._wake = threading.Event()
+        self._woke_at = 0.0
+        self._closed = False
+        self._heard: SimpleQueue[_Heard] = SimpleQueue()
+        self._silence = Silence()  # of the replica, as people see it
+        self._asked = Silence()  # of the present connection
+        # Written by the keeper only; `_live` is set exactly while the state is UP.
+        self._live: Connection | None = None
+        self._state = LinkState.CONNECTING
+        self._ready: frozenset[str] = frozenset()
+        self._probe_answer: ProbeAnswer | None = None
+        self._heard_at: float | None = None
+        self._rtt_s: float | None = None
+        self._detail = "not reached yet"
+        self._opened = 0
+        self._explained_at = float("-inf")
+        self._thread = threading.Thread(
+            target=self._keep, name=f"fogft-keep-{peer.id.short}", daemon=True
+        )
+        self._thread.start()
+
+    # -- port.Link ------------------------------------------------------------------------
+
+    @property
+    def peer(self) -> Peer:
+        """Whom it talks to."""
+        return self._peer
+
+    @property
+    def usable(self) -> bool:
+        """Whether requests may be offered."""
+        return self._live is not None
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that the last probe answer called ready; empty unless UP."""
+        return self._ready
+
+    @property
+    def draining(self) -> bool:
+        """Whether the replica asked to be left alone."""
+        answer = self._probe_answer
+        return answer is not None and answer.draining
+
+    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+        """Take one attempt, or return False. Never blocks."""
+        live = self._live
+        return live is not None and live.offer(service, request_id, payload, remaining_s)
+
+    def forget(self, request_id: bytes) -> None:
+        """Free the window of a request whose answer is no longer wanted."""
+        live = self._live
+        if live is not None:
+            live.forget(request_id)
+
+    def status(self) -> LinkStatus:
+        """Return a snapshot."""
+        now = time.monotonic()
+        live, heard_at = self._live, self._heard_at
+        return LinkStatus(
+            state=self._state,
+            probe_answer=self._probe_answer,
+            heard_age_s=None if heard_at is None else now - heard_at,
+            silent_for_s=self._silence.for_s(now),
+            rtt_s=self._rtt_s,
+            in_flight=len(live.window) if live else 0,
+            in_flight_bytes=live.window.held_bytes if live else 0,
+            reopened=max(self._opened - 1, 0),
+            detail=self._detail,
+        )
+
+    def close(self) -> None:
+        """End the link; its keeper lets go of the rest within moments."""
+        self._closed = True
+        see_off(self._thread)
+        self._wake.set()
+        live, self._live = self._live, None
+        self._ready = frozenset()
+        if live is not None:
+            live.close()
+        self._dialer.closed(self)
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the keeper thread of a closed link."""
+        self._thread.join(timeout_s)
+
+    # -- the keeper thread ----------------------------------------------------------------
+
+    def _keep(self) -> None:
+        failures = 0
+        while not self._closed:
+            self._silence.began(time.monotonic())
+            connection = self._open()
+            if connection is not None:
+                was_up = self._attend(connection)
+                self._part(connection)
+                failures = 0 if was_up else failures + 1
+            else:
+                failures += 1
+            self._woke_at = time.monotonic()  # opening took time, and that is silence
+            if not self._closed:
+                self._pause(_BACKOFF_S[min(failures, len(_BACKOFF_S) - 1)])
+
+    def _open(self) -> Connection | None:
+        began = time.monotonic()
+        try:
+            connection = Connection(
+                config.to_zenoh(self._config),
+                self._peer,
+                self._dialer.robot,
+                self._services,
+                turns=self._dialer.turns,
+                answered=self._answered,
+                lost=self._wake.set,
+                room=self._changed,
+            )
+        except WireError as error:
+            self._say(error.message)
+            return None
+        except zenoh.ZError as error:
+            self._say(self._explain(time.monotonic() - began) or self._detail or str(error))
+            return None
+        self._opened += 1
+        return connection
+
+    def _explain(self, took_s: float) -> str:
+        """Find words for a failed opening; empty when that was done lately."""
+        if took_s >= self._dialer.settings.open_timeout_s * 0.9:
+            return f"`{self._peer.endpoint}` does not answer: frozen, blackholed or overloaded"
+        now = time.monotonic()
+        if self._closed or now - self._explained_at < _EXPLAIN_EVERY_S:
+            return ""
+        self._explained_at = now
+        return diagnosis.explain(self._peer, self._dialer.credentials, _EXPLAIN_TIMEOUT_S)
+
+    def _attend(self, connection: Connection) -> bool:
+        """Probe a connection until it is lost, suspect or not wanted; return whether it was up."""
+        up = False
+        self._woke_at = next_probe = time.monotonic()
+        self._asked = Silence()
+        while not self._closed and not connection.lost_because:
+            now = time.monotonic()
+            if now >= next_probe:
+                connection.sweep()
+                self._probe(connection, now)
+                next_probe = now + (self._probe_every_s if up else _FIRST_PROBES_EVERY_S)
+            left_s = self._suspect_after_s - self._asked.for_s(now)
+            if left_s <= 0:
+                connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
+                break
+            self._pause(min(next_probe - now, left_s))
+            try:
+                up = self._listen(connection) or up
+            except WireError as error:
+                connection.lost_because = error.message
+        return up
+
+    def _probe(self, connection: Connection, now: float) -> None:
+        self._asked.began(now)
+        self._silence.began(now)
+        probe = Probe(self._dialer.robot, self._dialer.manager_age())
+
+        def heard(content: bytes) -> None:
+            self._heard.put(_Heard(connection, content, now, time.monotonic()))
+            self._wake.set()
+
+        try:
+            connection.probe(
+                self._probe_key, frame.encode_probe(probe), self._suspect_after_s * 2, heard
+            )
+        except zenoh.ZError as error:
+            connection.lost_because = f"sending failed: {error}"
+            return
+        if not connection.alive():
+            connection.lost_because = "the connection was lost"
+
+    def _listen(self, connection: Connection) -> bool:
+        """Take what was heard; return whether the link is up by it.
+
+        Raises:
+            WireError: Another replica answers here, or nothing that can be read.
+        """
+        up = False
+        while True:
+            try:
+                heard = self._heard.get_nowait()
+            except Empty:
+                return up
+            if heard.connection is connection:
+                self._take(connection, heard)
+                up = True
+
+    def _take(self, connection: Connection, heard: _Heard) -> None:
+        id = self._peer.id
+        try:
+            answer = frame.decode_probe_answer(heard.content)
+        except frame.FrameError as error:
+            raise WireError(f"`{self._peer.endpoint}` answers probes with {error}") from error
+        if (answer.slot, answer.generation) != (id.slot, id.generation):
+            raise WireError(
+                f"`{self._peer.endpoint}` says that it is {answer.slot}.{answer.generation}, "
+                f"not {id.short}"
+            )
+        self._asked.ended()
+        self._silence.ended()
+        self._heard_at = heard.at
+        self._rtt_s = heard.at - heard.sent_at
+        news = self._live is None or answer != self._probe_answer
+        self._probe_answer = answer
+        self._ready = answer.ready
+        if self._live is None:
+            self._state = LinkState.UP
+            self._detail = ""
+            self._live = connection
+            log.info("link_up replica=%s rtt_s=%.4f", id.short, self._rtt_s)
+        if self._closed:  # by another thread, just now
+            self._live, self._ready = None, frozenset()
+        elif news:
+            self._changed()
+
+    def _part(self, connection: Connection) -> None:
+        """Let go of a connection: nothing more is offered to it, what is open there is lost."""
+        was_up = self._live is not None
+        self._live = None
+        self._ready = frozenset()
+        if was_up:
+            self._state = LinkState.SUSPECT
+            log.warning("link_lost replica=%s reason=%r", self._peer.id.short,
+                        connection.lost_because)  # fmt: skip
+        if not self._closed:
+            self._silence.began(time.monotonic())
+            self._say(connection.lost_because)
+        connection.close()
+        if was_up:
+            self._changed()
+
+    def _pause(self, wanted_s: float) -> None:
+        """Wait, or until something happens. Time in which we did not run is not silence."""
+        wanted_s = max(wanted_s, 0.0)
+        self._wake.wait(wanted_s)
+        self._wake.clear()
+        now = time.monotonic()
+        for silence in (self._silence, self._asked):
+            silence.excuse(now - self._woke_at - wanted_s, now)
+        self._woke_at = now
+
+    def _say(self, detail: str) -> None:
+        if detail != self._detail:
+            self._detail = detail
+            log.info("link_detail replica=%s detail=%r", self._peer.id.short, detail)
+            self._changed()
+
+    # -- to the owner (any thread) --------------------------------------------------------
+
+    def _answered(self, answer: Answer) -> None:
+        try:
+            self._events.answered(self, answer)
+        except Exception:  # in Zenoh's thread nobody else would tell of it
+            log.exception("answer_not_taken request=%s", answer.request_id.hex())
+
+    def _changed(self) -> None:
+        try:
+            self._events.changed(self)
+        except Exception:
+            log.exception("change_not_taken replica=%s", self._peer.id.short)
+
+
+class ZenohDialer:
+    """Makes links over Zenoh; see `port.Dialer`.
+
+    Args:
+        credentials: The robot's certificate and key, and the pool's CA.
+        robot: The robot's name.
+        pool_uid: The pool; peers of another are refused.
+        suspect_after_s: Probes unanswered for so long make a link suspect.
+        manager_age: Seconds since the pool's manager gave a sign, None if never; told to
+            replicas with each probe.
+        settings: Zenoh's times.
+    """
+
+    def __init__(
+        self,
+        credentials: CredentialPaths,
+        *,
+        robot: str,
+        pool_uid: str,
+        suspect_after_s: float = 2.0,
+        manager_age: Callable[[], float | None] = lambda: None,
+        settings: LinkSettings | None = None,
+    ) -> None:
+        self.credentials = credentials
+        self.robot = robot
+        self.suspect_after_s = suspect_after_s
+        self.manager_age = manager_age
+        self.settings = settings or LinkSettings()
+        self.turns = Turns()
+        self._pool_uid = pool_uid
+        self._lock = threading.Lock()
+        self._links: list[ZenohLink] = []
+
+    def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
+        """Start a link; return at once, in state CONNECTING.
+
+        Raises:
+            WireError: The peer belongs to another pool.
+        """
+        if peer.id.pool_uid != self._pool_uid:
+            raise WireError(f"replica `{peer.id}` belongs to another pool than this robot")
+        link = ZenohLink(self, peer, services, events)
+        with self._lock:
+            self._links.append(link)
+        return link
+
+    def closed(self, link: ZenohLink) -> None:
+        """Forget a link that was closed."""
+        with self._lock:
+            if link in self._links:
+                self._links.remove(link)
+
+    def close(self) -> None:
+        """Close every link, and wait a little for their threads."""
+        with self._lock:
+            links, self._links = self._links, []
+        for link in links:
+            link.close()
+        end = time.monotonic() + _CLOSE_WAIT_S
+        for link in links:
+            link.join(max(0.0, end - time.monotonic()))

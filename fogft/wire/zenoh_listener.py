@@ -1,0 +1,287 @@
+"""A replica's end over Zenoh: hear requests and probes, queue the answers of each robot apart.
+
+Zenoh's threads only decode and hand over. Replies leave through one thread for each
+connection of a robot, because replying to a frozen robot can block; probes are answered by
+one more thread, ahead of all replies.
+
+Owns: the session, its queryables, the reply threads. Not here: what a request is worth
+(`fogft.proxy.responder`), duplicates included.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from queue import SimpleQueue
+
+import zenoh
+from zenoh import handlers
+
+from fogft.core import names
+from fogft.core.errors import WireError
+from fogft.core.model import ReplicaId
+from fogft.wire import config, frame
+from fogft.wire.config import CredentialPaths, LinkSettings
+from fogft.wire.leaving import see_off
+from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
+from fogft.wire.reply_queue import Counters, Reply, ReplyQueues
+
+log = logging.getLogger(__name__)
+
+_CLOSE_WAIT_S = 1.0
+
+
+class ZenohIncoming:
+    """A request that came over Zenoh; see `port.Incoming`."""
+
+    __slots__ = ("_chores", "_header", "_payload", "_queries", "_queues", "_service")
+
+    def __init__(
+        self,
+        service: str,
+        header: frame.RequestHeader,
+        payload: bytes,
+        *,
+        query: zenoh.Query,
+        queues: ReplyQueues,
+        chores: SimpleQueue[Callable[[], None] | None],
+    ) -> None:
+        self._service = service
+        self._header = header
+        self._payload = payload
+        self._queries = [query]  # taken by the first answer; list.pop is atomic
+        self._queues = queues
+        self._chores = chores
+
+    @property
+    def service(self) -> str:
+        """Name of the service asked for."""
+        return self._service
+
+    @property
+    def request_id(self) -> bytes:
+        """16 bytes, made by the client proxy."""
+        return self._header.request_id
+
+    @property
+    def robot(self) -> str:
+        """Who asks."""
+        return self._header.robot
+
+    @property
+    def remaining_s(self) -> float:
+        """Time that was left when the robot sent it."""
+        return self._header.remaining_s
+
+    @property
+    def payload(self) -> bytes:
+        """The serialised request (CDR)."""
+        return self._payload
+
+    def reply(self, payload: bytes) -> None:
+        """Send the serialised response. Never blocks."""
+        self._send(payload, "")
+
+    def refuse(self, reason: str) -> None:
+        """Send a refusal. Never blocks."""
+        self._send(b"", reason)
+
+    def _send(self, payload: bytes, refusal: str) -> None:
+        try:
+            query = self._queries.pop()
+        except IndexError:
+            return  # answered before
+        self._payload = b""
+        reply = Reply(query, self._header.request_id, payload, refusal)
+        self._queues.put(self._header.token, self._header.robot, reply)
+
+    def __del__(self) -> None:
+        """Refuse what its owner forgot: the robot must not wait for it until its deadline.
+
+        The collector may call this anywhere, even while a lock of ours is held; a
+        `SimpleQueue` may be put into from here.
+        """
+        if self._queries:
+            forgotten = Reply(self._queries.pop(), self._header.request_id, b"", Refusal.LOST)
+            self._chores.put(
+                partial(self._queues.put, self._header.token, self._header.robot, forgotten)
+            )
+
+
+class ZenohListener:
+    """Listens for robots; see `port.Listener`.
+
+    Args:
+        listen: ``host:port``; port 0 for any that is free.
+        credentials: The replica's certificate and key, and the pool's CA.
+        id: Which replica this is: it hears the keys of its slot only.
+        settings: Zenoh's times.
+
+    Raises:
+        WireError: `listen` is not ``host:port``.
+    """
+
+    def __init__(
+        self,
+        listen: str,
+        credentials: CredentialPaths,
+        id: ReplicaId,
+        *,
+        settings: LinkSettings | None = None,
+    ) -> None:
+        self._endpoint = _with_port(listen)
+        self._id = id
+        self._config = config.replica_settings(
+            self._endpoint, id, credentials, settings or LinkSettings()
+        )
+        self._counters = Counters()
+        self._queues = ReplyQueues(self._counters)
+        self._chores: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._session: zenoh.Session | None = None
+        self._queryables: list[object] = []
+
+    @property
+    def endpoint(self) -> str:
+        """``host:port`` as bound."""
+        return self._endpoint
+
+    def serve(
+        self,
+        services: Mapping[str, str],
+        on_request: Callable[[Incoming], None],
+        on_probe: Callable[[Probe], ProbeAnswer],
+    ) -> None:
+        """Begin to listen.
+
+        Raises:
+            WireError: The port is taken, or the credentials cannot be used.
+        """
+        try:
+            session = self._session = zenoh.open(config.to_zenoh(self._config))
+        except zenoh.ZError as error:
+            raise WireError(
+                f"cannot listen at `{self._endpoint}`: {str(error).split(' at /')[0]}",
+                "see that the port is free and that the certificate, its key and the CA exist",
+            ) from error
+        threading.Thread(target=self._do_chores, name="fogft-probes", daemon=True).start()
+        for name, key in services.items():
+            self._declare(session, key, partial(self._request, name, on_request))
+        # Last: who is told that this replica is ready finds every service.
+        probe_key = names.probe_key(self._id.pool_uid, self._id.slot)
+        self._declare(session, probe_key, partial(self._probe, on_probe))
+
+    def _declare(
+        self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query], None]
+    ) -> None:
+        def guarded(query: zenoh.Query) -> None:
+            try:
+                heard(query)
+            except Exception:  # in Zenoh's thread nobody else would tell of it
+                self._counters.add("failed")
+                log.exception("query_not_taken key=%s", key)
+
+        callback = handlers.Callback(guarded, indirect=False)
+        self._queryables.append(session.declare_queryable(key, callback, complete=True))
+
+    # -- Zenoh's threads ------------------------------------------------------------------
+
+    def _request(
+        self, service: str, on_request: Callable[[Incoming], None], query: zenoh.Query
+    ) -> None:
+        self._counters.add("requests")
+        attachment = query.attachment
+        try:
+            header = frame.decode_request(attachment.to_bytes() if attachment else b"")
+        except frame.FrameError as error:
+            self._malformed(error, query)
+            return
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        on_request(
+            ZenohIncoming(
+                service, header, payload, query=query, queues=self._queues, chores=self._chores
+            )
+        )
+
+    def _probe(self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query) -> None:
+        self._counters.add("probes")
+        try:
+            probe = frame.decode_probe(query.payload.to_bytes() if query.payload else b"")
+        except frame.FrameError as error:
+            self._malformed(error, query)
+            return
+        self._chores.put(partial(_answer_probe, on_probe, probe, query))
+
+    def _malformed(self, error: frame.FrameError, query: zenoh.Query) -> None:
+        count = self._counters.add("malformed")
+        if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
+            log.warning("request_malformed reason=%r count=%d", str(error), count)
+        self._chores.put(Reply(query, bytes(names.REQUEST_ID_BYTES), b"", Refusal.MALFORMED).send)
+
+    # -- the probe thread -----------------------------------------------------------------
+
+    def _do_chores(self) -> None:
+        while (chore := self._chores.get()) is not None:
+            try:
+                chore()
+            except Exception:
+                self._counters.add("failed")
+                log.exception("probe_not_answered")
+
+    # -- the owner ------------------------------------------------------------------------
+
+    def counters(self) -> Mapping[str, int]:
+        """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
+        ``malformed``, ``reply_dropped``, ``failed``.
+        """
+        return self._counters.snapshot()
+
+    def close(self) -> None:
+        """Send what is queued, then stop. Repeatable; takes a second at most."""
+        session, self._session = self._session, None
+        if session is None:
+            return
+        self._queryables.clear()
+        self._queues.close(_CLOSE_WAIT_S / 2)
+        self._chores.put(None)
+        closer = threading.Thread(
+            target=_close, args=(session,), name="fogft-close-listener", daemon=True
+        )
+        closer.start()
+        see_off(closer)
+        closer.join(_CLOSE_WAIT_S / 2)
+
+
+def _answer_probe(
+    on_probe: Callable[[Probe], ProbeAnswer], probe: Probe, query: zenoh.Query
+) -> None:
+    try:
+        content = frame.encode_probe_answer(on_probe(probe))
+        query.reply(query.key_expr, content, express=True)
+    finally:
+        query.drop()  # type: ignore[no-untyped-call]
+
+
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()  # type: ignore[no-untyped-call]
+    except zenoh.ZError as error:  # a robot is frozen with replies in flight; Zenoh waits 10 s
+        log.debug("session_closed_late reason=%r", str(error))
+
+
+def _with_port(listen: str) -> str:
+    host, separator, port = listen.rpartition(":")
+    if not separator or not host or not port.isdigit() or int(port) > 65535:
+        raise WireError(f"`{listen}` is not `host:port`", "for instance `0.0.0.0:7447`")
+    if int(port) != 0:
+        return listen
+    # Zenoh does not tell which port it was given, so we ask the kernel for a free one first.
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.bind((host.strip("[]"), 0))
+            return f"{host}:{probe.getsockname()[1]}"
+    except OSError as error:
+        raise WireError(f"cannot listen at `{listen}`: {error.strerror or error}") from error

@@ -1,0 +1,109 @@
+"""A measuring client: one ROS node, serialised requests, a clock around each call."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from tests.bench.service import FLAG, MAP
+
+LARGE_BYTES = 640 * 480 * 3
+CALL_LIMIT_S = 10.0
+_DISCOVERY_LIMIT_S = 30.0
+
+
+def payloads() -> dict[str, bytes]:
+    """Return the serialised requests by service: a few bytes, and 0.9 MB."""
+    import array
+
+    from nav_msgs.srv import SetMap
+    from rclpy.serialization import serialize_message
+    from std_srvs.srv import SetBool
+
+    large = SetMap.Request()
+    large.map.data = array.array("b", bytes(LARGE_BYTES))
+    return {
+        FLAG[0]: bytes(serialize_message(SetBool.Request(data=True))),
+        MAP[0]: bytes(serialize_message(large)),
+    }
+
+
+@dataclass
+class Flood:
+    """Requests kept in flight: how many were answered, and how long it took."""
+
+    answered: int = 0
+    seconds: float = 0.0
+    answered_at: list[float] = field(default_factory=list)
+
+
+class Caller:
+    """Calls the bench's services in one ROS domain."""
+
+    def __init__(self, domain_id: int, name: str) -> None:
+        from fogft.ros.node import SerialisedNode
+
+        self._node = SerialisedNode(name, domain_id)
+        self._clients: dict[str, Any] = {n: self._node.client(n, t) for n, t in (FLAG, MAP)}
+
+    def wait(self) -> None:
+        """Wait until discovery has found the services."""
+        limit = time.monotonic() + _DISCOVERY_LIMIT_S
+        while not all(client.available() for client in self._clients.values()):
+            if time.monotonic() > limit:
+                raise TimeoutError("the services did not appear")
+            time.sleep(0.02)
+
+    def call(self, service: str, payload: bytes) -> float:
+        """Return how long one call took, in seconds.
+
+        Raises:
+            TimeoutError: No answer within `CALL_LIMIT_S`.
+        """
+        answered = threading.Event()
+        client = self._clients[service]
+        began = time.perf_counter()
+        ticket = client.call(payload, lambda _: answered.set())
+        if not answered.wait(CALL_LIMIT_S):
+            client.forget(ticket)
+            raise TimeoutError(f"{service} got no answer")
+        return time.perf_counter() - began
+
+    def flood(self, service: str, payload: bytes, count: int, in_flight: int) -> Flood:
+        """Send `count` requests, `in_flight` at a time; wait for all answers."""
+        client, result, done = self._clients[service], Flood(), threading.Event()
+        sent = min(in_flight, count)
+        lock = threading.Lock()
+
+        def answered(_: bytes) -> None:
+            nonlocal sent
+            with lock:
+                result.answered += 1
+                again = sent < count
+                sent += again
+            if again:
+                client.call(payload, answered)
+            elif result.answered == count:
+                done.set()
+
+        began = time.perf_counter()
+        for _ in range(sent):
+            client.call(payload, answered)
+        while not done.wait(CALL_LIMIT_S):
+            before = result.answered
+            if done.wait(CALL_LIMIT_S) or result.answered == before:
+                break
+        result.seconds = time.perf_counter() - began
+        return result
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._node.close()
+
+
+def milliseconds(seconds: Sequence[float]) -> list[float]:
+    """Return durations in milliseconds."""
+    return [s * 1000 for s in seconds]

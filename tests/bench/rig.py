@@ -1,0 +1,273 @@
+"""A pool of real proxies and services as processes, without a manager and without a cloud.
+
+The bench writes the proxies' configuration and the membership itself, and so holds every
+process by its id. All of them die with the bench.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.core import membership as memberships
+from fogft.core import names
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.pool import credentials
+from fogft.ros import shared_memory
+from fogft.ros.environment import child_environment
+from tests.bench.service import FLAG, MAP
+
+ROOT = Path(__file__).resolve().parents[2]
+_READY_LIMIT_S = 60.0
+_LIBC = ctypes.CDLL(None)
+
+
+def free_ports(count: int) -> list[int]:
+    """Return TCP ports on loopback that are free now."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for listening in sockets:
+            listening.bind(("127.0.0.1", 0))
+        return [listening.getsockname()[1] for listening in sockets]
+
+
+def free_domains(count: int) -> list[int]:
+    """Return ROS domains below 60 (tests use those above) in which nobody listens here."""
+    ports = set()
+    for table in ("/proc/net/udp", "/proc/net/udp6"):
+        with contextlib.suppress(OSError):
+            for line in Path(table).read_text().splitlines()[1:]:
+                ports.add(int(line.split()[1].rsplit(":", 1)[1], 16))
+    free = [d for d in range(1, 60) if not any(0 <= p - 7400 - 250 * d < 250 for p in ports)]
+    start = os.getpid() % len(free)
+    return (free[start:] + free[:start])[:count]
+
+
+def _die_with_parent() -> None:
+    _LIBC.prctl(1, signal.SIGKILL, 0, 0, 0)
+
+
+@dataclass
+class Replica:
+    """One server proxy with its service below it."""
+
+    id: ReplicaId
+    domain_id: int
+    port: int
+    dial_port: int  # the relay's where there is one
+    process: subprocess.Popen[bytes]
+    relay: subprocess.Popen[bytes] | None = None
+
+    def service_pid(self) -> int:
+        """Return the process id of the service."""
+        pid = self.process.pid
+        return int(Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0])
+
+    def signal(self, number: int) -> None:
+        """Send a signal to server proxy and service, as to a whole machine."""
+        pids = [self.process.pid]
+        with contextlib.suppress(OSError, IndexError):
+            pids.append(self.service_pid())
+        for pid in pids:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, number)
+
+
+class Rig:
+    """N replicas, one client proxy and the bare round trip's replier. Use as a context manager.
+
+    Args:
+        folder: An empty folder of its own.
+        replicas: How many.
+        sleep_s: How long the service sleeps over each request.
+        relayed: Slots that are reached through a relay.
+    """
+
+    def __init__(
+        self, folder: Path, replicas: int, *, sleep_s: float = 0.0, relayed: Sequence[int] = ()
+    ) -> None:
+        self._folder = folder
+        self._uid = secrets.token_hex(8)
+        self._version = 0
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._sleep_s = sleep_s
+        self.robot_domain, *domains = free_domains(replicas + 1)
+        self.domains = domains
+        credentials.create_authority(folder / "ca", self._uid)
+        self.replicas = [self._replica(slot, slot in relayed) for slot in range(replicas)]
+        self.floor_port = self._floor()
+        self.proxy = self._client_proxy()
+        self.follow(range(replicas))
+
+    def __enter__(self) -> Rig:
+        try:
+            self.wait_ready(range(len(self.replicas)))
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def follow(self, slots: Sequence[int]) -> None:
+        """Have the client proxy hold links to these slots and no others."""
+        self._version += 1
+        members = tuple(
+            Member(r.id, f"127.0.0.1:{r.dial_port}") for r in self.replicas if r.id.slot in slots
+        )
+        membership = Membership("bench", self._uid, 1, self._version, members)
+        disk.write_json(self._folder / "membership.json", memberships.to_dict(membership))
+
+    def links(self) -> dict[int, dict[str, Any]]:
+        """Return the client proxy's links by slot, as it last reported them."""
+        report = disk.read_json(self._folder / "proxy-status.json") or {}
+        return {link["slot"]: link for link in report.get("links", ())}
+
+    def wait_ready(self, slots: Sequence[int]) -> None:
+        """Wait until the client proxy holds exactly these links, all up and ready."""
+
+        def ready() -> bool:
+            links = self.links()
+            return set(links) == set(slots) and all(len(k["ready"]) == 2 for k in links.values())
+
+        self._wait(ready, f"replicas {list(slots)} to be ready")
+
+    def _wait(self, condition: Callable[[], bool], what: str) -> None:
+        limit = time.monotonic() + _READY_LIMIT_S
+        while not condition():
+            dead = [p.args for p in self._processes if p.poll() is not None]
+            if dead or time.monotonic() > limit:
+                raise RuntimeError(
+                    f"waited in vain for {what}; ended: {dead}; logs: {self._folder}\n{self._log()}"
+                )
+            time.sleep(0.05)
+
+    def _log(self) -> str:
+        lines = []
+        for log in sorted(self._folder.glob("*.log")):
+            lines += [f"{log.name}: {line}" for line in log.read_text().splitlines()[-5:]]
+        return "\n".join(lines)
+
+    def _replica(self, slot: int, relayed: bool) -> Replica:
+        id = ReplicaId(self._uid, slot, 1)
+        port, dial_port = free_ports(2)
+        name = f"replica-{slot}"
+        self._issue(name, "replica", names.replica_certificate_name(id), credentials.Role.REPLICA)
+        config = {
+            "pool": "bench",
+            "pool_uid": self._uid,
+            "slot": slot,
+            "generation": 1,
+            "listen": f"127.0.0.1:{port}",
+            "services": self._services(),
+            "run": f"exec {sys.executable} -m tests.bench.service {self._sleep_s}",
+            "workdir": str(ROOT),
+            "credentials": _pair(name, "replica"),
+            "domain_id": self.domains[slot],
+        }
+        (self._folder / f"{name}.yaml").write_text(json.dumps(config))  # JSON is YAML
+        process = self._start(name, "fogft", "serve", "--config", f"{name}.yaml")
+        relay = None
+        if relayed:
+            relay = self._start(f"relay-{slot}", "tests.bench.relay", str(dial_port), str(port))
+        return Replica(id, self.domains[slot], port, dial_port if relayed else port, process, relay)
+
+    def _client_proxy(self) -> subprocess.Popen[bytes]:
+        self._issue(
+            "robot",
+            "robot",
+            names.robot_certificate_name(self._uid, "bench"),
+            credentials.Role.ROBOT,
+        )
+        config = {
+            "pool": "bench",
+            "pool_uid": self._uid,
+            "robot": "bench",
+            "membership": "membership.json",
+            "status": "proxy-status.json",
+            "lease": "lease.json",
+            "lock": "proxy.lock",
+            "credentials": _pair("robot", "robot"),
+            "services": self._services(),
+            "domain_id": self.robot_domain,
+        }
+        (self._folder / "proxy.yaml").write_text(json.dumps(config))
+        return self._start("proxy", "fogft", "proxy", "--config", "proxy.yaml")
+
+    def _floor(self) -> int:
+        """Start the bare replier, with certificates like a replica's."""
+        (port,) = free_ports(1)
+        id = ReplicaId(self._uid, 99, 1)
+        folder = self.floor_folder
+        for stem, name, role in (
+            ("replica", names.replica_certificate_name(id), credentials.Role.REPLICA),
+            ("robot", names.robot_certificate_name(self._uid, "floor"), credentials.Role.ROBOT),
+        ):
+            self._issue(folder.name, stem, name, role)
+        self._start("floor", "tests.bench.floor", str(folder), str(port))
+        log = self._folder / "floor.log"
+        self._wait(lambda: "ready" in log.read_text(), "the bare replier")
+        return port
+
+    @property
+    def floor_folder(self) -> Path:
+        """Where the bare round trip's certificates are."""
+        return self._folder / "floor"
+
+    def _issue(self, folder: str, stem: str, name: str, role: credentials.Role) -> None:
+        credential = credentials.issue(self._folder / "ca", name, role=role)
+        credentials.write(credential, self._folder / folder, stem)
+
+    def _services(self) -> list[dict[str, Any]]:
+        return [{"name": n, "type": t, "timeout_s": 10.0} for n, t in (FLAG, MAP)]
+
+    def _start(self, name: str, module: str, *arguments: str) -> subprocess.Popen[bytes]:
+        environ = {**child_environment(), "PYTHONPATH": str(ROOT)}
+        environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        with (self._folder / f"{name}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                cwd=self._folder,
+                env=environ,
+                stdout=log,
+                stderr=log,
+                preexec_fn=_die_with_parent,
+            )
+        self._processes.append(process)
+        return process
+
+    def close(self) -> None:
+        """End every process; remove the shared memory of those that were killed."""
+        for process in self._processes:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGCONT)
+                process.terminate()
+        for process in self._processes:
+            try:
+                process.wait(timeout=5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        shared_memory.sweep()
+
+
+def _pair(folder: str, stem: str) -> dict[str, str]:
+    return {
+        "ca": f"{folder}/ca.crt",
+        "certificate": f"{folder}/{stem}.crt",
+        "key": f"{folder}/{stem}.key",
+    }

@@ -1,0 +1,171 @@
+"""Overhead and throughput: what the proxies cost a call, and how many they carry."""
+
+from __future__ import annotations
+
+import gc
+import os
+import random
+from pathlib import Path
+from typing import Any
+
+from tests.bench import machine
+from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.floor import Floor
+from tests.bench.rig import Rig
+from tests.bench.service import FLAG, MAP
+from tests.bench.statistics import Estimate, estimate, median, overhead_ratio, percentile
+
+_WARM_UP = 30
+_IN_FLIGHT = 64
+
+
+def overhead(folder: Path, replicas: int, *, quick: bool) -> list[dict[str, Any]]:
+    """Compare direct calls, proxied calls and bare round trips, in turns, in one run."""
+    sizes = {FLAG[0]: (300 if quick else 1500, "flag"), MAP[0]: (80 if quick else 300, "map")}
+    rows = []
+    with Rig(folder, replicas) as rig:
+        direct = Caller(rig.domains[0], "bench_direct")
+        proxied = Caller(rig.robot_domain, "bench_proxied")
+        floor = Floor(rig.floor_folder, rig.floor_port)
+        direct.wait()
+        proxied.wait()
+        for (service, (rounds, key)), payload in zip(
+            sizes.items(), payloads().values(), strict=True
+        ):
+            sides: dict[str, list[float]] = {"direct": [], "proxied": [], "get": []}
+            gc.collect()
+            for number in range(_WARM_UP + rounds):
+                took = {
+                    "direct": direct.call(service, payload),
+                    "proxied": proxied.call(service, payload),
+                    "get": floor.call(key, payload),
+                }
+                if number >= _WARM_UP:
+                    for side, seconds in took.items():
+                        sides[side].append(seconds)
+            row = _row(service, replicas, len(payload), sides)
+            before = _cpu_used(rig)
+            for _ in range(rounds):
+                proxied.call(service, payload)
+            row["cpu_ms_per_request"] = _cpu_per_request(before, rig, rounds)
+            rows.append(row)
+        for caller in (direct, proxied):
+            caller.close()
+        floor.close()
+    return rows
+
+
+def _row(
+    service: str, replicas: int, size_bytes: int, sides: dict[str, list[float]]
+) -> dict[str, Any]:
+    source = random.Random(0)
+    in_ms = {side: milliseconds(sample) for side, sample in sides.items()}
+    row: dict[str, Any] = {
+        "service": service,
+        "replicas": replicas,
+        "request_bytes": size_bytes,
+        "rounds": len(sides["direct"]),
+    }
+    for side, sample in in_ms.items():
+        row[f"{side}_ms"] = _interval(
+            estimate({side: sample}, lambda s, side=side: median(s[side]), source, resamples=500)
+        )
+        row[f"{side}_p99_ms"] = percentile(sample, 99)
+    row["overhead_ratio"] = _interval(
+        estimate(
+            in_ms,
+            lambda s: overhead_ratio(median(s["direct"]), median(s["proxied"]), median(s["get"])),
+            source,
+            resamples=500,
+        )
+    )
+    return row
+
+
+def _interval(found: Estimate) -> dict[str, float]:
+    return {"value": found.value, "low": found.low, "high": found.high}
+
+
+def _cpu_used(rig: Rig) -> dict[str, float]:
+    """Return the processor time used so far by role, all replicas together, in seconds."""
+    roles = {
+        "caller": [os.getpid()],
+        "client_proxy": [rig.proxy.pid],
+        "server_proxies": [r.process.pid for r in rig.replicas],
+        "services": [r.service_pid() for r in rig.replicas],
+    }
+    return {role: sum(map(machine.cpu_s, pids)) for role, pids in roles.items()}
+
+
+def _cpu_per_request(before: dict[str, float], rig: Rig, requests: int) -> dict[str, float]:
+    """Return what each role has used since, in milliseconds a request."""
+    return {role: (s - before[role]) * 1000 / requests for role, s in _cpu_used(rig).items()}
+
+
+def throughput(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Count SetBool calls per second with 64 in flight: direct, and through two replicas."""
+    count = 3_000 if quick else 20_000
+    rows = []
+    with Rig(folder, 2) as rig:
+        payload = payloads()[FLAG[0]]
+        for way, domain in (("direct", rig.domains[0]), ("proxied", rig.robot_domain)):
+            caller = Caller(domain, f"bench_{way}")
+            caller.wait()
+            caller.flood(FLAG[0], payload, 500, _IN_FLIGHT)
+            before = _cpu_used(rig)
+            repeats = [caller.flood(FLAG[0], payload, count, _IN_FLIGHT) for _ in range(3)]
+            cpu_ms = _cpu_per_request(before, rig, count * len(repeats))
+            caller.close()
+            per_s = [r.answered / r.seconds for r in repeats]
+            rows.append(
+                {
+                    "way": way,
+                    "replicas": 2,
+                    "in_flight": _IN_FLIGHT,
+                    "requests": count * len(repeats),
+                    "unanswered": count * len(repeats) - sum(r.answered for r in repeats),
+                    "per_s": median(per_s),
+                    "per_s_low": min(per_s),
+                    "per_s_high": max(per_s),
+                    "cpu_ms_per_request": cpu_ms,
+                }
+            )
+    return rows
+
+
+def memory(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Follow each proxy's own memory over many requests (and some large ones before)."""
+    steps, step = 10, 1_000 if quick else 10_000
+    with Rig(folder, 2) as rig:
+        proxies = {"client proxy": rig.proxy.pid}
+        proxies |= {f"server proxy {r.id.slot}": r.process.pid for r in rig.replicas}
+        caller = Caller(rig.robot_domain, "bench_memory")
+        caller.wait()
+        small, large = payloads()[FLAG[0]], payloads()[MAP[0]]
+        grown: dict[str, list[int]] = {name: [] for name in proxies}
+
+        def look() -> None:
+            for name, pid in proxies.items():
+                grown[name].append(machine.own_memory_bytes(pid))
+
+        look()
+        caller.flood(MAP[0], large, 200, 8)
+        look()
+        unanswered = 0
+        for _ in range(steps):
+            unanswered += step - caller.flood(FLAG[0], small, step, _IN_FLIGHT).answered
+            look()
+        caller.close()
+    return [
+        {
+            "process": name,
+            "requests": steps * step,
+            "unanswered": unanswered,
+            "at_start_bytes": sizes[0],
+            "after_200_large_bytes": sizes[1],
+            "after_first_step_bytes": sizes[2],
+            "at_end_bytes": sizes[-1],
+            "all_bytes": sizes,
+        }
+        for name, sizes in grown.items()
+    ]

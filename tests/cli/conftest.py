@@ -1,0 +1,19 @@
+"""A state folder of its own for each test, and terminals of a fixed width."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty state folder, which every command uses."""
+    folder = tmp_path / "fogft"
+    folder.mkdir(mode=0o700)
+    monkeypatch.setenv("FOGFT_HOME", str(folder))
+    monkeypatch.setenv("COLUMNS", "100")
+    for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE"):
+        monkeypatch.delenv(name, raising=False)
+    return folder

@@ -1,0 +1,102 @@
+"""Pools on disk as a command finds them, without a process behind them."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.core.intent import Intent, to_json
+from fogft.pool.paths import PoolPaths
+from fogft.pool.status import PoolStatus, ReplicaStatus, ServiceStatus
+from fogft.pool.store import Identity, write_identity
+
+UID = "0123456789abcdef"
+FILE = "/home/robot/pool.yaml"
+SPEC = """\
+name: planner
+run: python3 planner_service.py
+fogft:
+  replicas: 3
+  services:
+    - {name: /plan, type: nav_msgs/srv/GetPlan}
+"""
+REPLICA = ReplicaStatus(
+    slot=0,
+    generation=1,
+    phase="ready",
+    verdict="good",
+    location="local/us-west-2/a",
+    instance="small",
+    spot=True,
+    usd_per_hour=0.0214,
+    endpoint="127.0.0.1:40001",
+    link="up",
+    rtt_s=0.00042,
+    silent_for_s=0.0,
+    won=1412,
+    in_flight=2,
+    restarts=0,
+    age_s=421.0,
+    detail="",
+)
+STATUS = PoolStatus(
+    pool="planner",
+    uid=UID,
+    cloud="local",
+    file=FILE,
+    epoch=1,
+    manager_pid=4711,
+    observed_at=0.0,
+    cloud_reachable=True,
+    stopping=False,
+    target=3,
+    ready=1,
+    uplink_suspected=False,
+    usd_per_hour=0.0628,
+    proxy_pid=4712,
+    proxy_alive=True,
+    notes=("waiting after 3 failed launches (capacity)",),
+    replicas=(
+        REPLICA,
+        replace(
+            REPLICA, slot=1, generation=12, phase="starting", link="connecting", rtt_s=None,
+            location="local/eu-central-1/b", usd_per_hour=0.02, won=0, age_s=4.2,
+            detail="`/plan` is not up yet",
+        ),
+        replace(
+            REPLICA, slot=2, generation=3, phase="draining", link="suspect", rtt_s=1.25, won=7,
+            age_s=93_600.0,
+            detail="silent for 17 s, and so it is replaced by another one elsewhere",
+        ),
+    ),
+    services=(
+        ServiceStatus(
+            name="/plan",
+            type="nav_msgs/srv/GetPlan",
+            ready_replicas=1,
+            counters={
+                "received": 1424, "answered": 1419, "late": 2801, "rejected": 0, "silent": 4,
+                "empty": 0, "turned_away": 1, "refused": {}, "pending": 2, "pending_bytes": 300,
+                "p50_s": 0.0213, "p99_s": 0.148,
+            },
+        ),
+    ),
+)  # fmt: skip
+
+
+def lay_down(home: Path, status: PoolStatus | None = STATUS, *, age_s: float = 0.4) -> PoolPaths:
+    """Write a pool's files as `up` and a manager leave them."""
+    name = status.pool if status else "planner"
+    paths = PoolPaths.of(name, home)
+    paths.folder.mkdir(parents=True)
+    paths.spec.write_text(SPEC.replace("planner\n", f"{name}\n", 1))
+    paths.intent.write_text(json.dumps(to_json(Intent())))
+    if status is not None:
+        observed: dict[str, Any] = replace(status, observed_at=time.time() - age_s).to_json()
+        disk.write_json(paths.status, observed)
+    write_identity(paths, Identity(name, UID, "local", FILE, time.time()))
+    return paths

@@ -1,0 +1,93 @@
+"""A wish is on disk when its command returns, whether or not a manager lives."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from fogft import disk
+from fogft.cli import main
+from tests.cli.pools import FILE, lay_down
+
+
+def wish(paths):
+    """Return what the manager will read."""
+    return json.loads(paths.intent.read_text())
+
+
+def test_scale_counts_from_what_is_wanted_now(home, capsys):
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        assert main.run(["scale", "up", "2"]) == 0
+        assert capsys.readouterr().err == "done: `planner` shall have 5 replicas (was 3)\n"
+        assert main.run(["scale", "down", "1", "--pool", "planner"]) == 0
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", "done: `planner` shall have 4 replicas (was 5)\n")
+    assert wish(paths)["target"] == 4
+
+
+def test_the_last_replica_stays(home, capsys):
+    paths = lay_down(home)
+    assert main.run(["scale", "down", "3"]) == 1
+    said = capsys.readouterr()
+    assert said.err == (
+        "error: cannot scale `planner` to 0 replicas: at least 1 must stay\n\n"
+        "hint: `fogft down` ends a pool\n"
+    )
+    assert wish(paths)["target"] is None
+
+
+def test_without_a_manager_the_wish_is_kept_and_that_is_said(home, capsys):
+    paths = lay_down(home)
+    assert main.run(["drain", "1"]) == 0
+    assert capsys.readouterr().err == (
+        "done: replica `1.12` of `planner` is to be replaced\n"
+        "warning: no manager of `planner` runs: this happens once one does\n\n"
+        f"hint: start it with `fogft up {FILE}`\n"
+    )
+    assert wish(paths)["drained"] == {"1": 12}
+
+
+def test_only_a_slot_with_a_replica_can_be_drained(home, capsys):
+    paths = lay_down(home)
+    assert main.run(["drain", "7"]) == 1
+    assert capsys.readouterr().err == (
+        "error: pool `planner` has no replica in slot 7\n\nhint: slots with a replica: 0, 1, 2\n"
+    )
+    assert wish(paths)["drained"] == {}
+
+
+def test_exclude_and_include(home, capsys):
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        for words in ("is now", "was already"):
+            assert main.run(["exclude", "local/us-west-2/"]) == 0
+            assert f"`local/us-west-2/` {words} excluded" in capsys.readouterr().err
+        assert wish(paths)["excluded"] == ["local/us-west-2"]
+        assert main.run(["include", "local/us-west-2"]) == 0
+        assert wish(paths)["excluded"] == []
+        assert main.run(["include", "local/us-west-2"]) == 1
+    assert "is not excluded" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("place", "hint"),
+    [("us-west-2", "`local/us-west-2`"), ("local/us-west-9", "`local/us-west-2`")],
+)
+def test_a_location_that_does_not_exist_is_not_excluded(home, capsys, place, hint):
+    paths = lay_down(home)
+    assert main.run(["exclude", place]) == 1
+    said = capsys.readouterr().err
+    assert f"has no location `{place}`" in said
+    assert f"hint: did you mean {hint}?" in said
+    assert wish(paths)["excluded"] == []
+
+
+@pytest.mark.parametrize("command", [["scale", "up", "1"], ["drain", "0"], ["exclude", "local"]])
+def test_a_pool_that_is_being_ended_takes_no_wishes(home, capsys, command):
+    paths = lay_down(home)
+    paths.intent.write_text(json.dumps({**wish(paths), "stopping": True}))
+    assert main.run(command) == 1
+    assert "pool `planner` is being ended" in capsys.readouterr().err
+    assert wish(paths)["target"] is None

@@ -1,0 +1,259 @@
+"""What the doctor says of things that are wrong, and how it says it."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+
+from fogft import app, disk
+from fogft.cli import main
+from fogft.cli.doctor import text
+from fogft.cloud.local import faults
+from fogft.cloud.local.faults import CloudFaults
+from fogft.doctor import checks, finding, leftovers, machine, pools, ros
+from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
+from fogft.pool import credentials
+from fogft.pool.paths import PoolPaths
+
+UID = "0123456789abcdef"
+
+
+def situation(home: Path, *names: str, now: float | None = None) -> Situation:
+    return Situation(home, names, None, time.time() if now is None else now)
+
+
+def the_only(found) -> Finding:
+    (only,) = found
+    return only
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A pool's credentials: its CA and a robot's."""
+    path = PoolPaths.of("planner", tmp_path).credentials
+    path.parent.mkdir(parents=True)
+    credentials.create_authority(path, UID)
+    issued = credentials.issue(path, f"robot.r.{UID}", role=credentials.Role.ROBOT)
+    credentials.write(issued, path, "robot")
+    return path
+
+
+# --- its text
+
+
+def test_a_finding_is_a_line_and_its_advice_another():
+    assert text(ok("clock", "2026-11-21")) == "ok    clock               2026-11-21"
+    assert text(warn("ports", "7447 is taken", "free it")) == (
+        "warn  ports               7447 is taken\n                          -> free it"
+    )
+
+
+def test_it_fails_when_something_does_not_work(monkeypatch, capsys):
+    findings = [ok("a", "fine"), warn("b", "odd", "look"), fail("c", "broken", "mend")]
+    monkeypatch.setattr(app, "doctor", lambda _: iter(findings))
+    assert main.run(["doctor"]) == 1
+    said = capsys.readouterr()
+    assert said.err == "\n3 checks: 1 failed, 1 to look at\n"
+    assert len(said.out.splitlines()) == 5
+    assert "\033" not in said.out
+
+
+def test_warnings_alone_are_no_failure(monkeypatch, capsys):
+    monkeypatch.setattr(app, "doctor", lambda _: iter([warn("b", "odd", "look")]))
+    assert main.run(["doctor", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == [
+        {"check": "b", "verdict": "warn", "text": "odd", "advice": "look"}
+    ]
+
+
+def test_a_check_that_breaks_does_not_hide_the_others(tmp_path):
+    def breaks(_: Situation):
+        raise RuntimeError("oh")
+
+    found = list(finding.run([breaks, machine.python], situation(tmp_path)))
+    assert [f.verdict for f in found] == [Verdict.FAIL, Verdict.OK]
+    assert "RuntimeError: oh" in found[0].text
+
+
+def test_whatever_is_wrong_comes_with_advice(tmp_path):
+    """Every finding but `ok` says what to do."""
+    light = [check for check in checks.ALL if check not in (ros.rclpy, ros.discovery)]
+    for found in finding.run(light, situation(tmp_path, "no-such-pool")):
+        assert found.text
+        assert bool(found.advice) == (found.verdict is not Verdict.OK), found
+
+
+def test_a_pool_file_with_a_mistake_is_an_error(tmp_path, capsys):
+    (tmp_path / "pool.yaml").write_text("run: x\n")
+    assert main.run(["doctor", str(tmp_path / "pool.yaml")]) == 1
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+# --- the machine
+
+
+def test_a_clock_from_before_the_installation_is_wrong(tmp_path):
+    assert the_only(machine.clock(situation(tmp_path, now=1e9))).verdict is Verdict.FAIL
+    assert the_only(machine.clock(situation(tmp_path))).verdict is Verdict.OK
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write anywhere")
+def test_a_state_folder_that_cannot_be_written_is_found(tmp_path):
+    tmp_path.chmod(0o500)
+    assert the_only(machine.state_folder(situation(tmp_path / "x"))).verdict is Verdict.FAIL
+
+
+def test_a_state_folder_that_others_read_is_found(tmp_path):
+    tmp_path.chmod(0o755)
+    first, _ = machine.state_folder(situation(tmp_path))
+    assert (first.verdict, first.advice) == (Verdict.WARN, f"run `chmod 700 {tmp_path}`")
+
+
+# --- ROS
+
+
+@pytest.mark.parametrize(
+    ("environ", "domain", "reach"),
+    [
+        ({}, Verdict.OK, Verdict.OK),
+        ({"ROS_DOMAIN_ID": "42"}, Verdict.OK, Verdict.OK),
+        ({"ROS_DOMAIN_ID": "150"}, Verdict.WARN, Verdict.OK),
+        ({"ROS_DOMAIN_ID": "233"}, Verdict.FAIL, Verdict.OK),
+        ({"ROS_DOMAIN_ID": "-1"}, Verdict.FAIL, Verdict.OK),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, Verdict.OK, Verdict.FAIL),
+        (
+            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "10.0.0.1"},
+            Verdict.OK,
+            Verdict.OK,
+        ),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "NEAR"}, Verdict.OK, Verdict.FAIL),
+        ({"ROS_LOCALHOST_ONLY": "1"}, Verdict.OK, Verdict.WARN),
+    ],
+)
+def test_the_domain_and_the_range_are_judged(environ, domain, reach):
+    assert [f.verdict for f in ros.judge_domain(environ)] == [domain, reach]
+
+
+def test_a_profile_that_is_no_xml_is_found(tmp_path, monkeypatch):
+    broken = tmp_path / "profile.xml"
+    broken.write_text("<dds>")
+    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", str(broken))
+    assert the_only(ros.profile(situation(tmp_path))).verdict is Verdict.FAIL
+
+
+@pytest.mark.ros
+def test_two_processes_find_each_other(tmp_path, monkeypatch, ros_domain):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+    found = the_only(ros.discovery(situation(tmp_path)))
+    assert found.verdict is Verdict.OK, found
+    assert "was found in" in found.text
+
+
+@pytest.mark.ros
+def test_nodes_that_cannot_find_each_other_are_found_out(tmp_path, monkeypatch, ros_domain):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    found = the_only(ros.discovery(situation(tmp_path)))
+    assert found.verdict is Verdict.FAIL
+    assert found.text == "two nodes here do not find each other"
+
+
+def test_without_rclpy_it_says_how_to_get_it(tmp_path, monkeypatch):
+    broken = tmp_path / "rclpy"
+    broken.mkdir()
+    (broken / "__init__.py").write_text("raise ImportError('librcl.so: not found')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    found = the_only(ros.rclpy(situation(tmp_path)))
+    assert found.verdict is Verdict.FAIL
+    assert "librcl.so: not found" in found.text
+    assert "fogft[ros]" in found.advice
+
+
+# --- pools
+
+
+def test_good_credentials_are_good(folder, tmp_path):
+    found = the_only(pools.certificates(situation(tmp_path, "planner")))
+    assert found == ok("credentials", "pool `planner`: 2 certificates valid, keys private")
+
+
+def test_a_key_that_others_can_read_is_found(folder, tmp_path):
+    (folder / "robot.key").chmod(0o644)
+    found = the_only(pools.certificates(situation(tmp_path, "planner")))
+    assert found.verdict is Verdict.FAIL
+    assert found.advice == f"run `chmod 600 {folder / 'robot.key'}`"
+
+
+@pytest.mark.parametrize(
+    ("days", "verdict", "words"),
+    [
+        (29, Verdict.WARN, "expires at"),
+        (31, Verdict.FAIL, "expired at"),
+        (-2, Verdict.FAIL, "not valid before"),
+    ],
+)
+def test_certificates_out_of_time_are_found(folder, days, verdict, words):
+    now = datetime.now(timezone.utc) + timedelta(days=days)
+    robot = [f for f in pools.judge_folder("planner", folder, now) if "robot" in f.text]
+    assert the_only(robot).verdict is verdict
+    assert words in robot[0].text
+
+
+def test_a_damaged_certificate_is_found(folder):
+    (folder / "robot.crt").write_text("no certificate")
+    found = the_only(pools.judge_folder("planner", folder, datetime.now(timezone.utc)))
+    assert found.verdict is Verdict.FAIL
+
+
+def test_missing_processes_are_found_and_living_ones_seen(tmp_path):
+    paths = PoolPaths.of("planner", tmp_path)
+    paths.folder.mkdir(parents=True)
+    manager, proxy = pools.processes(situation(tmp_path, "planner"))
+    assert (manager.verdict, proxy.verdict) == (Verdict.WARN, Verdict.FAIL)
+    with disk.locked(paths.manager_lock), disk.locked(paths.proxy_lock):
+        found = list(pools.processes(situation(tmp_path, "planner")))
+    assert [f.verdict for f in found] == [Verdict.OK, Verdict.OK]
+
+
+def test_silent_links_are_found():
+    silent = {"slot": 1, "generation": 2, "state": "suspect", "detail": ""}
+    up = {"slot": 0, "generation": 1, "state": "up"}
+    assert [f.verdict for f in pools.judge_links("p", [up])] == [Verdict.OK]
+    found = list(pools.judge_links("p", [up, silent]))
+    assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
+    assert "`1.2` is suspect: it does not answer probes" in found[0].text
+    assert [f.verdict for f in pools.judge_links("p", [silent])] == [Verdict.WARN, Verdict.FAIL]
+
+
+def test_a_replica_whose_program_ends_is_found():
+    ends = {"slot": 1, "generation": 2, "state": "up", "detail": "`run` exit status 3"}
+    found = list(pools.judge_links("p", [ends]))
+    assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
+    assert "`1.2` is not ready: `run` exit status 3" in found[0].text
+    assert "`fogft logs 1`" in found[0].advice
+
+
+def test_chaos_that_lasts_is_found(tmp_path):
+    assert list(leftovers.chaos(situation(tmp_path))) == []
+    outage = CloudFaults({"local/us-west-2": None, "local/us-west-1": 1.0}, {"local/us-east-1": 0})
+    (tmp_path / "local").mkdir()
+    faults.write(tmp_path / "local" / faults.FILE, outage)
+    found = the_only(leftovers.chaos(situation(tmp_path)))
+    assert "`local/us-west-2` is out, `local/us-east-1` has room for 0 machines" in found.text
+    assert "us-west-1" not in found.text
+
+
+def test_a_proxy_that_hangs_is_found(tmp_path):
+    paths = PoolPaths.of("planner", tmp_path)
+    paths.folder.mkdir(parents=True)
+    report = {"pid": 4711, "written_at": time.time() - 60, "links": []}
+    paths.proxy_status.write_text(json.dumps(report))
+    with disk.locked(paths.proxy_lock):
+        found = the_only(pools.links(situation(tmp_path, "planner")))
+    assert found.verdict is Verdict.FAIL
+    assert "4711" in found.advice

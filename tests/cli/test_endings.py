@@ -1,0 +1,139 @@
+"""How a command ends: exit status, and what stands on which stream."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from fogft import app
+from fogft.cli import main
+from fogft.core.errors import PoolNotFound
+
+
+def run_failing(monkeypatch: pytest.MonkeyPatch, problem: BaseException) -> int:
+    def fail(*_: object) -> None:
+        raise problem
+
+    monkeypatch.setattr(app, "pool_name", fail)
+    return main.run(["drain", "0"])
+
+
+def test_an_error_is_told_on_stderr_with_its_hint_after_a_blank_line(monkeypatch, capsys):
+    problem = PoolNotFound("there is no pool `a`", "start one with `fogft up`")
+    assert run_failing(monkeypatch, problem) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == "error: there is no pool `a`\n\nhint: start one with `fogft up`\n"
+
+
+def test_an_error_without_a_hint_is_one_line(monkeypatch, capsys):
+    assert run_failing(monkeypatch, PoolNotFound("there is no pool `a`")) == 1
+    assert capsys.readouterr().err == "error: there is no pool `a`\n"
+
+
+def test_a_defect_of_ours_keeps_its_trace(monkeypatch):
+    """Anything but a `FogftError` is not caught."""
+    with pytest.raises(ZeroDivisionError):
+        run_failing(monkeypatch, ZeroDivisionError("defect"))
+
+
+def test_a_broken_pipe_that_is_not_stdout_is_a_defect_of_ours(monkeypatch):
+    """Only a closed stdout is excused: a socket that breaks must not end us in silence."""
+    with pytest.raises(BrokenPipeError):
+        run_failing(monkeypatch, BrokenPipeError("a socket"))
+
+
+def test_an_interrupt_is_one_line_and_130(monkeypatch, capsys):
+    assert run_failing(monkeypatch, KeyboardInterrupt()) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_version_is_data(capsys):
+    assert main.run(["--version"]) == 0
+    said = capsys.readouterr()
+    assert said.out == "fogft 0.1.0\n"
+    assert said.err == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["frobnicate"], "no such command 'frobnicate'"),
+        (["scale"], "missing command"),
+        (["scale", "up"], "missing argument 'N'"),
+        (["scale", "up", "0"], "invalid value for 'N': "),
+        (["drain", "-1"], "no such option: -1"),
+        (["status", "--josn"], "no such option: --josn"),
+        (["proxy"], "missing option '--config' / '-c'"),
+    ],
+)
+def test_wrong_usage_is_2_with_a_way_to_help(arguments, message, capsys):
+    assert main.run(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.lower().startswith(f"error: {message}".lower())
+    assert "\n\nhint: see `fogft" in said.err
+    assert said.err.endswith("--help`\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "hint"),
+    [
+        (["drain", "2.1"], "'SLOT': must be a whole number", "the slot of replica `2.1` is 2"),
+        (["logs", "manager"], "'SLOT': must be a whole number", "see `fogft logs --help`"),
+        (["scale", "up", "99"], "'N': must be less than or equal to 64", "see `fogft scale up"),
+        (["up", "--timeout", "x"], "'--timeout': must be a number", "see `fogft up --help`"),
+    ],
+)
+def test_a_wrong_value_is_told_in_our_words(arguments, message, hint, capsys):
+    assert main.run(arguments) == 2
+    said = capsys.readouterr().err
+    assert f"error: invalid value for {message}\n" in said
+    assert hint in said
+
+
+def test_no_command_shows_the_help_as_wrong_usage(capsys):
+    assert main.run([]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("Usage: fogft")
+
+
+def test_a_reader_that_left_gets_no_trace():
+    """``fogft --help | head -0`` says nothing on stderr."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-m", "fogft", "--help"],
+            stdout=writing,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    finally:
+        os.close(writing)
+    assert ended.stderr == ""
+    assert ended.returncode == 141
+
+
+def test_control_c_while_it_waits_is_one_line(tmp_path):
+    """A real SIGINT to a real process: one line, status 130, no trace."""
+    code = (
+        "import time; from fogft import app; from fogft.cli import main\n"
+        "app.pool_name = lambda name: (print('waiting', flush=True), time.sleep(60))\n"
+        "main.main(['drain', '0'])"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "waiting\n"
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=30)
+    assert stderr == "interrupted\n"
+    assert process.returncode == 130

@@ -1,0 +1,85 @@
+"""Commands that go on until they are interrupted, or until nobody reads them any more."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+from fogft import disk
+from tests.cli.pools import STATUS, lay_down
+
+
+@contextmanager
+def going_on(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a command in the background; it is over at the end."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "fogft", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def interrupted(process: subprocess.Popen[str]) -> bool:
+    """Interrupt a command; return whether it ended as it should."""
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    return (stderr, process.returncode) == ("interrupted\n", 130)
+
+
+def test_logs_are_followed(home):
+    paths = lay_down(home)
+    paths.manager_log.write_text("one\ntwo\n")
+    with going_on("logs", "-f", "-n", "1") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "manager  two\n"
+        with paths.manager_log.open("a") as log:
+            log.write("three\n")
+        assert process.stdout.readline() == "manager  three\n"
+        paths.proxy_log.write_text("a log that was not there before\n")
+        assert process.stdout.readline() == "proxy    a log that was not there before\n"
+        assert interrupted(process)
+
+
+def test_a_watched_status_is_said_again_and_again(home):
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock), going_on("status", "--watch", "--json") as process:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["ready"] == 1
+        disk.write_json(paths.status, replace(STATUS, ready=3).to_json())
+        while json.loads(process.stdout.readline())["ready"] != 3:
+            pass
+        assert interrupted(process)
+
+
+def test_a_watch_ends_with_its_pool(home):
+    paths = lay_down(home)
+    with going_on("status", "--watch") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("planner  1 of 3 ready")
+        paths.status.unlink()
+        paths.identity.unlink()
+        _, stderr = process.communicate(timeout=30)
+    assert stderr.startswith("error: there is no pool `planner`")
+    assert process.returncode == 1
+
+
+def test_a_reader_that_leaves_ends_it_without_a_trace(home):
+    """``fogft status --watch | head -1``."""
+    lay_down(home)
+    with going_on("status", "--watch") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("planner  1 of 3 ready")
+        process.stdout.close()
+        assert process.wait(30) == 141
+        assert process.stderr is not None
+        assert process.stderr.read() == ""

@@ -1,0 +1,195 @@
+"""What ``fogft status`` shows, to a person and to a program."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+from dataclasses import fields, replace
+
+import pytest
+
+from fogft import disk
+from fogft.cli import main
+from fogft.cli.status_text import age, milliseconds, number
+from fogft.pool.status import PoolStatus
+from tests.cli.pools import FILE, STATUS, lay_down
+
+SCREEN = """\
+planner  1 of 3 ready  $0.063/h on local  seen 0.4 s ago
+
+REPLICA  PHASE     LOCATION                $/H  LINK            RTT    WON    AGE
+0.1      ready     local/us-west-2/a     0.021  up          0.42 ms  1 412  7 min
+1.12     starting  local/eu-central-1/b  0.020  connecting        -      0  4.2 s
+         `/plan` is not up yet
+2.3      draining  local/us-west-2/a     0.021  suspect      1.25 s      7   26 h
+         silent for 17 s, and so it is replaced by another one elsewhere
+
+SERVICE  READY  REQUESTS  ANSWERED  UNANSWERED   LATE  WAITING      P50     P99
+/plan        1     1 424     1 419           5  2 801        2  21.3 ms  148 ms
+
+note: waiting after 3 failed launches (capacity)
+"""
+
+
+def without_age(screen: str) -> str:
+    """Return a screen with the one thing in it that depends on the clock made the same."""
+    return re.sub(r"seen 0\.\d s ago", "seen 0.4 s ago", screen)
+
+
+def test_the_screen_at_100_columns(home, capsys):
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        assert main.run(["status"]) == 0
+    said = capsys.readouterr()
+    assert without_age(said.out) == SCREEN
+    assert said.err == ""
+
+
+def test_a_pipe_gets_one_line_for_each_replica(home, capsys, monkeypatch):
+    """Nothing is cut or broken into lines for a reader that is a program."""
+    monkeypatch.delenv("COLUMNS")
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        main.run(["status"])
+    rows = [line for line in capsys.readouterr().out.splitlines() if re.match(r"\d+\.\d+ ", line)]
+    assert [row.split()[0] for row in rows] == ["0.1", "1.12", "2.3"]
+    assert rows[1].endswith("4.2 s  `/plan` is not up yet")
+
+
+def test_json_is_the_managers_status_with_two_keys_more(home, capsys):
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        assert main.run(["status", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert set(said) == {f.name for f in fields(PoolStatus)} | {"age_s", "manager_alive"}
+    assert said["manager_alive"] is True
+    assert 0.4 <= said["age_s"] < 60
+    assert said["replicas"][0] == json.loads(paths.status.read_text())["replicas"][0]
+
+
+def test_a_dead_manager_is_told_twice(home, capsys):
+    """In the data, for whoever reads it alone, and as a warning with what to do."""
+    lay_down(home)
+    assert main.run(["status"]) == 0
+    said = capsys.readouterr()
+    assert "NO MANAGER" in said.out
+    assert said.err == (
+        "warning: no manager runs: requests go on, but nothing that is lost is replaced\n\n"
+        f"hint: start it with `fogft up {FILE}`, or end it with `fogft down`\n"
+    )
+
+
+def test_a_manager_that_hangs_is_told(home, capsys):
+    paths = lay_down(home, age_s=40)
+    with disk.locked(paths.manager_lock):
+        main.run(["status"])
+    assert "the manager has not looked for 40 s" in capsys.readouterr().err
+
+
+def test_what_sounds_alarm_stands_in_the_first_line(home, capsys):
+    status = replace(STATUS, proxy_alive=False, uplink_suspected=True, stopping=True)
+    lay_down(home, status)
+    main.run(["status"])
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.endswith("NO MANAGER  NO CLIENT PROXY  UPLINK SUSPECTED  ENDING")
+
+
+def test_a_pool_that_nobody_looked_at_yet_has_the_same_schema(home, capsys):
+    lay_down(home, None)
+    assert main.run(["status", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert set(said) == {f.name for f in fields(PoolStatus)} | {"age_s", "manager_alive"}
+    assert said["age_s"] is None
+    main.run(["status"])
+    assert "not observed yet" in capsys.readouterr().out
+
+
+def test_a_status_of_another_version_is_an_error(home, capsys):
+    paths = lay_down(home)
+    paths.status.write_text('{"pool": "planner", "replicas": [], "services": []}')
+    assert main.run(["status"]) == 1
+    assert capsys.readouterr().err.startswith("error: not a status: ")
+
+
+def test_which_pool_is_meant_must_be_clear(home, capsys):
+    assert main.run(["status"]) == 1
+    assert "error: there is no pool here\n\nhint: start one" in capsys.readouterr().err
+    for name in ("planner", "detector"):
+        lay_down(home, replace(STATUS, pool=name))
+    assert main.run(["status"]) == 1
+    assert "there are 2 pools: `detector`, `planner`" in capsys.readouterr().err
+    assert main.run(["status", "detector"]) == 0
+    assert capsys.readouterr().out.startswith("detector  ")
+    assert main.run(["status", "planer"]) == 1
+    assert "there is no pool `planer`" in capsys.readouterr().err
+
+
+def on_a_terminal(home, **environ: str) -> str:
+    """Return what ``fogft status`` sends to a terminal of 100 columns."""
+    leader, follower = pty.openpty()
+    try:
+        subprocess.run(
+            [sys.executable, "-m", "fogft", "status"],
+            stdin=follower,
+            stdout=follower,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", **environ},
+            check=True,
+        )
+    finally:
+        os.close(follower)
+    sent = b""
+    try:
+        while chunk := os.read(leader, 65536):
+            sent += chunk
+    except OSError:  # the terminal has no more
+        pass
+    os.close(leader)
+    return sent.decode()
+
+
+def test_a_terminal_gets_colour_unless_it_wants_none(home):
+    paths = lay_down(home, age_s=0.0)
+    with disk.locked(paths.manager_lock):
+        assert "\033[32mready" in on_a_terminal(home)
+        for environ in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
+            plain = on_a_terminal(home, **environ)
+            assert "\033" not in plain
+            assert "0.1      ready" in plain
+
+
+def test_colour_moves_nothing(home, capsys):
+    """The coloured screen without its codes is the plain one."""
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        coloured = on_a_terminal(home).replace("\r\n", "\n")
+    stripped = re.sub(r"\033\[[0-9;]*m", "", coloured)
+    lines = [
+        line.rstrip() for line in re.sub(r"seen \S+ s ago", "seen 0.4 s ago", stripped).splitlines()
+    ]
+    assert lines == SCREEN.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.04, "0.0 s"), (9.9, "9.9 s"), (42, "42 s"), (150, "2 min"), (3900, "1 h 5 min"),
+     (36_000, "10 h"), (90_000, "25 h"), (200_000, "2 d")],
+)  # fmt: skip
+def test_ages(seconds, text):
+    assert age(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "-"), (0.00042, "0.42 ms"), (0.0123, "12.3 ms"), (0.5, "500 ms"), (1.2, "1.20 s")],
+)
+def test_milliseconds(seconds, text):
+    assert milliseconds(seconds) == text
+
+
+def test_thousands():
+    assert number(1234567) == "1 234 567"

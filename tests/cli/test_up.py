@@ -1,0 +1,309 @@
+"""What ``fogft up`` says before, while and after it starts a pool, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fogft import app, disk
+from fogft.cli import main, progress
+from fogft.cli.lifecycle import is_answering
+from fogft.core.errors import FogftError
+from fogft.pool.seen import Seen
+from tests.cli.pools import REPLICA, SPEC, STATUS, lay_down
+
+POOL = SPEC + "resources: {infra: local/us-west-2, use_spot: true}\n"
+STARTING = replace(REPLICA, phase="starting", link="connecting", detail="`/plan` is not up yet")
+UP = replace(STATUS, notes=(), replicas=(REPLICA,), target=1, observed_at=1e12)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """A pool file for the local cloud."""
+    path = tmp_path / "pool.yaml"
+    path.write_text(POOL)
+    return path
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch):
+    """Have `up` start nothing and see one status after the other."""
+
+    def script(*statuses: object, started: bool = True) -> None:
+        left = iter(statuses)
+
+        def look(_: str) -> Seen:
+            status = next(left)
+            return status if isinstance(status, Seen) else Seen(status, 0.1, True)
+
+        monkeypatch.setattr(app, "start", lambda _: started)
+        monkeypatch.setattr(app, "status", look)
+        monkeypatch.setattr(progress, "LOOK_EVERY_S", 0.0)
+
+    return script
+
+
+def test_it_says_what_it_will_do_each_change_and_how_it_ended(file, looks, capsys):
+    waiting = replace(UP, ready=0, services=(replace(UP.services[0], ready_replicas=0),))
+    looks(
+        replace(waiting, replicas=(), services=()),
+        replace(waiting, replicas=(replace(STARTING, phase="provisioning", detail=""),)),
+        replace(waiting, replicas=(STARTING,)),
+        replace(waiting, replicas=(STARTING,)),
+        replace(UP, target=3),
+    )
+    assert main.run(["up", str(file)]) == 0
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.splitlines() == [
+        "pool `planner`: 3 replicas on `local`",
+        "  0  local/us-west-2/a  cpu4  $0.066/h",
+        "  1  local/us-west-2/b  cpu4  $0.069/h",
+        "  2  local/us-west-2/a  cpu4  $0.066/h",
+        "  together $0.201/h",
+        "0.1  provisioning at local/us-west-2/a",
+        "0.1  starting",
+        "0.1  `/plan` is not up yet",
+        "0.1  ready",
+        "done: `planner` answers, with 1 of 3 replicas ready; "
+        "2 more in preparation, see `fogft status`",
+    ]
+
+
+def test_a_replica_that_is_lost_meanwhile_is_told(file, looks, capsys):
+    other = replace(REPLICA, slot=1)
+    looks(replace(UP, proxy_alive=False, notes=("no capacity",)), replace(UP, replicas=(other,)))
+    assert main.run(["up", str(file)]) == 0
+    lines = capsys.readouterr().err.splitlines()[5:]
+    assert lines == [
+        "0.1  ready at local/us-west-2/a",
+        "note: no capacity",
+        "1.1  ready at local/us-west-2/a",
+        "0.1  gone",
+        "done: `planner` answers, with 1 of 1 replicas ready",
+    ]
+
+
+def test_it_gives_up_with_the_reason_and_says_what_still_runs(home, file, looks, capsys):
+    paths = lay_down(home)
+    paths.proxy_log.write_text("first\nlast words\n")
+    silent = replace(UP.services[0], ready_replicas=0)
+    never = replace(
+        UP, proxy_alive=False, services=(silent,), replicas=(STARTING,), notes=("no capacity",)
+    )
+    looks(*[never] * 1_000_000)
+    assert main.run(["up", str(file), "--timeout", "1"]) == 1
+    assert capsys.readouterr().err.endswith(
+        "error: `/plan` of `planner` does not answer after 1 s\n"
+        "  no capacity\n"
+        "  replica 0.1: `/plan` is not up yet\n"
+        "the end of the log of `proxy`:\n"
+        "  first\n"
+        "  last words\n"
+        "\n"
+        "hint: the manager goes on trying: see `fogft status` and `fogft logs`; "
+        "`fogft down planner` ends it\n"
+    )
+
+
+def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, capsys):
+    lay_down(home).manager_log.write_text("its last words\n")
+    looks(Seen(STATUS, 0.1, False))
+    assert main.run(["up", str(file)]) == 1
+    assert "error: the manager of `planner` has ended:\nits last words\n" in capsys.readouterr().err
+
+
+def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
+    looks()
+
+    def interrupt(_: str) -> Seen:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(app, "status", interrupt)
+    assert main.run(["up", str(file)]) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "interrupted: `planner` goes on starting; `fogft down planner` ends it"
+
+
+@pytest.mark.parametrize(
+    ("status", "answers"),
+    [
+        (UP, True),
+        (replace(UP, observed_at=9.0), False),  # seen before the file was applied
+        (replace(UP, proxy_alive=False), False),
+        (replace(UP, services=()), False),  # the manager has not read the new file
+        (replace(UP, services=(replace(UP.services[0], ready_replicas=0),)), False),
+        (replace(UP, services=(*UP.services, replace(UP.services[0], name="/old"))), False),
+    ],
+)
+def test_when_a_pool_answers(status, answers):
+    assert is_answering(Seen(status, 0.1, True), {"/plan"}, since=10.0) is answers
+
+
+# --- what is refused, and changes nothing
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (POOL.replace("local/us-west-2", "local/mars"), "7: resources.infra: the local cloud has"),
+        (
+            POOL.replace("local/us-west-2", "aws"),
+            "7: resources.infra: cloud `aws` is not supported",
+        ),
+        (POOL.replace("GetPlan", "GetPlam"), "6: fogft.services[0].type: "),
+        (POOL.replace("replicas", "replica"), "4: fogft.replica: "),
+    ],
+)
+def test_a_mistake_is_told_with_file_line_and_key(home, file, wrong, message, capsys):
+    file.write_text(wrong)
+    assert main.run(["up", str(file)]) == 1
+    said = capsys.readouterr()
+    assert said.err.startswith(f"error: {file}:{message}"), said.err
+    assert "\n\nhint: " in said.err
+    assert list(home.iterdir()) == []
+
+
+def test_a_file_that_is_not_there(home, capsys):
+    assert main.run(["up", "no.yaml"]) == 1
+    assert capsys.readouterr().err.startswith("error: no.yaml: no such file\n\nhint: ")
+    assert list(home.iterdir()) == []
+
+
+def test_a_file_for_another_cloud_can_be_tried_here(file, looks, capsys):
+    file.write_text(POOL.replace("local/us-west-2", "aws/us-west-2"))
+    looks(UP)
+    assert main.run(["up", str(file), "--cloud", "local"]) == 0
+    assert "  0  local/us-west-2/a" in capsys.readouterr().err
+    assert main.run(["up", str(file), "--cloud", "aws"]) == 1
+    assert capsys.readouterr().err == (
+        "error: cloud `aws` is not supported yet\n\nhint: supported: `local`\n"
+    )
+
+
+def test_a_changed_file_is_told_in_words(home, file, looks, capsys):
+    lay_down(home)
+    file.write_text(POOL.replace("replicas: 3", "replicas: 2").replace("_service", "_node"))
+    looks(UP)
+    assert main.run(["up", str(file)]) == 0
+    assert capsys.readouterr().err.splitlines()[:5] == [
+        "pool `planner` changes:",
+        "  `run`: python3 planner_service.py -> python3 planner_node.py",
+        "  `resources` added",
+        "  `replicas`: 3 -> 2",
+        "  so its replicas are replaced one after the other, new before old",
+    ]
+
+
+def test_the_same_file_changes_nothing(home, file, looks, capsys):
+    lay_down(home)
+    file.write_text(SPEC)
+    looks(UP, started=False)
+    assert main.run(["up", str(file)]) == 0
+    first, _, last = capsys.readouterr().err.splitlines()
+    assert first == "pool `planner` is as its file says; nothing changes"
+    assert last == "done: `planner` answers, with 1 of 1 replicas ready"
+
+
+def test_up_again_gives_a_pool_its_manager_back(home, file, looks, capsys):
+    lay_down(home)
+    file.write_text(SPEC)
+    looks(UP)
+    assert main.run(["up", str(file)]) == 0
+    second = capsys.readouterr().err.splitlines()[1]
+    assert second == "it had no manager: one was started, and takes over what runs"
+
+
+# --- init and down
+
+
+def test_init_writes_an_example_and_says_how_to_go_on(tmp_path, capsys):
+    into = tmp_path / "mine"
+    assert main.run(["init", "planner", "--into", str(into)]) == 0
+    said = capsys.readouterr()
+    files = [Path(line) for line in said.out.splitlines()]
+    assert files[0] == into / "pool.yaml"
+    assert all(path.is_file() for path in files)
+    assert said.err == f"\nhint: look at `{files[0]}`, then run `fogft up {files[0]}`\n"
+    assert main.run(["init", "planner", "--into", str(into)]) == 1
+    assert "exist" in capsys.readouterr().err
+    assert main.run(["init", "planner", "--into", str(into), "--force"]) == 0
+
+
+@pytest.mark.parametrize("name", app.examples())
+def test_every_example_is_a_good_pool_file(tmp_path, name):
+    files = app.init(name, tmp_path / name)
+    preview = app.order(files[0]).preview
+    assert len(preview.launches) == preview.spec.replicas
+    assert preview.notes == ()
+
+
+def test_an_unknown_example_is_an_error(capsys):
+    assert main.run(["init", "planer"]) == 1
+    assert (
+        capsys.readouterr().err
+    ) == "error: there is no example `planer`\n\nhint: did you mean `planner`?\n"
+
+
+def test_down_with_nothing_there_is_done(capsys):
+    """It is safe to repeat."""
+    assert main.run(["down"]) == 0
+    assert capsys.readouterr().err == "nothing to end: there is no pool here\n"
+
+
+def test_down_ends_a_pool_whose_manager_is_dead(home, capsys):
+    paths = lay_down(home)
+    assert main.run(["down", "--yes"]) == 0
+    assert not paths.folder.exists()
+    assert capsys.readouterr().err.endswith("done: nothing of `planner` is left\n")
+    assert main.run(["down"]) == 0
+
+
+def test_down_of_another_name_is_a_mistake(home, capsys):
+    """A misspelt name must not look like success while the real pool goes on costing money."""
+    paths = lay_down(home)
+    assert main.run(["down", "planer"]) == 1
+    assert (
+        "error: there is no pool `planer`\n\nhint: there are: `planner`" in capsys.readouterr().err
+    )
+    assert paths.identity.exists()
+
+
+# --- logs
+
+
+def test_logs_of_manager_and_proxy(home, capsys):
+    paths = lay_down(home)
+    paths.manager_log.write_text("2026-01-01T00:00:01.000 INFO manager_started\n")
+    paths.proxy_log.write_text("2026-01-01T00:00:00.000 INFO proxy_started\n")
+    assert main.run(["logs"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "proxy    2026-01-01T00:00:00.000 INFO proxy_started",
+        "manager  2026-01-01T00:00:01.000 INFO manager_started",
+    ]
+
+
+def test_logs_of_a_slot_that_never_was(home, capsys):
+    lay_down(home)
+    assert main.run(["logs", "4"]) == 1
+    assert "no log of a replica in slot 4" in capsys.readouterr().err
+
+
+# --- refresh
+
+
+def test_refresh_without_a_manager_asks_the_cloud_and_says_so(home, capsys):
+    lay_down(home)
+    assert main.run(["status", "--refresh"]) == 0
+    said = capsys.readouterr()
+    assert "note: no manager runs: the cloud was asked directly" in said.out
+    assert said.out.startswith("planner  0 of 3 ready  $0.000/h on local  seen 0.0 s ago")
+
+
+def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        with pytest.raises(FogftError, match="did not look again"):
+            app.refresh("planner", limit_s=0.2)

@@ -1,0 +1,53 @@
+"""What every test may use: ROS domains of its own, and discovery that stays on this machine."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+# No test asserts wall-clock time; Hypothesis would, by default.
+hypothesis.settings.register_profile("fogft", deadline=None)
+hypothesis.settings.load_profile("fogft")
+
+# Set before any test imports rclpy; child processes inherit it.
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+DOMAINS = range(60, 101)  # above 101 the ports of a domain reach Linux's ephemeral ones
+
+
+def _lock_domain(taken: dict[int, int]) -> int:
+    """Lock a free domain id against this user's other test runs; its descriptor goes to `taken`."""
+    folder = Path(tempfile.gettempdir()) / f"fogft-test-domains-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    start = os.getpid() % len(DOMAINS)
+    for domain in (*DOMAINS[start:], *DOMAINS[:start]):
+        descriptor = os.open(folder / str(domain), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            continue
+        taken[domain] = descriptor
+        return domain
+    pytest.fail("no ROS domain is free: do other test runs hang?")
+
+
+@pytest.fixture
+def ros_domains() -> Iterator[Callable[[], int]]:
+    """Hand out ROS domain ids that no other test has, until this test ends."""
+    taken: dict[int, int] = {}
+    yield lambda: _lock_domain(taken)
+    for descriptor in taken.values():
+        os.close(descriptor)
+
+
+@pytest.fixture
+def ros_domain(ros_domains: Callable[[], int]) -> int:
+    """Return a ROS domain id that no other test has, until this test ends."""
+    return ros_domains()

@@ -1,0 +1,368 @@
+"""The contract of links and listeners, on every implementation of `wire.port`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fogft.core.errors import WireError
+from fogft.core.model import LinkState, ReplicaId
+from fogft.wire.link_window import ATTEMPTS_LIMIT
+from fogft.wire.memory import MemoryWire
+from fogft.wire.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer, Refusal
+from fogft.wire.zenoh_link import ZenohDialer
+from fogft.wire.zenoh_listener import ZenohListener
+from tests.wire.wire_pool import (
+    LIMIT_S,
+    POOL_UID,
+    SERVICE,
+    Authority,
+    Owner,
+    keys,
+    peer,
+    request_id,
+)
+
+
+class MemoryWorld:
+    """The wire in memory, moved until what is awaited has come."""
+
+    def __init__(self) -> None:
+        self._wire = MemoryWire()
+        self._dialers: list[Dialer] = []
+
+    def listener(self, slot: int, generation: int, endpoint: str = "") -> Listener:
+        return self._wire.listener(ReplicaId(POOL_UID, slot, generation), endpoint)
+
+    def dialer(self, **options: object) -> Dialer:
+        return self._wire.dialer(**options)  # type: ignore[arg-type]
+
+    def wait_for(self, condition: Callable[[], object]) -> None:
+        for _ in range(1000):
+            self._wire.pump()
+            if condition():
+                return
+            self._wire.advance(0.05)
+        raise AssertionError("the awaited condition never came")
+
+    def settle(self) -> None:
+        self._wire.advance(1.0)
+
+    def close(self) -> None:
+        pass
+
+
+class ZenohWorld:
+    """Zenoh over loopback, both ends in this process."""
+
+    def __init__(self, folder: Path) -> None:
+        self._authority = Authority(folder)
+        self._made: list[Dialer | Listener] = []
+
+    def listener(self, slot: int, generation: int, endpoint: str = "127.0.0.1:0") -> Listener:
+        files = self._authority.replica(slot, generation)
+        listener = ZenohListener(endpoint, files, ReplicaId(POOL_UID, slot, generation))
+        self._made.append(listener)
+        return listener
+
+    def dialer(self, **options: object) -> Dialer:
+        options = {"robot": "robot", **options}
+        files = self._authority.robot(str(options["robot"]))
+        dialer = ZenohDialer(files, pool_uid=POOL_UID, **options)  # type: ignore[arg-type]
+        self._made.append(dialer)
+        return dialer
+
+    def wait_for(self, condition: Callable[[], object]) -> None:
+        end = time.monotonic() + LIMIT_S
+        while not condition():
+            assert time.monotonic() < end, "the awaited condition never came"
+            time.sleep(0.002)
+
+    def settle(self) -> None:
+        """Give what must not happen a moment in which it could."""
+        time.sleep(0.2)
+
+    def close(self) -> None:
+        for made in self._made:
+            made.close()
+
+
+World = MemoryWorld | ZenohWorld
+
+
+@pytest.fixture(params=["memory", "zenoh"])
+def world(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[World]:
+    made: World = MemoryWorld() if request.param == "memory" else ZenohWorld(tmp_path)
+    yield made
+    made.close()
+
+
+class Replica:
+    """A listener with a service that a test answers by hand, or at once with an echo."""
+
+    def __init__(self, listener: Listener, *, slot: int = 0, generation: int = 1) -> None:
+        self.listener = listener
+        self.requests: list[Incoming] = []
+        self.probes: list[Probe] = []
+        self.echo = False
+        self.answer = ProbeAnswer(slot, generation, "first", frozenset({SERVICE}))
+        listener.serve(keys(slot), self._request, self._probe)
+
+    def _request(self, incoming: Incoming) -> None:
+        self.requests.append(incoming)
+        if self.echo:
+            incoming.reply(incoming.payload)
+
+    def _probe(self, probe: Probe) -> ProbeAnswer:
+        self.probes.append(probe)
+        return self.answer
+
+
+@pytest.fixture
+def replica(world: World) -> Replica:
+    return Replica(world.listener(0, 1))
+
+
+@pytest.fixture
+def owner() -> Owner:
+    return Owner()
+
+
+@pytest.fixture
+def link(world: World, replica: Replica, owner: Owner) -> Link:
+    """A link that is up."""
+    made = world.dialer().dial(peer(replica.listener.endpoint), keys(0), owner)
+    world.wait_for(lambda: made.usable)
+    return made
+
+
+def test_a_link_is_connecting_until_its_first_probe_is_answered(world: World, owner: Owner) -> None:
+    listener = world.listener(0, 1)
+    link = world.dialer().dial(peer(listener.endpoint), keys(0), owner)
+    assert link.status().state is LinkState.CONNECTING
+    assert not link.usable
+    assert link.ready == frozenset()
+    assert not link.offer(SERVICE, request_id(1), b"", 1.0)
+    replica = Replica(listener)
+    world.wait_for(lambda: link.usable)
+    status = link.status()
+    assert status.state is LinkState.UP
+    assert status.probe_answer == replica.answer
+    assert link.ready == {SERVICE}
+    assert status.detail == ""
+    assert owner.changes > 0
+
+
+def test_a_request_gets_its_answer_once(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    assert link.offer(SERVICE, request_id(7), b"question", 5.0)
+    world.wait_for(lambda: replica.requests)
+    incoming = replica.requests[0]
+    assert (incoming.service, incoming.request_id) == (SERVICE, request_id(7))
+    assert (incoming.robot, incoming.payload) == ("robot", b"question")
+    assert 0 < incoming.remaining_s <= 5.0
+    incoming.reply(b"answer")
+    incoming.reply(b"another")
+    incoming.refuse(Refusal.CRASHED)
+    world.wait_for(lambda: owner.answers)
+    world.settle()
+    assert len(owner.answers) == 1
+    answer = owner.answers[0][1]
+    assert (answer.payload, answer.refusal, answer.service) == (b"answer", "", SERVICE)
+    assert link.status().in_flight == 0
+
+
+@pytest.mark.parametrize("reason", [Refusal.NOT_READY, Refusal.OVERLOADED, Refusal.CRASHED])
+def test_a_refusal_arrives_with_its_reason(
+    world: World, replica: Replica, link: Link, owner: Owner, reason: str
+) -> None:
+    link.offer(SERVICE, request_id(1), b"", 5.0)
+    world.wait_for(lambda: replica.requests)
+    replica.requests[0].refuse(reason)
+    world.wait_for(lambda: owner.answers)
+    assert [(a.payload, a.refusal) for a in owner.of(1)] == [(None, reason)]
+
+
+def test_answers_come_back_in_any_order_to_their_own_requests(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    for number in range(50):
+        assert link.offer(SERVICE, request_id(number), b"", 5.0)
+    world.wait_for(lambda: len(replica.requests) == 50)
+    for incoming in reversed(replica.requests):
+        incoming.reply(b"for " + incoming.request_id)
+    world.wait_for(lambda: len(owner.answers) == 50)
+    for number in range(50):
+        assert [a.payload for a in owner.of(number)] == [b"for " + request_id(number)]
+
+
+def test_an_unknown_service_is_not_taken(link: Link) -> None:
+    assert not link.offer("/other", request_id(1), b"", 1.0)
+
+
+def test_an_open_request_is_not_taken_twice(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    assert link.offer(SERVICE, request_id(1), b"a", 5.0)
+    assert not link.offer(SERVICE, request_id(1), b"a", 5.0)
+    world.wait_for(lambda: replica.requests)
+    replica.requests[0].reply(b"")
+    world.wait_for(lambda: owner.answers)
+    assert link.offer(SERVICE, request_id(1), b"a", 5.0)
+
+
+def test_a_full_window_says_no_and_later_tells_of_room(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    """However many are offered, no more are taken than the window holds; none blocks."""
+    taken = [link.offer(SERVICE, request_id(n), b"", 60.0) for n in range(ATTEMPTS_LIMIT + 20)]
+    assert taken == [True] * ATTEMPTS_LIMIT + [False] * 20
+    assert link.usable
+    assert link.status().in_flight == ATTEMPTS_LIMIT
+    world.wait_for(lambda: len(replica.requests) == ATTEMPTS_LIMIT)
+    changes = owner.changes
+    for incoming in replica.requests:
+        incoming.reply(b"")
+    world.wait_for(lambda: len(owner.answers) == ATTEMPTS_LIMIT)
+    world.wait_for(lambda: owner.changes > changes)
+    assert link.offer(SERVICE, request_id(9999), b"", 1.0)
+
+
+def test_a_forgotten_request_frees_its_room_and_its_answer_is_dropped(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    link.offer(SERVICE, request_id(1), b"12345", 5.0)
+    assert link.status().in_flight_bytes == 5
+    world.wait_for(lambda: replica.requests)
+    link.forget(request_id(1))
+    link.forget(request_id(2))
+    assert (link.status().in_flight, link.status().in_flight_bytes) == (0, 0)
+    replica.requests[0].reply(b"late")
+    link.offer(SERVICE, request_id(3), b"", 5.0)
+    world.wait_for(lambda: len(replica.requests) == 2)
+    replica.requests[1].reply(b"")
+    world.wait_for(lambda: owner.of(3))
+    world.settle()
+    assert owner.of(1) == []
+
+
+def test_an_attempt_whose_time_is_up_is_lost(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    link.offer(SERVICE, request_id(1), b"", 0.3)
+    world.wait_for(lambda: owner.answers)
+    assert [(a.payload, a.refusal) for a in owner.of(1)] == [(None, Refusal.LOST)]
+    assert link.usable
+
+
+def test_a_request_that_the_replica_forgets_is_lost_at_once(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    """Long before its time is up: another replica may be asked meanwhile."""
+    link.offer(SERVICE, request_id(1), b"", 3600.0)
+    world.wait_for(lambda: replica.requests)
+    replica.requests.clear()
+    world.wait_for(lambda: owner.answers)
+    assert [(a.payload, a.refusal) for a in owner.of(1)] == [(None, Refusal.LOST)]
+
+
+def test_when_the_replica_dies_its_attempts_are_lost_and_a_new_one_is_found(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    link.offer(SERVICE, request_id(1), b"", 60.0)
+    world.wait_for(lambda: replica.requests)
+    replica.listener.close()
+    world.wait_for(lambda: owner.answers)
+    world.wait_for(lambda: not link.usable)
+    assert [a.refusal for a in owner.of(1)] == [Refusal.LOST]
+    assert link.status().state is LinkState.SUSPECT
+    assert link.ready == frozenset()
+    assert not link.offer(SERVICE, request_id(2), b"", 1.0)
+    again = Replica(world.listener(0, 1, replica.listener.endpoint))
+    again.echo = True
+    world.wait_for(lambda: link.usable)
+    assert link.offer(SERVICE, request_id(1), b"again", 5.0)
+    world.wait_for(lambda: len(owner.of(1)) == 2)
+    assert owner.of(1)[1].payload == b"again"
+    assert link.status().reopened == 1
+
+
+def test_silence_grows_while_nobody_is_there(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    assert link.status().silent_for_s < 1.0
+    replica.listener.close()
+    world.wait_for(lambda: link.status().silent_for_s > 0.3)
+    heard_age_s = link.status().heard_age_s
+    assert heard_age_s is not None
+    assert heard_age_s >= 0.3
+
+
+def test_a_closed_link_loses_what_is_open(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    link.offer(SERVICE, request_id(1), b"", 60.0)
+    world.wait_for(lambda: replica.requests)
+    link.close()
+    link.close()
+    world.wait_for(lambda: owner.answers)
+    replica.requests[0].reply(b"late")
+    world.settle()
+    assert [a.refusal for a in owner.of(1)] == [Refusal.LOST]
+    assert not link.usable
+    assert not link.offer(SERVICE, request_id(2), b"", 1.0)
+
+
+def test_what_a_probe_says_is_seen_on_the_link(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    replica.answer = ProbeAnswer(0, 1, "first", frozenset(), draining=True, detail="starts")
+    world.wait_for(lambda: link.draining)
+    assert link.ready == frozenset()
+    assert link.usable
+    probe_answer = link.status().probe_answer
+    assert probe_answer is not None
+    assert probe_answer.detail == "starts"
+
+
+def test_a_probe_tells_of_robot_and_manager(world: World, replica: Replica, owner: Owner) -> None:
+    dialer = world.dialer(robot="ada", manager_age=lambda: 4.5)
+    link = dialer.dial(peer(replica.listener.endpoint), keys(0), owner)
+    world.wait_for(lambda: link.usable)
+    assert replica.probes[-1] == Probe("ada", 4.5)
+
+
+@pytest.mark.parametrize("said", [(1, 1), (0, 2)], ids=["another slot", "another generation"])
+def test_a_replica_that_says_it_is_another_never_comes_up(
+    world: World, owner: Owner, said: tuple[int, int]
+) -> None:
+    replica = Replica(world.listener(0, 1))
+    replica.answer = ProbeAnswer(*said, "first", frozenset({SERVICE}))
+    link = world.dialer().dial(peer(replica.listener.endpoint), keys(0), owner)
+    words = f"says that it is {said[0]}.{said[1]}, not 0.1"
+    world.wait_for(lambda: words in link.status().detail)
+    assert not link.usable
+    assert link.status().state is LinkState.CONNECTING
+
+
+def test_another_generation_at_the_endpoint_is_not_talked_to(world: World, owner: Owner) -> None:
+    replica = Replica(world.listener(0, 2), generation=2)
+    link = world.dialer().dial(peer(replica.listener.endpoint, generation=1), keys(0), owner)
+    world.wait_for(lambda: "has the certificate of" in link.status().detail)
+    assert not link.usable
+    assert replica.probes == []
+
+
+def test_nobody_there_is_said_in_words(world: World, owner: Owner) -> None:
+    listener = world.listener(0, 1)
+    link = world.dialer().dial(peer(listener.endpoint), keys(0), owner)
+    world.wait_for(lambda: "connection refused" in link.status().detail)
+
+
+def test_two_listeners_cannot_have_one_endpoint(world: World, replica: Replica) -> None:
+    with pytest.raises(WireError, match="cannot listen"):
+        Replica(world.listener(0, 1, replica.listener.endpoint))

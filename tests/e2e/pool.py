@@ -1,0 +1,149 @@
+"""A whole pool of real processes, driven only through the command line, as a user would."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+NODES = Path(__file__).parent / "nodes"
+
+
+class Pool:
+    """A pool in its own FOGFT_HOME and ROS domain.
+
+    Args:
+        folder: Where everything of it lies.
+        domain: The robot's ROS domain.
+    """
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder = folder
+        self.file = folder / "pool.yaml"
+        self.environ = {
+            **os.environ,
+            "FOGFT_HOME": str(folder / "home"),
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "NO_COLOR": "1",
+        }
+        self.uids: set[str] = set()
+
+    def write(
+        self, *, replicas: int = 3, work_s: float = 0.005, more: str = "", task: str = ""
+    ) -> None:
+        """Write the pool file: `nav_msgs/srv/GetPlan` at `/plan`, answered after `work_s`."""
+        self.file.write_text(
+            "name: e2e\n"
+            "resources:\n"
+            "  any_of: [{infra: local/us-west-1}, {infra: local/us-west-2},"
+            " {infra: local/eu-central-1}]\n"
+            f"run: exec {sys.executable} {NODES}/plan_service.py {work_s}\n"
+            f"{task}"
+            "fogft:\n"
+            f"  replicas: {replicas}\n"
+            "  services:\n"
+            "    - {name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10.0}\n"
+            f"{more}"
+        )
+
+    def fogft(self, *words: str, ok: bool = True, limit_s: float = 120) -> str:
+        """Run a command; return its standard output."""
+        done = subprocess.run(
+            [sys.executable, "-m", "fogft", *words],
+            env=self.environ, cwd=self.folder, capture_output=True, text=True, timeout=limit_s,
+            check=False,
+        )  # fmt: skip
+        if ok:
+            assert done.returncode == 0, f"fogft {' '.join(words)}\n{done.stdout}\n{done.stderr}"
+        return done.stdout if ok else done.stdout + done.stderr
+
+    def status(self) -> dict[str, Any]:
+        """Return what `fogft status --json` says."""
+        status = json.loads(self.fogft("status", "--json"))
+        self.uids.add(status["uid"])
+        return status
+
+    def ready(self) -> int:
+        """Count the replicas that are ready."""
+        return sum(1 for r in self.status()["replicas"] if r["phase"] == "ready")
+
+    def wait(self, condition: Callable[[], Any], limit_s: float = 90) -> Any:
+        """Wait until a condition holds; return what it gave."""
+        end = time.monotonic() + limit_s
+        while True:
+            value = condition()
+            if value:
+                return value
+            assert time.monotonic() < end, f"waited {limit_s} s; status: {self.status()}"
+            time.sleep(0.2)
+
+    def up(self, *words: str) -> None:
+        """Start or change the pool and wait until it is whole."""
+        self.fogft("up", str(self.file), "--yes", *words)
+        wanted = self.status()["target"]
+        self.wait(lambda: self.ready() == wanted)
+
+    def client(self, seconds: float, rate_hz: float, limit_s: float = 12.0) -> Client:
+        """Start an ordinary rclpy client that asks for a while."""
+        return Client(self.environ, seconds, rate_hz, limit_s)
+
+    def processes(self) -> list[int]:
+        """Find the processes of this pool by what they carry in their environment."""
+        home = self.environ["FOGFT_HOME"].encode()
+        found = []
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdigit() and int(entry.name) != os.getpid():
+                try:
+                    if home in (entry / "environ").read_bytes():
+                        found.append(int(entry.name))
+                except OSError:
+                    continue
+        return found
+
+    def close(self) -> None:
+        """End the pool through the command line, and what is left of it by force."""
+        if (self.folder / "home" / "pools").exists():
+            self.fogft("down", ok=False)
+        for pid in self.processes():
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+
+
+class Client:
+    """A running plan_client.py."""
+
+    def __init__(self, environ: dict[str, str], seconds: float, rate: float, limit_s: float):
+        self._seconds = seconds + limit_s
+        self._process = subprocess.Popen(
+            [sys.executable, f"{NODES}/plan_client.py", str(seconds), str(rate), str(limit_s)],
+            env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            if line.startswith("asking"):
+                break
+
+    @property
+    def asking(self) -> bool:
+        return self._process.poll() is None
+
+    def finish(self) -> dict[str, Any]:
+        """Let it ask no more; return its summary once all is answered or given up."""
+        if self.asking:
+            self._process.send_signal(signal.SIGINT)
+        return self.result()
+
+    def result(self) -> dict[str, Any]:
+        """Wait for its end and return its summary."""
+        out, err = self._process.communicate(timeout=self._seconds + 30)
+        assert self._process.returncode == 0, err
+        return json.loads(out)

@@ -1,0 +1,116 @@
+"""The main job: a service goes on answering while its replicas die."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import time
+
+import pytest
+
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
+
+
+def flawless(result: dict) -> bool:
+    return result["failed"] == result["wrong"] == result["twice"] == 0
+
+
+@pytest.mark.parametrize("seed", [20261])
+def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
+    """30 s of requests under kills and freezes, one replica always spared at a time."""
+    pool.up()
+    client = pool.client(30, 25)
+    chance = random.Random(seed)
+    end = time.monotonic() + 26
+    faults = []
+    while time.monotonic() < end:
+        ready = [r["slot"] for r in pool.status()["replicas"] if r["phase"] == "ready"]
+        if len(ready) > 1:
+            slot, kind = chance.choice(ready), chance.choice(["kill", "freeze"])
+            pool.fogft("chaos", kind, str(slot))
+            faults.append((kind, slot))
+            if kind == "freeze" and chance.random() < 0.5:
+                time.sleep(chance.uniform(1, 4))
+                pool.fogft("chaos", "thaw", str(slot), ok=False)
+        time.sleep(chance.uniform(0.5, 2.0))
+    result = client.result()
+    assert {kind for kind, _ in faults} == {"kill", "freeze"}
+    assert result["requests"] > 500
+    assert flawless(result), (result, faults)
+    pool.wait(lambda: pool.ready() == 3)
+    pool.fogft("down")
+    assert pool.processes() == []
+
+
+def test_a_slow_service_is_never_taken_for_a_dead_one(pool):
+    """A service that thinks six times longer than the suspicion limit is left in peace."""
+    pool.write(
+        replicas=2, work_s=3.0, more="  health: {suspect_after_s: 0.5, replace_after_s: 1.0}\n"
+    )
+    pool.up()
+    before = {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
+    result = pool.client(6, 0.5, limit_s=20).result()
+    assert flawless(result)
+    after = pool.status()
+    assert {(r["slot"], r["generation"]) for r in after["replicas"]} == before
+    assert all(r["phase"] == "ready" for r in after["replicas"])
+
+
+def test_traffic_outlives_the_manager_and_the_next_one_adopts_the_pool(pool):
+    pool.write(replicas=2)
+    pool.up()
+    before = {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
+    client = pool.client(60, 20)
+    os.kill(pool.status()["manager_pid"], signal.SIGKILL)
+    time.sleep(1)
+    pool.fogft("up", str(pool.file), "--yes")
+    assert flawless(client.finish())
+    status = pool.wait(lambda: pool.status() if pool.ready() == 2 else None)
+    assert {(r["slot"], r["generation"]) for r in status["replicas"]} == before
+
+
+def test_a_changed_file_is_applied_without_losing_a_request(pool):
+    """A new `run` replaces every replica, new before old, under load."""
+    pool.write(replicas=2)
+    pool.up()
+    before = {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
+    client = pool.client(90, 20)
+    pool.write(replicas=2, work_s=0.006)
+    pool.up()
+    pool.wait(
+        lambda: not before & {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
+    )
+    assert flawless(client.finish())
+
+
+def test_scale_up_and_down_under_load(pool):
+    pool.write(replicas=1)
+    pool.up()
+    client = pool.client(60, 20)
+    pool.fogft("scale", "up", "2")
+    pool.wait(lambda: pool.ready() == 3)
+    pool.fogft("scale", "down", "2")
+    pool.wait(lambda: len(pool.status()["replicas"]) == 1 and pool.ready() == 1)
+    assert flawless(client.finish())
+
+
+def test_down_works_when_everything_but_the_replicas_is_dead(pool):
+    pool.write(replicas=2)
+    pool.up()
+    status = pool.status()
+    for pid in (status["manager_pid"], status["proxy_pid"]):
+        os.kill(pid, signal.SIGKILL)
+    pool.fogft("down")
+    assert pool.processes() == []
+    pool.fogft("down", ok=False)
+
+
+def test_replicas_without_a_manager_end_themselves(pool):
+    """Whatever became of the manager, nothing runs and costs for ever."""
+    pool.write(replicas=1, more="  orphan_after_s: 3\n")
+    pool.up()
+    status = pool.status()
+    os.kill(status["manager_pid"], signal.SIGKILL)
+    pool.wait(lambda: len(pool.processes()) <= 1)  # the client proxy lives on
+    assert pool.processes() == [status["proxy_pid"]]

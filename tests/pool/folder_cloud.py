@@ -1,0 +1,75 @@
+"""A cloud whose machines are files, so that managers can be killed and others take over."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.port import Launch
+from fogft.core.errors import CloudUnreachable
+from fogft.core.model import Machine, MachinePhase, Offer, Placement, ReplicaId
+
+ZONES = [Placement("folder", region, "a", "m1") for region in ("one", "two", "three")]
+
+
+class FolderCloud:
+    """Implements `fogft.cloud.port.Cloud`; the file `outage` makes it unreachable."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        return [Offer(zone, 0.1) for zone in ZONES]
+
+    def machines(self, pool_uid: str) -> Sequence[Machine]:
+        self._reach()
+        found = [self._read(path) for path in self.folder.glob(f"{pool_uid}-*.json")]
+        return sorted(found, key=lambda m: m.id)
+
+    def launch(self, order: Launch) -> None:
+        self._reach()
+        with (self.folder / "launched").open("a") as log:
+            log.write(f"{order.id.short}\n")
+        value = {
+            "id": [order.id.pool_uid, order.id.slot, order.id.generation],
+            "region": order.placement.region,
+            "hash": order.spec_hash,
+            "at": time.time(),
+            "files": sorted(order.files),
+        }
+        partial = self.folder / f".{order.id}"
+        partial.write_text(json.dumps(value))
+        partial.rename(self.folder / f"{order.id}.json")
+
+    def terminate(self, id: ReplicaId) -> None:
+        self._reach()
+        (self.folder / f"{id}.json").unlink(missing_ok=True)
+
+    def log(self, id: ReplicaId) -> str | None:
+        return None
+
+    def launched(self) -> list[str]:
+        """Return every launch ever ordered, as ``slot.generation``."""
+        log = self.folder / "launched"
+        return log.read_text().split() if log.exists() else []
+
+    def _reach(self) -> None:
+        if (self.folder / "outage").exists():
+            raise CloudUnreachable("told to be")
+
+    def _read(self, path: Path) -> Machine:
+        value = json.loads(path.read_text())
+        id = ReplicaId(*value["id"])
+        return Machine(
+            id=id,
+            placement=Placement("folder", value["region"], "a", "m1"),
+            phase=MachinePhase.RUNNING,
+            launched_at=value["at"],
+            endpoint=f"127.0.0.1:{1000 + id.slot * 100 + id.generation}",
+            usd_per_hour=0.1,
+            spec_hash=value["hash"],
+        )

@@ -1,0 +1,106 @@
+"""A pool in a temporary home, over the folder cloud, with managers as real processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.pool import pool_file, shutdown, startup
+from fogft.pool.paths import PoolPaths
+from fogft.pool.store import PoolStore
+from tests.pool.folder_cloud import FolderCloud
+
+FILE = """\
+name: pool
+run: exec ./serve
+fogft:
+  replicas: {replicas}
+  services:
+    - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: {timeout_s}}}
+"""
+
+
+def store_of(home: Path, name: str = "pool") -> PoolStore:
+    return PoolStore(
+        PoolPaths.of(name, home), lambda text, file: pool_file.parse(text, file=file), time.time
+    )
+
+
+def cloud_of(home: Path) -> FolderCloud:
+    return FolderCloud(home / "cloud")
+
+
+class Scene:
+    """What a test of whole processes needs; `close` ends every process it started."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        self.file = home / "pool.yaml"
+        self.store = store_of(home)
+        self.paths = self.store.paths
+        self.cloud = cloud_of(home)
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def write(self, *, replicas: int = 2, timeout_s: float = 5.0) -> startup.Written:
+        """Do what `up` does with files."""
+        source = FILE.format(replicas=replicas, timeout_s=timeout_s)
+        self.file.write_text(source)
+        spec = pool_file.read(self.file)
+        return startup.write(self.store, spec, source=source, file=self.file, cloud="folder")
+
+    def command(self, name: str = "pool") -> list[str]:
+        return [sys.executable, "-m", "tests.pool.manager_process", str(self.home), name]
+
+    def start_manager(self) -> subprocess.Popen[bytes]:
+        """Start a manager; it need not get into office."""
+        self.home.mkdir(exist_ok=True)
+        with (self.home / "manager-output").open("ab") as output:
+            process = subprocess.Popen(self.command(), stdout=output, stderr=output)
+        self._started.append(process)
+        return process
+
+    def status(self) -> dict[str, Any]:
+        return disk.read_json(self.paths.status) or {}
+
+    def running(self) -> list[str]:
+        """Return the machines that exist."""
+        return [m.id.short for m in self.cloud.machines(self.store.identity().uid)]
+
+    def wait(self, condition: Callable[[], Any], limit_s: float = 30.0) -> Any:
+        """Wait until a condition holds; return what it gave."""
+        end = time.monotonic() + limit_s
+        while True:
+            value = condition()
+            if value:
+                return value
+            assert time.monotonic() < end, (self.status(), self._output())
+            time.sleep(0.02)
+
+    def whole(self, count: int) -> bool:
+        """Whether the manager sees so many ready replicas and no others."""
+        seen = self.status()
+        return seen.get("ready") == count and len(seen["replicas"]) == count
+
+    def end(self) -> list[str]:
+        """Do what `down` does."""
+        return shutdown.end(self.store, lambda _: self.cloud, limit_s=5)
+
+    def _output(self) -> str:
+        path = self.home / "manager-output"
+        return path.read_text() if path.exists() else ""
+
+    def close(self) -> None:
+        for process in self._started:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        report = disk.read_json(self.paths.proxy_status) or {}
+        if disk.is_locked(self.paths.proxy_lock) and "pid" in report:
+            os.kill(report["pid"], signal.SIGKILL)

@@ -1,0 +1,67 @@
+"""`down` ends everything of a pool and nothing else, in whatever state the pool is."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from fogft import disk
+from fogft.cloud.port import Launch
+from fogft.core.errors import CloudUnreachable, PoolNotFound
+from fogft.core.model import ReplicaId
+from tests.pool.folder_cloud import ZONES
+from tests.pool.scene import Scene
+
+STRANGER = ReplicaId("f" * 16, 0, 1)
+
+
+def test_down_ends_all_and_leaves_the_stranger(scene: Scene) -> None:
+    """Manager, proxy, machines and folder go; another pool's machine stays."""
+    scene.cloud.launch(Launch(STRANGER, "other", ZONES[0], 0.1, ""))
+    scene.write(replicas=2)
+    manager = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    uid = scene.store.identity().uid
+    told = scene.end()
+    assert manager.wait(10) == 0
+    assert [line.split(" ")[0] for line in told] == ["manager", "client", "replica", "replica"]
+    assert not scene.cloud.machines(uid)
+    assert [m.id for m in scene.cloud.machines(STRANGER.pool_uid)] == [STRANGER]
+    assert not scene.paths.folder.exists()
+    with pytest.raises(PoolNotFound):
+        scene.end()
+
+
+def test_down_works_when_the_manager_is_dead_or_frozen(scene: Scene) -> None:
+    """Neither a dead nor a stopped manager keeps a pool alive."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    frozen = scene._started[0]
+    frozen.send_signal(signal.SIGSTOP)
+    told = scene.end()
+    frozen.wait(10)
+    assert "replica 0.1 (folder/one/a)" in told
+    assert not scene.paths.folder.exists()
+
+
+def test_down_without_manager_or_proxy(scene: Scene) -> None:
+    """A pool that was written and never started is ended too."""
+    scene.write()
+    assert scene.end() == []
+    assert not scene.paths.folder.exists()
+
+
+def test_down_can_be_repeated_after_an_outage(scene: Scene) -> None:
+    """While the cloud cannot tell, the pool's files stay, so that the next try finds all."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    (scene.cloud.folder / "outage").touch()
+    with pytest.raises(CloudUnreachable):
+        scene.end()
+    assert scene.store.intent().stopping
+    assert not disk.is_locked(scene.paths.manager_lock)
+    (scene.cloud.folder / "outage").unlink()
+    assert scene.end() == ["replica 0.1 (folder/one/a)"]

@@ -1,0 +1,225 @@
+"""Server proxies and client proxies as processes, started by hand: no manager, no cloud."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fogft.core import membership, names
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.pool import credentials
+
+UID = "0123456789abcdef"
+LIMIT_S = 60.0
+ROOT = Path(__file__).parents[2]
+SERVICE = ROOT / "tests/e2e/nodes/plan_service.py"
+SERVICES = "[{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 45.0}]"
+
+
+def wait_for(condition: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> Any:
+    """Return what a condition gave once it holds."""
+    end = time.monotonic() + limit_s
+    while not (found := condition()):
+        assert time.monotonic() < end, f"waited {limit_s:.0f} s in vain: {what}"
+        time.sleep(0.02)
+    return found
+
+
+class Parts:
+    """A pool without a manager: its folder, its certificates and its processes."""
+
+    def __init__(self, folder: Path, domain: Callable[[], int]) -> None:
+        self.folder = folder
+        self._domain = domain
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._version = 0
+        credentials.create_authority(folder / "ca", UID)
+
+    def replica(self, slot: int, work_s: float = 0.001) -> Replica:
+        return Replica(self, slot, work_s)
+
+    def robot(self, name: str, *replicas: Replica) -> Robot:
+        return Robot(self, name, replicas)
+
+    def issue(self, common_name: str, role: credentials.Role, stem: str) -> None:
+        made = credentials.issue(self.folder / "ca", common_name, role=role)
+        credentials.write(made, self.folder, stem)
+
+    def domain(self) -> int:
+        return self._domain()
+
+    def start(self, command: str, config: Path) -> subprocess.Popen[bytes]:
+        with config.with_suffix(".log").open("ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "fogft", command, "--config", str(config)],
+                cwd=ROOT, stdout=log, stderr=log,
+            )  # fmt: skip
+        self._processes.append(process)
+        return process
+
+    def next_version(self) -> int:
+        self._version += 1
+        return self._version
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.wait()
+
+
+class Replica:
+    """A server proxy with an ordinary service under it."""
+
+    def __init__(self, parts: Parts, slot: int, work_s: float) -> None:
+        self.id = ReplicaId(UID, slot, 1)
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.endpoint = f"127.0.0.1:{free.getsockname()[1]}"
+        parts.issue(names.replica_certificate_name(self.id), credentials.Role.REPLICA, f"r{slot}")
+        config = parts.folder / f"replica{slot}.yaml"
+        config.write_text(
+            f'pool: p\npool_uid: "{UID}"\nslot: {slot}\ngeneration: 1\n'
+            f"listen: {self.endpoint}\nservices: {SERVICES}\ndomain_id: {parts.domain()}\n"
+            f"run: exec {sys.executable} {SERVICE} {work_s}\n"
+            f"credentials: {{ca: ca/ca.crt, certificate: r{slot}.crt, key: r{slot}.key}}\n"
+        )
+        self.process = parts.start("serve", config)
+
+    def run_pid(self) -> int:
+        """Return the process id of the user's command."""
+
+        def find() -> int:
+            children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+            for pid in children.read_text().split():
+                if SERVICE.name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    return int(pid)
+            return 0
+
+        return int(wait_for(find, "the user's command"))
+
+
+class Robot:
+    """A client proxy."""
+
+    def __init__(self, parts: Parts, name: str, replicas: tuple[Replica, ...]) -> None:
+        self._parts = parts
+        self._members = parts.folder / f"{name}-members.json"
+        self._status = parts.folder / f"{name}-status.json"
+        self._config = parts.folder / f"{name}.yaml"
+        self.domain = parts.domain()
+        parts.issue(names.robot_certificate_name(UID, name), credentials.Role.ROBOT, name)
+        self._config.write_text(
+            f'pool: p\npool_uid: "{UID}"\nrobot: {name}\nmembership: {self._members.name}\n'
+            f"status: {self._status.name}\nlease: lease.json\nlock: {name}.lock\n"
+            f"credentials: {{ca: ca/ca.crt, certificate: {name}.crt, key: {name}.key}}\n"
+            f"services: {SERVICES}\ndomain_id: {self.domain}\n"
+        )
+        self.follow(*replicas)
+        self.process = parts.start("proxy", self._config)
+
+    def follow(self, *replicas: Replica) -> None:
+        """Write the membership, whole, as a manager would."""
+        members = tuple(Member(r.id, r.endpoint) for r in replicas)
+        wanted = Membership("p", UID, 1, self._parts.next_version(), members)
+        new = self._members.with_suffix(".new")
+        new.write_text(json.dumps(membership.to_dict(wanted)))
+        os.replace(new, self._members)
+
+    def restart(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._status.unlink()
+        self.process = self._parts.start("proxy", self._config)
+
+    def links(self) -> list[dict[str, Any]]:
+        try:
+            return list(json.loads(self._status.read_text())["links"])
+        except FileNotFoundError:
+            return []
+
+    def ready(self) -> list[int]:
+        """Return the slots that can answer now."""
+        return [link["slot"] for link in self.links() if link["ready"]]
+
+
+class Caller:
+    """An rclpy client that checks what it is answered.
+
+    It keeps all answers: one with the default quality of service would lose some whenever a
+    busy machine holds it up (`fogft.ros.pacing` makes that rare, and its tests say how rare).
+    """
+
+    def __init__(self, domain: int) -> None:
+        import rclpy
+        from nav_msgs.srv import GetPlan
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import HistoryPolicy, QoSProfile
+
+        self._type = GetPlan
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self._node = rclpy.create_node("caller", context=self._context)
+        keeps_all = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+        self._client = self._node.create_client(GetPlan, "/plan", qos_profile=keeps_all)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._asked = 0
+        self._open: set[int] = set()
+        self.right = 0
+        self.wrong: list[int] = []
+
+    def ask(self, count: int = 1) -> None:
+        """Ask, all at once; nothing is taken meanwhile."""
+        for _ in range(count):
+            self._asked += 1
+            number = self._asked
+            request = self._type.Request(tolerance=float(number))
+            request.start.pose.position.x = float(number)
+            self._open.add(number)
+            future = self._client.call_async(request)
+            future.add_done_callback(lambda done, number=number: self._answered(number, done))
+
+    def _answered(self, number: int, future: Any) -> None:
+        plan = future.result().plan
+        once = number in self._open
+        self._open.discard(number)
+        if once and plan.header.frame_id == f"{number}" and plan.poses[0].pose.position.x == number:
+            self.right += 1
+        else:
+            self.wrong.append(number)
+
+    def spin(self, seconds: float = 0.0) -> None:
+        end = time.monotonic() + seconds
+        self._executor.spin_once(timeout_sec=seconds)
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def wait(self) -> None:
+        """Wait until the service is there and has answered, which a dead one does not."""
+        assert self._client.wait_for_service(timeout_sec=LIMIT_S)
+        before, end = self.right, time.monotonic() + LIMIT_S
+        while self.right == before:
+            assert time.monotonic() < end, "the service never answered"
+            self.ask()
+            self.spin(0.5)
+        self._open.clear()
+
+    def all_answered(self, limit_s: float = LIMIT_S) -> bool:
+        """Take answers until each request has its own; whether that came about."""
+        end = time.monotonic() + limit_s
+        while self._open and time.monotonic() < end:
+            self.spin(0.05)
+        return not self._open and not self.wrong
+
+    def close(self) -> None:
+        self._node.destroy_node()
+        self._context.try_shutdown()

@@ -1,0 +1,214 @@
+"""Hand-driven ends of the ports, for tests of the proxies: nothing happens by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.core.model import LinkState, ReplicaId
+from fogft.wire.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
+
+UID = "0123456789abcdef"
+
+
+class Clock:
+    """Time that moves only when told."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class FakeLink:
+    """A link whose answers the test gives."""
+
+    def __init__(self, slot: int, *, generation: int = 1, room: int = 1000) -> None:
+        self.peer = Peer(ReplicaId(UID, slot, generation), f"h{slot}:1", f"replica.{slot}")
+        self.ready: frozenset[str] = frozenset()
+        self.draining = False
+        self.room = room
+        self.offered: list[tuple[str, bytes, bytes, float]] = []
+        self.forgotten: list[bytes] = []
+        self.closed = False
+
+    @property
+    def usable(self) -> bool:
+        return bool(self.ready)
+
+    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+        if len(self.offered) >= self.room:
+            return False
+        self.offered.append((service, request_id, payload, remaining_s))
+        return True
+
+    def forget(self, request_id: bytes) -> None:
+        self.forgotten.append(request_id)
+
+    def status(self) -> LinkStatus:
+        state = LinkState.UP if self.ready else LinkState.SUSPECT
+        return LinkStatus(state, None, 0.0, 0.0, 0.001, 0, 0, 0, "")
+
+    def close(self) -> None:
+        self.closed = True
+
+    def reply(self, payload: bytes, n: int = -1) -> Answer:
+        service, request, _, _ = self.offered[n]
+        return Answer(request, payload=payload, service=service)
+
+    def refusal(self, reason: str, n: int = -1) -> Answer:
+        service, request, _, _ = self.offered[n]
+        return Answer(request, refusal=reason, service=service)
+
+
+class FakeDialer:
+    """Makes `FakeLink`s and keeps them, newest last."""
+
+    def __init__(self) -> None:
+        self.links: list[FakeLink] = []
+
+    def dial(self, peer, services, events) -> FakeLink:
+        link = FakeLink(peer.id.slot, generation=peer.id.generation)
+        link.peer = peer
+        link.events = events  # type: ignore[attr-defined]
+        link.services = dict(services)  # type: ignore[attr-defined]
+        self.links.append(link)
+        return link
+
+    def close(self) -> None:
+        for link in self.links:
+            link.close()
+
+
+class FakeIncoming:
+    """A request at the replica; keeps what it was answered."""
+
+    def __init__(
+        self, request_id: bytes, payload: bytes = b"q", *, service: str = "/s", remaining_s=10.0
+    ) -> None:
+        self.request_id = request_id
+        self.payload = payload
+        self.service = service
+        self.robot = "r"
+        self.remaining_s = remaining_s
+        self.outcome: list[Any] = []
+
+    def reply(self, payload: bytes) -> None:
+        self.outcome.append(payload)
+
+    def refuse(self, reason: str) -> None:
+        self.outcome.append(f"refused {reason}")
+
+
+class FakeClient:
+    """A client of a local service; the test answers."""
+
+    def __init__(self) -> None:
+        self.there = True
+        self.count = 1
+        self.broken: RosError | None = None
+        self.calls: list[tuple[bytes, Callable[[bytes], None]]] = []
+        self.forgotten: list[int] = []
+        self.closed = False
+
+    def available(self) -> bool:
+        return self.there
+
+    def servers(self) -> int:
+        return self.count if self.there else 0
+
+    def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
+        if self.broken is not None:
+            raise self.broken
+        self.calls.append((payload, on_response))
+        return len(self.calls)
+
+    def forget(self, ticket: int) -> None:
+        self.forgotten.append(ticket)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class FakeServer:
+    """A service offered to the robot."""
+
+    def __init__(self, on_request) -> None:
+        self.on_request = on_request
+        self.responses: list[tuple[Any, bytes]] = []
+        self.closed = False
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        self.responses.append((handle, payload))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class FakeNode:
+    """A ROS node without ROS."""
+
+    def __init__(self) -> None:
+        self.servers: dict[str, FakeServer] = {}
+        self.clients: dict[str, FakeClient] = {}
+        self.closed = False
+        self.alive = True
+        self.refuses = ""
+
+    def serve(self, name, type_name, on_request) -> FakeServer:
+        if self.refuses == name:
+            raise RosError("its type cannot be loaded")
+        self.servers[name] = FakeServer(on_request)
+        return self.servers[name]
+
+    def client(self, name, type_name) -> FakeClient:
+        self.clients[name] = FakeClient()
+        return self.clients[name]
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class FakeListener:
+    """A listener whose requests and probes the test makes."""
+
+    endpoint = "127.0.0.1:7447"
+
+    def __init__(self) -> None:
+        self.closed = False
+        self.services: dict[str, str] = {}
+
+    def serve(self, services, on_request, on_probe) -> None:
+        self.services = dict(services)
+        self.on_request = on_request
+        self.on_probe: Callable[[Probe], ProbeAnswer] = on_probe
+
+    def counters(self):
+        return {}
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class FakeSupervisor:
+    """A command that lives and dies as the test says."""
+
+    def __init__(self) -> None:
+        self.alive = False
+        self.restarts = -1
+        self.last_exit = ""
+        self.dies = False
+        self.stopped = False
+
+    def poll(self) -> bool:
+        died, self.dies = self.dies, False
+        if died or not self.alive:
+            self.restarts += 1
+        self.alive = True
+        return died
+
+    def stop(self) -> None:
+        self.alive = False
+        self.stopped = True

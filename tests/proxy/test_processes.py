@@ -1,0 +1,115 @@
+"""Real `fogft serve` and `fogft proxy` processes, with an ordinary service beneath."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fogft.ros import environment
+from tests.proxy.by_hand import LIMIT_S, Caller, Parts, Robot, wait_for
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+environment.prepare(os.environ)
+
+
+@pytest.fixture
+def parts(tmp_path: Path, ros_domains: Callable[[], int]) -> Iterator[Parts]:
+    made = Parts(tmp_path, ros_domains)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def call() -> Iterator[Callable[[Robot], Caller]]:
+    """Make a caller beside a robot's proxy, and wait until it is answered."""
+    made: list[Caller] = []
+
+    def start(robot: Robot) -> Caller:
+        made.append(Caller(robot.domain))
+        made[-1].wait()
+        return made[-1]
+
+    yield start
+    for caller in made:
+        caller.close()
+
+
+def test_a_burst_to_an_ordinary_service_is_answered_in_full(parts, call):
+    """Its queue of ten, the default, loses none of them, with one replica or two."""
+    replicas = [parts.replica(0), parts.replica(1)]
+    robot = parts.robot("robot", *replicas)
+    caller = call(robot)
+    for _ in range(2):
+        caller.ask(200)
+        assert caller.all_answered()
+    robot.follow(replicas[1])
+    caller.ask(200)
+    assert caller.all_answered()
+
+
+def test_a_frozen_robot_does_not_hold_up_a_live_one(parts, call):
+    """Two robots share a replica; one stops with requests under way, and goes on later."""
+    replica = parts.replica(0)
+    frozen, live = parts.robot("frozen", replica), parts.robot("live", replica)
+    caller, other = call(live), call(frozen)
+    other.ask(50)
+    os.kill(frozen.process.pid, signal.SIGSTOP)
+    for _ in range(200):
+        caller.ask()
+        caller.spin(0.005)
+    assert caller.all_answered()
+    assert live.links()[0]["reopened"] == 0
+    os.kill(frozen.process.pid, signal.SIGCONT)
+    assert other.all_answered()
+
+
+def test_what_a_dying_command_worked_on_is_answered_by_the_next(parts, call):
+    """With one replica there is nobody else: the requests wait for the command's restart."""
+    replica = parts.replica(0, work_s=0.02)
+    robot = parts.robot("robot", replica)
+    caller = call(robot)
+    caller.ask(30)
+    caller.spin(0.1)
+    os.kill(first := replica.run_pid(), signal.SIGKILL)
+    assert caller.all_answered()
+    assert replica.run_pid() != first
+    wait_for(lambda: robot.links()[0]["restarts"] == 1, "the restart in the report")
+
+
+def test_a_membership_change_under_load_loses_nothing(parts, call):
+    """Every replica is exchanged for another while requests flow, then the old ones die."""
+    old, new = parts.replica(0), parts.replica(1)
+    robot = parts.robot("robot", old)
+    caller = call(robot)
+
+    def load_until(ready: list[int]) -> None:
+        end = time.monotonic() + LIMIT_S
+        while robot.ready() != ready:
+            assert time.monotonic() < end, f"{ready} are never ready"
+            caller.ask()
+            caller.spin(0.01)
+
+    robot.follow(old, new)
+    load_until([0, 1])
+    caller.ask(20)
+    robot.follow(new)
+    load_until([1])
+    old.process.kill()
+    caller.ask(20)
+    assert caller.all_answered()
+
+
+def test_a_proxy_starts_again_without_a_manager(parts, call):
+    """Its configuration and the last membership on disk are all that it needs."""
+    robot = parts.robot("robot", parts.replica(0))
+    caller = call(robot)
+    robot.restart()
+    wait_for(robot.ready, "the replica")
+    caller.wait()
+    caller.ask(50)
+    assert caller.all_answered()

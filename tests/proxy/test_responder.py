@@ -1,0 +1,284 @@
+"""The replica runs a request id once and answers every copy of it."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.core.errors import RosError
+from fogft.proxy.responder import Responder
+from fogft.ros.port import Unreadable
+from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
+
+A = b"a" * 16
+B = b"b" * 16
+
+
+class Scene:
+    def __init__(self, **options) -> None:
+        self.clock = Clock()
+        self.ready = True
+        self.client = FakeClient()
+        self.responder = Responder(lambda name: self.ready, clock=self.clock, **options)
+        self.responder.use({"/s": self.client})
+
+    def ask(self, id: bytes, **options) -> FakeIncoming:
+        incoming = FakeIncoming(id, **options)
+        self.responder.request(incoming)
+        return incoming
+
+    def answer(self, n: int, payload: bytes = b"r") -> None:
+        self.client.calls[n][1](payload)
+
+
+def test_a_request_is_run_and_answered():
+    scene = Scene()
+    incoming = scene.ask(A, payload=b"q")
+    assert scene.client.calls[0][0] == b"q"
+    scene.answer(0, b"r")
+    assert incoming.outcome == [b"r"]
+    assert scene.responder.in_flight == 0
+
+
+def test_a_copy_joins_the_work_in_progress():
+    scene = Scene()
+    first, copy = scene.ask(A), scene.ask(A)
+    scene.answer(0, b"r")
+    assert (first.outcome, copy.outcome) == ([b"r"], [b"r"])
+    assert scene.responder.ran == 1
+
+
+def test_a_copy_of_finished_work_gets_the_kept_answer():
+    scene = Scene()
+    scene.ask(A)
+    scene.answer(0, b"r")
+    assert scene.ask(A).outcome == [b"r"]
+    assert len(scene.client.calls) == 1
+
+
+def test_a_copy_whose_answer_is_no_longer_kept_is_refused_not_run_again():
+    scene = Scene(kept_bytes=3)
+    scene.ask(A)
+    scene.answer(0, b"long answer")
+    assert scene.ask(A).outcome == ["refused forgotten"]
+    assert len(scene.client.calls) == 1
+
+
+def test_a_service_that_is_not_there_refuses_at_once():
+    scene = Scene()
+    scene.ready = False
+    assert scene.ask(A).outcome == ["refused not-ready"]
+
+
+def test_an_unknown_service_is_refused():
+    assert Scene().ask(A, service="/other").outcome == ["refused not-ready"]
+
+
+def test_more_than_the_window_is_refused():
+    scene = Scene(max_in_flight=1)
+    scene.ask(A)
+    assert scene.ask(B).outcome == ["refused overloaded"]
+    scene.answer(0)
+    assert scene.ask(b"c" * 16).outcome == []
+
+
+def test_no_more_is_passed_on_than_an_ordinary_service_keeps():
+    """A ROS service with the default queue silently loses what exceeds ten."""
+    scene = Scene()
+    asked = [scene.ask(bytes([n]) * 16) for n in range(25)]
+    assert len(scene.client.calls) == 10
+    for n in range(25):
+        scene.answer(n)
+        assert len(scene.client.calls) == min(25, 11 + n)
+    assert all(incoming.outcome == [b"r"] for incoming in asked)
+
+
+def test_what_waits_past_its_deadline_is_never_begun():
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=9.0)
+    waiting = scene.ask(B, remaining_s=1.0)
+    scene.clock.now += 2.0
+    scene.answer(0)
+    assert waiting.outcome == ["refused expired"]
+    assert len(scene.client.calls) == 1
+
+
+def test_a_copy_joins_what_waits():
+    scene = Scene(outstanding=1)
+    scene.ask(A)
+    first, copy = scene.ask(B), scene.ask(B)
+    scene.answer(0)
+    scene.answer(1, b"b")
+    assert (first.outcome, copy.outcome) == ([b"b"], [b"b"])
+
+
+def test_expired_work_keeps_its_room_until_the_service_is_done_with_it():
+    """The service still has it in its queue: passing on more would overflow that queue."""
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=1.0)
+    waiting = scene.ask(B, remaining_s=9.0)
+    scene.clock.now += 1.0
+    scene.responder.tick()
+    assert len(scene.client.calls) == 1
+    scene.answer(0, b"too late")
+    scene.answer(1, b"b")
+    assert waiting.outcome == [b"b"]
+
+
+def test_a_response_that_never_comes_frees_its_room_in_the_end():
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=1.0)
+    for _ in range(2):
+        scene.clock.now += 61.0
+        scene.responder.tick()
+    scene.ask(B)
+    assert len(scene.client.calls) == 2
+    assert scene.client.forgotten == [1]
+
+
+def test_a_crash_ends_what_waits_too_and_does_not_blame_it():
+    """A robot bars a replica that crashed on a request three times; this one was not begun."""
+    scene = Scene(outstanding=1)
+    asked = [scene.ask(A), scene.ask(B)]
+    scene.responder.crashed()
+    assert [incoming.outcome for incoming in asked] == [["refused crashed"], ["refused not-ready"]]
+    scene.ask(b"c" * 16)
+    assert scene.responder.in_flight == 1
+
+
+def test_a_request_past_its_deadline_is_never_begun():
+    scene = Scene()
+    assert scene.ask(A, remaining_s=0.0).outcome == ["refused expired"]
+    assert scene.client.calls == []
+
+
+def test_a_request_the_service_cannot_read_is_refused_and_can_be_sent_again():
+    scene = Scene()
+    scene.client.broken = Unreadable("too short")
+    assert scene.ask(A).outcome == ["refused malformed"]
+    assert scene.responder.in_flight == 0
+
+
+def test_a_request_that_ros_has_no_room_for_may_be_sent_again():
+    """Malformed would keep the robot from ever asking this replica again."""
+    scene = Scene()
+    scene.client.broken = RosError("its queue is full")
+    assert scene.ask(A).outcome == ["refused overloaded"]
+    scene.client.broken = None
+    again = scene.ask(A)
+    scene.answer(0, b"r")
+    assert again.outcome == [b"r"]
+
+
+def test_held_bytes_are_bounded():
+    """A robot whose requests others answer first goes on sending: its window is free again."""
+    scene = Scene(held_bytes=10)
+    big = scene.ask(A, payload=b"larger than allowed, but alone")
+    assert scene.ask(B, payload=b"q").outcome == ["refused overloaded"]
+    scene.answer(0, b"r")
+    assert big.outcome == [b"r"]
+    assert scene.ask(B, payload=b"q").outcome == []
+
+
+def test_a_service_that_was_lost_frees_its_room_and_no_other():
+    """A frozen or restarted service does not answer what it was given: others shall not wait."""
+    scene = Scene(outstanding=1)
+    other = FakeClient()
+    scene.responder.use({"/s": scene.client, "/other": other})
+    lost, spared = scene.ask(A), scene.ask(B, service="/other")
+    late = scene.ask(b"c" * 16, remaining_s=1.0)
+    scene.responder.crashed("/s")
+    assert (lost.outcome, spared.outcome) == (["refused crashed"], [])
+    assert late.outcome == ["refused not-ready"]
+    scene.ask(b"d" * 16)
+    assert len(scene.client.calls) == 2
+
+
+def test_a_lost_service_frees_the_room_of_expired_work_too():
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=1.0)
+    scene.clock.now += 1.0
+    scene.responder.tick()
+    scene.responder.crashed("/s")
+    scene.ask(B)
+    assert len(scene.client.calls) == 2
+
+
+def test_a_crash_refuses_what_was_in_work_and_a_copy_is_run_anew():
+    scene = Scene()
+    incoming = scene.ask(A)
+    scene.responder.crashed()
+    assert incoming.outcome == ["refused crashed"]
+    assert scene.client.forgotten == [1]
+    again = scene.ask(A)
+    scene.answer(1, b"r")
+    assert again.outcome == [b"r"]
+
+
+def test_an_answer_after_the_crash_reaches_nobody():
+    scene = Scene()
+    incoming = scene.ask(A)
+    scene.responder.crashed()
+    scene.answer(0, b"ghost")
+    assert incoming.outcome == ["refused crashed"]
+
+
+def test_work_past_its_deadline_is_dropped():
+    scene = Scene()
+    incoming = scene.ask(A, remaining_s=2.0)
+    scene.clock.now += 2.0
+    scene.responder.tick()
+    assert incoming.outcome == ["refused expired"]
+    assert scene.responder.in_flight == 0
+
+
+def test_finished_ids_are_forgotten_at_their_deadline():
+    """Memory stays flat: nothing of a request outlives its deadline."""
+    scene = Scene()
+    for n in range(1000):
+        scene.ask(n.to_bytes(16, "big"), remaining_s=1.0)
+        scene.answer(n)
+    scene.clock.now += 1.0
+    scene.responder.tick()
+    assert len(scene.responder._work) == len(scene.responder._kept) == 0
+    assert scene.responder._kept_bytes == 0
+
+
+def test_the_number_of_ids_is_bounded():
+    scene = Scene(kept_ids=10)
+    for n in range(100):
+        scene.ask(n.to_bytes(16, "big"))
+        scene.answer(n)
+    assert len(scene.responder._work) <= 10
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["ask", "answer", "crash", "wait"]), st.integers(0, 3)),
+        max_size=50,
+    )
+)
+def test_every_copy_gets_exactly_one_outcome_and_runs_never_overlap(steps):
+    """Each incoming ends at most once; an id is never in two runs at the same time."""
+    scene = Scene(kept_bytes=8, outstanding=2)
+    asked: list[FakeIncoming] = []
+    finished: set[int] = set()
+    for step, n in steps:
+        if step == "ask":
+            asked.append(scene.ask(bytes([n]) * 16, payload=bytes([n]), remaining_s=5.0))
+        elif step == "answer" and n < len(scene.client.calls):
+            payload, _ = scene.client.calls[n]
+            scene.answer(n, b"to " + payload)
+            finished.add(n)
+        elif step == "crash":
+            scene.responder.crashed()
+        else:
+            scene.clock.now += n
+            scene.responder.tick()
+    for incoming in asked:
+        assert len(incoming.outcome) <= 1
+        if incoming.outcome and isinstance(incoming.outcome[0], bytes):
+            assert incoming.outcome == [b"to " + incoming.payload]
+    waiting = sum(1 for incoming in asked if not incoming.outcome)
+    assert (waiting == 0) == (scene.responder.in_flight == 0)
+    assert scene.responder._kept_bytes >= 0

@@ -1,0 +1,45 @@
+"""ROS nodes for tests, in the shipped environment. Each ends with its test."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from fogft.ros import environment
+
+environment.prepare(os.environ)
+
+SET_BOOL = "std_srvs/srv/SetBool"
+LIMIT_S = 30.0
+
+
+def wait_for(
+    condition: Callable[[], Any], what: str = "condition", limit_s: float = LIMIT_S
+) -> None:
+    """Return when a condition holds; fail when it does not for too long."""
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail(f"waited {limit_s:.0f} s in vain: {what}")
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def make_node() -> Iterator[Callable[[int], Any]]:
+    """Make nodes of ours in a domain."""
+    from fogft.ros.node import SerialisedNode
+
+    nodes: list[SerialisedNode] = []
+
+    def make(domain: int) -> SerialisedNode:
+        nodes.append(SerialisedNode(f"ours_{len(nodes)}", domain))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.close()
+        assert not node.alive

@@ -1,0 +1,156 @@
+"""What is set for ROS processes, what is left alone, and what is reported."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+from fogft.core.errors import RosError
+from fogft.ros import environment
+
+
+def test_the_profile_is_chosen_where_nothing_is_set() -> None:
+    environ = {"PATH": "/bin"}
+    assert environment.prepare(environ)
+    assert environ == {
+        "PATH": "/bin",
+        environment.PROFILE_VARIABLE: str(environment.profile_path()),
+    }
+    assert not environment.prepare(environ)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "FASTDDS_BUILTIN_TRANSPORTS",
+    ],
+)
+def test_the_users_choice_stands(name: str) -> None:
+    """Any variable that chooses transports keeps ours out."""
+    environ = {name: "theirs"}
+    assert not environment.prepare(environ)
+    assert environ == {name: "theirs"}
+
+
+def test_a_profile_in_the_working_folder_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fast DDS reads such a file only where no variable names another: so none is set."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DEFAULT_FASTDDS_PROFILES.xml").touch()
+    environ: dict[str, str] = {}
+    assert not environment.prepare(environ)
+    assert environ == {}
+
+
+def test_small_shared_memory_keeps_the_profile_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a container with 64 MB of /dev/shm, segments of 35 MB would only fail."""
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=64_000_000))
+    assert not environment.prepare({})
+
+
+def test_an_incomplete_installation_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environment, "__file__", str(tmp_path / "fogft" / "ros" / "x.py"))
+    with pytest.raises(RosError, match="missing"):
+        environment.profile_path()
+
+
+def test_an_installed_package_finds_its_own_profile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a wheel, templates lie in the package; in a checkout, beside it."""
+    packaged = tmp_path / "fogft" / "templates" / "fastdds_shm.xml"
+    packaged.parent.mkdir(parents=True)
+    packaged.touch()
+    monkeypatch.setattr(environment, "__file__", str(tmp_path / "fogft" / "ros" / "x.py"))
+    assert environment.profile_path() == packaged
+
+
+def test_the_profile_has_both_transports() -> None:
+    """Shared memory for speed, and UDP, without which no node without the profile is reached."""
+    space = "{http://www.eprosima.com}"
+    root = ElementTree.parse(environment.profile_path()).getroot()
+    kinds = [each.text for each in root.iter(f"{space}type")]
+    used = [each.text for each in root.find(f".//{space}userTransports") or ()]
+    named = [each.text for each in root.iter(f"{space}transport_id")]
+    assert sorted(kinds) == ["SHM", "UDPv4"]
+    assert len(used) == 2
+    assert set(used) <= set(named)
+
+
+def test_a_child_gets_rid_of_the_wheels_hook() -> None:
+    """The guard and the wheels' folders go; the user's own folders stay, in order."""
+    ours = Path(sys.prefix, "lib")
+    wheels = ours / "python3.11" / "site-packages" / "ros_rclpy.libs"
+    environ = {
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
+        "LD_LIBRARY_PATH": os.pathsep.join(["/opt/a", str(ours), "/opt/b", str(wheels)]),
+        "ROS_DOMAIN_ID": "7",
+    }
+    child = environment.child_environment(environ)
+    assert child == {"LD_LIBRARY_PATH": "/opt/a:/opt/b", "ROS_DOMAIN_ID": "7"}
+    assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" in environ
+
+
+def test_a_child_without_the_wheels_keeps_all() -> None:
+    """Of a sourced installation nothing is taken away."""
+    environ = {"LD_LIBRARY_PATH": f"{sys.prefix}/lib:/opt/ros/kilted/lib", "A": "b"}
+    assert environment.child_environment(environ) == environ
+    only = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1", "LD_LIBRARY_PATH": f"{sys.prefix}/lib"}
+    assert environment.child_environment(only) == {}
+
+
+@pytest.mark.ros
+def test_a_child_in_this_environment_can_use_ros() -> None:
+    """What was undone, the child's own start-up does again."""
+    subprocess.run(
+        [sys.executable, "-c", "import rclpy.impl.implementation_singleton"],
+        env=environment.child_environment(),
+        check=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.ros
+def test_describe_tells_what_is_there() -> None:
+    found = environment.describe({"ROS_DOMAIN_ID": "42", "ROS_STATIC_PEERS": "10.0.0.1"})
+    assert found["domain"] == "42"
+    assert found["discovery"] == "SUBNET, peers 10.0.0.1"
+    assert found["profile"].startswith("none")
+    assert found["rmw"].startswith("rmw_")
+    assert found["distribution"] != "unknown"
+    assert int(found["shared_memory_free_mb"]) >= 0
+    assert all(isinstance(value, str) and value for value in found.values())
+
+
+@pytest.mark.parametrize(
+    ("environ", "expected"),
+    [
+        ({}, "SUBNET"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, "LOCALHOST"),
+        ({"ROS_LOCALHOST_ONLY": "1"}, "LOCALHOST (ROS_LOCALHOST_ONLY=1)"),
+        ({"ROS_LOCALHOST_ONLY": "0"}, "SUBNET"),
+    ],
+)
+def test_describe_tells_how_far_discovery_reaches(environ: dict[str, str], expected: str) -> None:
+    assert environment.describe(environ)["discovery"] == expected
+
+
+def test_describe_tells_when_ros_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No ROS is a finding, not a failure."""
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    found: dict[str, Any] = environment.describe({})
+    assert found["rclpy"].startswith("not usable: ")
+    assert found["domain"] == "0"

@@ -1,0 +1,214 @@
+"""The take loop: what may go wrong around it, and that it lives on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fogft.core.errors import RosError
+
+from .conftest import LIMIT_S, SET_BOOL, wait_for
+
+pytestmark = pytest.mark.ros
+
+TRUE = b"\x00\x01\x00\x00\x01"
+RESPONSE = b"\x00\x01\x00\x00\x01\x00\x00\x00\x01\x00\x00\x00\x00"
+
+
+def echo_pair(make_node: Callable[[int], Any], domain: int) -> tuple[Any, Any]:
+    """Return a server that answers and a client that has found it, on two nodes."""
+    server = make_node(domain).serve(
+        "/flag", SET_BOOL, lambda _, handle: server.respond(handle, RESPONSE)
+    )
+    client = make_node(domain).client("/flag", SET_BOOL)
+    wait_for(client.available, "discovery")
+    return server, client
+
+
+def test_a_callback_that_raises_costs_only_its_own_message(
+    make_node: Callable[[int], Any], ros_domain: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Errors of callbacks are logged, on both sides; the next message is served."""
+    seen: list[bytes] = []
+
+    def on_request(payload: bytes, handle: Any) -> None:
+        seen.append(payload)
+        if len(seen) == 1:
+            raise ValueError("first request")
+        server.respond(handle, RESPONSE)
+
+    def fail(_: bytes) -> None:
+        raise ValueError("first response")
+
+    server = make_node(ros_domain).serve("/flag", SET_BOOL, on_request)
+    client = make_node(ros_domain).client("/flag", SET_BOOL)
+    wait_for(client.available, "discovery")
+    answers: list[bytes] = []
+    client.call(TRUE, answers.append)
+    client.call(TRUE, fail)
+    client.call(TRUE, answers.append)
+    wait_for(lambda: answers, "the third response")
+    assert caplog.text.count("ValueError: first") == 2
+
+
+def test_bytes_of_another_type_are_refused_or_read_never_fatal(
+    make_node: Callable[[int], Any], ros_domain: int
+) -> None:
+    """Noise to call and to respond ends in an error, and both loops live on."""
+    server, client = echo_pair(make_node, ros_domain)
+    for noise in (b"\xff" * 3, b"\xff" * 4, b"\xff" * 64, b"\x00\x01\x00\x00", b""):
+        with pytest.raises(RosError, match="not a serialised SetBool_Request"):
+            client.call(noise, lambda _: None)
+        with pytest.raises(RosError, match="not a serialised SetBool_Response"):
+            server.respond(bytes(24), noise)
+    answers: list[bytes] = []
+    client.call(TRUE, answers.append)
+    wait_for(lambda: answers, "a response after the noise")
+    assert answers[0][4] == 1
+
+
+def test_a_wrong_service_name_is_an_error(make_node: Callable[[int], Any], ros_domain: int) -> None:
+    """A name that ROS refuses is said, and the node lives on."""
+    node = make_node(ros_domain)
+    for name in ("no spaces", "", "/trailing/"):
+        with pytest.raises(RosError, match="cannot be made"):
+            node.serve(name, SET_BOOL, lambda *_: None)
+        with pytest.raises(RosError, match="cannot be made"):
+            node.client(name, SET_BOOL)
+    assert node.alive
+
+
+def test_a_wrong_node_name_is_an_error() -> None:
+    """A node name that ROS refuses is an error of ours, not a trace of rclpy's."""
+    from fogft.ros.node import SerialisedNode
+
+    with pytest.raises(RosError, match="`not a name`"):
+        SerialisedNode("not a name")
+
+
+def test_closing_from_callbacks(make_node: Callable[[int], Any], ros_domain: int) -> None:
+    """A callback may close its service, its client, even the node: nothing waits for itself."""
+    server_node, client_node = make_node(ros_domain), make_node(ros_domain)
+
+    def on_request(_: bytes, handle: Any) -> None:
+        server.respond(handle, RESPONSE)
+        server.close()
+
+    def on_response(_: bytes) -> None:
+        client.close()
+        client_node.close()
+
+    server = server_node.serve("/flag", SET_BOOL, on_request)
+    client = client_node.client("/flag", SET_BOOL)
+    wait_for(client.available, "discovery")
+    client.call(TRUE, on_response)
+    wait_for(lambda: not client_node.alive, "the client's node to end")
+    watcher = server_node.client("/flag", SET_BOOL)
+    wait_for(lambda: not watcher.available(), "the service to be gone")
+    assert server_node.alive
+
+
+def test_services_come_and_go_under_traffic(
+    make_node: Callable[[int], Any], ros_domain: int
+) -> None:
+    """Entities made and closed by other threads cost no message of one that stays."""
+    _, client = echo_pair(make_node, ros_domain)
+    node = make_node(ros_domain)
+    errors: list[BaseException] = []
+
+    def come_and_go(number: int) -> None:
+        try:
+            for turn in range(10):
+                made = [
+                    node.serve(f"/s{number}_{turn}", SET_BOOL, lambda *_: None),
+                    node.client(f"/s{number}_{turn}", SET_BOOL),
+                ]
+                for entity in made:
+                    entity.close()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=come_and_go, args=(number,)) for number in range(3)]
+    for thread in threads:
+        thread.start()
+    answers: list[bytes] = []
+    sent: list[int] = []
+    while len(sent) < 200 or any(thread.is_alive() for thread in threads):
+        sent.append(client.call(TRUE, answers.append))
+        wait_for(lambda: len(sent) - len(answers) < 20, "room in flight")
+    for thread in threads:
+        thread.join(LIMIT_S)
+    wait_for(lambda: len(answers) == len(sent), "every response")
+    assert errors == []
+
+
+def test_a_fallback_is_announced_and_still_works(
+    make_node: Callable[[int], Any],
+    ros_domain: int,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Where the C library cannot be used, rclpy's messages do the work, with a warning."""
+    from fogft.ros import rcl
+
+    def missing() -> None:
+        raise RosError("the C library of ROS 2 cannot be used: gone")
+
+    monkeypatch.setattr(rcl, "load", missing)
+    _, client = echo_pair(make_node, ros_domain)
+    answers: list[bytes] = []
+    client.call(TRUE, answers.append)
+    wait_for(lambda: answers, "the response")
+    assert answers[0][4] == 1
+    assert "large messages will be slow" in caplog.text
+
+
+CHILD = """
+import os, signal, sys, threading
+from fogft.ros.node import SerialisedNode
+before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+node = SerialisedNode("child")
+node.serve("/here", "std_srvs/srv/SetBool", lambda *_: None)
+client = node.client("/here", "std_srvs/srv/SetBool")
+while not client.available(): pass
+assert before == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))
+node.close()
+assert threading.enumerate() == [threading.main_thread()], threading.enumerate()
+"""
+
+
+def test_a_node_leaves_the_process_as_it_was(ros_domain: int, tmp_path: Path) -> None:
+    """No signal handler, no thread, no file in the home folder; the domain is the variable's."""
+    environ = {**os.environ, "HOME": str(tmp_path), "ROS_DOMAIN_ID": str(ros_domain)}
+    environ.pop("ROS_LOG_DIR", None)
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD], env=environ, timeout=60, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_process_that_forgets_to_close_still_ends(ros_domain: int) -> None:
+    """An interrupted process ends: the take loop holds nobody back."""
+    child = (
+        "import sys, time; from fogft.ros.node import SerialisedNode\n"
+        f"node = SerialisedNode('child', {ros_domain}); print('up', flush=True)\n"
+        "time.sleep(60)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", child], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "up\n"
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=LIMIT_S)
+    assert process.returncode != 0
+    assert "KeyboardInterrupt" in errors

@@ -1,0 +1,153 @@
+"""No client gets more responses than an ordinary one keeps, unless it shows that it takes them."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.core.errors import RosError
+from fogft.ros.pacing import EVERY_S, WINDOW, WINDOW_LIMIT, Pace, Pacer
+
+ORDINARY = 10  # responses that a client with the default quality of service keeps
+
+
+def test_a_burst_is_answered_a_window_at_once_and_then_one_by_one():
+    pace = Pace(0.0)
+    for n in range(200):
+        pace.requested(n * 1e-5)
+    now, sent = 0.002, 0
+    while sent < 200:
+        sent += pace.take(now)
+        assert sent <= WINDOW + (now - 0.002) / EVERY_S + 1
+        now += 1e-4
+    assert now < 200 * EVERY_S
+
+
+@given(
+    bursts=st.lists(st.integers(1, 200), min_size=1, max_size=6),
+    pauses=st.sampled_from([0.0, 0.01, 0.3]),
+    latency=st.floats(0.002, 0.01),
+    spacing=st.floats(2e-5, 2e-4),
+)
+def test_a_client_that_takes_nothing_while_it_asks_never_overflows(
+    bursts, pauses, latency, spacing
+):
+    """It asks in bursts and takes one a millisecond otherwise; answers come slower than it asks."""
+    now, pace, untaken = 0.0, Pace(0.0), 0
+    asked: list[float] = []
+
+    def answer(most: int = 1000) -> int:
+        sent = 0
+        while sent < most and asked and asked[0] + latency <= now and pace.take(now):
+            asked.pop(0)
+            sent += 1
+        return sent
+
+    for burst in bursts:
+        for n in range(burst):
+            pace.requested(now)
+            asked.append(now)
+            now += spacing
+            if n % 2:
+                untaken += answer(1)
+            assert untaken <= ORDINARY
+        while asked or untaken:
+            untaken = max(untaken - 1, 0)
+            now += 0.001
+            untaken += answer()
+            assert untaken <= ORDINARY
+        now += pauses
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 9, 64])
+def test_a_client_that_asks_again_for_each_answer_is_hardly_held_up(at_once):
+    """A caller in a closed loop, however fast, waits only until what it has open is usual."""
+    now, pace, waits = 0.0, Pace(0.0), 0
+    for _ in range(at_once):
+        pace.requested(now)
+    for _ in range(5000):
+        while not pace.take(now):
+            waits += 1
+            now += EVERY_S
+        now += 1e-5
+        pace.requested(now)
+    assert waits <= at_once
+
+
+def test_a_client_that_proved_quick_must_prove_it_again_after_a_pause():
+    pace = Pace(0.0)
+    now = 0.0
+    for _ in range(1000):
+        pace.requested(now)
+        assert pace.take(now)
+        now += 1e-4
+    now += 1.0
+    for _ in range(2 * WINDOW_LIMIT):
+        pace.requested(now)
+    assert sum(pace.take(now) for _ in range(2 * WINDOW_LIMIT)) == WINDOW
+
+
+def test_a_client_that_asks_more_than_is_answered_is_not_starved():
+    """It asks five thousand times a second for long, and takes: that is no burst, but its use."""
+    now, pace, sent = 0.0, Pace(0.0), 0
+    for n in range(10_000):
+        pace.requested(now)
+        now += 2e-4
+        if n % 5 < 3:  # what the replicas can answer
+            sent += pace.take(now)
+    assert sent > 5000
+
+
+class Sent:
+    def __init__(self) -> None:
+        self.responses: list[tuple[bytes, bytes]] = []
+        self.all = threading.Event()
+        self.expected = 0
+
+    def __call__(self, handle: bytes, payload: bytes) -> None:
+        if payload == b"refused":
+            raise RosError("no room")
+        self.responses.append((handle, payload))
+        if len(self.responses) == self.expected:
+            self.all.set()
+
+
+def handle(client: int, number: int) -> bytes:
+    return bytes([client]) * 16 + number.to_bytes(8, "little")
+
+
+def test_every_response_is_sent_once_and_in_order():
+    sent = Sent()
+    sent.expected = 99
+    pacer = Pacer(sent)
+    for n in range(100):
+        pacer.requested(handle(1, n))
+    for n in range(100):
+        pacer.respond(handle(1, n), b"refused" if n == 50 else b"%d" % n)
+    assert sent.all.wait(30)
+    assert sent.responses == [(handle(1, n), b"%d" % n) for n in range(100) if n != 50]
+    pacer.close()
+
+
+def test_one_clients_burst_does_not_hold_up_another():
+    sent = Sent()
+    pacer = Pacer(sent, clock=lambda: 0.0)
+    for n in range(100):
+        pacer.requested(handle(1, n))
+        pacer.respond(handle(1, n), b"")
+    pacer.requested(handle(2, 0))
+    pacer.respond(handle(2, 0), b"")
+    assert sent.responses[-1][0] == handle(2, 0)
+    pacer.close()
+
+
+def test_clients_that_are_gone_are_forgotten():
+    pacer = Pacer(lambda handle, payload: None)
+    for client in range(200):
+        pacer.requested(handle(client, 0))
+        pacer.respond(handle(client, 0), b"")
+    assert len(pacer._paces) <= 64
+    pacer.close()

@@ -1,0 +1,266 @@
+"""Sweeping /dev/shm: what goes, and above all what stays."""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import mmap
+import os
+import secrets
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fogft.ros import shared_memory
+
+from .conftest import LIMIT_S, SET_BOOL, wait_for
+
+
+@pytest.fixture
+def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of shared memory apart from the machine's own, where files count at once."""
+    with tempfile.TemporaryDirectory(dir=shared_memory.FOLDER, prefix="fogft-test-") as name:
+        monkeypatch.setattr(shared_memory, "FOLDER", Path(name))
+        monkeypatch.setattr(shared_memory, "SETTLED_S", 0.0)
+        yield Path(name)
+
+
+@pytest.fixture
+def leave(folder: Path) -> Callable[[str], Path]:
+    """Leave files as a killed process would."""
+
+    def leave_file(name: str) -> Path:
+        (folder / name).write_bytes(b"left")
+        return folder / name
+
+    return leave_file
+
+
+LEFT = [
+    "fastdds_0123456789abcdef",
+    "fastdds_0123456789abcdef_el",
+    "fastrtps_0123456789abcdef",
+    "fastrtps_0123456789abcdef_el",
+    "fastdds_port7411",
+    "fastdds_port7411_el",
+    "fastdds_port7411_sl",
+    "sem.fastdds_port7411_mutex",
+    "sem.fastrtps_port7411_mutex",
+    "fast_datasharing_01.0f.bd_0.0.1.3",
+    "lttng-ust-wait-6-0",
+]
+
+
+@pytest.mark.parametrize("pattern", LEFT)
+def test_what_nobody_uses_goes(leave: Callable[[str], Path], pattern: str) -> None:
+    path = leave(pattern)
+    assert path.name in shared_memory.sweep()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    "pattern", ["psm_1", "sem.other", "fastdds_12_x", "fastdds_xyz", "my_fastdds_12", "lttng"]
+)
+def test_what_is_not_ros_stays(leave: Callable[[str], Path], pattern: str) -> None:
+    path = leave(pattern)
+    assert path.name not in shared_memory.sweep()
+    assert path.exists()
+
+
+@pytest.mark.parametrize("used", ["fastdds_ab", "fastdds_ab_el"])
+def test_an_open_file_keeps_its_group(leave: Callable[[str], Path], used: str) -> None:
+    """One file in use keeps all that belong to it."""
+    paths = [leave("fastdds_ab"), leave("fastdds_ab_el")]
+    with leave(used).open("rb"):
+        shared_memory.sweep()
+        assert all(path.exists() for path in paths)
+    shared_memory.sweep()
+    assert not any(path.exists() for path in paths)
+
+
+def test_a_mapped_file_stays(leave: Callable[[str], Path]) -> None:
+    """A mapping counts though the file is closed, as Fast DDS does it."""
+    path = leave("fastdds_ab")
+    libc = ctypes.CDLL(None)  # Python's own mmap keeps the file open
+    libc.mmap.restype = ctypes.c_void_p
+    libc.mmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long)
+    descriptor = os.open(path, os.O_RDONLY)
+    mapped = libc.mmap(None, 4, mmap.PROT_READ, mmap.MAP_SHARED, descriptor, 0)
+    os.close(descriptor)
+    shared_memory.sweep()
+    assert path.exists()
+    libc.munmap(ctypes.c_void_p(mapped), ctypes.c_size_t(4))
+    assert path.name in shared_memory.sweep()
+
+
+def test_a_locked_file_stays_though_its_holder_is_hidden(
+    leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lock tells of a process in another container, which /proc does not show."""
+    monkeypatch.setattr(shared_memory, "_used_names", set)
+    path, lock = leave("fastdds_ab"), leave("fastdds_ab_el")
+    with lock.open("rb") as held:
+        fcntl.flock(held, fcntl.LOCK_SH)
+        shared_memory.sweep()
+        assert path.exists()
+    assert {path.name, lock.name} <= set(shared_memory.sweep())
+
+
+def test_a_fresh_file_stays(leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between making a file and mapping it there is a moment; a whole group waits for it."""
+    monkeypatch.setattr(shared_memory, "SETTLED_S", 3600.0)
+    path = leave("fastdds_ab")
+    shared_memory.sweep()
+    assert path.exists()
+
+
+def test_files_of_others_stay(
+    leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = leave("fastdds_ab")
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    shared_memory.sweep()
+    assert path.exists()
+
+
+def test_a_file_that_comes_into_use_while_sweeping_stays(
+    leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second look counts."""
+    path = leave("fastdds_ab")
+    looks = iter([set[str](), {path.name}])
+    monkeypatch.setattr(shared_memory, "_used_names", lambda: next(looks))
+    assert path.name not in shared_memory.sweep()
+    assert path.exists()
+
+
+def test_a_port_is_judged_under_its_mutex(
+    leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody can open a port between the second look and its end; then the mutex is free again."""
+    steps: list[str] = []
+    used_names, unlink = shared_memory._used_names, shared_memory._unlink
+    monkeypatch.setattr(
+        shared_memory, "_used_names", lambda: (steps.append("look"), used_names())[1]
+    )
+    monkeypatch.setattr(
+        shared_memory, "_unlink", lambda name: (steps.append(name), unlink(name))[1]
+    )
+    monkeypatch.setattr(
+        shared_memory, "_semaphore", lambda group, what: steps.append(f"{group} {what}") or True
+    )
+    leave("fastdds_port7411")
+    leave("sem.fastdds_port7411_mutex")
+    shared_memory.sweep()
+    assert steps == [
+        "look",
+        "fastdds_port7411 sem_trywait",
+        "look",
+        "fastdds_port7411",
+        "fastdds_port7411 sem_post",
+        "sem.fastdds_port7411_mutex",
+    ]
+
+
+def test_a_mutex_is_had_once_and_leaves_no_mapping() -> None:
+    """It is the semaphore that Fast DDS knows by this name; holding it does not look like use."""
+    group = f"fogft_test_{secrets.token_hex(6)}"
+    libc = ctypes.CDLL(None)
+    libc.sem_open.restype = ctypes.c_void_p
+    made = libc.sem_open(f"/{group}_mutex".encode(), os.O_CREAT, 0o600, 1)
+    assert made
+    libc.sem_close(ctypes.c_void_p(made))
+    try:
+        assert shared_memory._semaphore(group, "sem_trywait")
+        assert not shared_memory._semaphore(group, "sem_trywait")
+        assert group not in Path("/proc/self/maps").read_text()
+        assert shared_memory._semaphore(group, "sem_post")
+        assert shared_memory._semaphore(group, "sem_trywait")
+    finally:
+        Path(f"/dev/shm/sem.{group}_mutex").unlink()
+    assert not shared_memory._semaphore(group, "sem_trywait")
+
+
+def test_sweeps_side_by_side_remove_each_file_once(leave: Callable[[str], Path]) -> None:
+    paths = [leave(f"fastdds_{number:04x}") for number in range(50)]
+    removed: list[str] = []
+    threads = [
+        threading.Thread(target=lambda: removed.extend(shared_memory.sweep())) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(LIMIT_S)
+    names = {path.name for path in paths}
+    assert sorted(name for name in removed if name in names) == sorted(names)
+
+
+def test_sweeping_does_not_load_ros() -> None:
+    """`fogft down` sweeps; it must not start ROS for that."""
+    code = "import sys; from fogft.ros import shared_memory; shared_memory.sweep()\n"
+    code += "assert not {'rclpy', 'zenoh'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+NODE = """
+import sys, time
+from fogft.ros.node import SerialisedNode
+node = SerialisedNode("left", int(sys.argv[1]))
+server = node.serve("/left", "std_srvs/srv/SetBool", lambda _, h: server.respond(h, ANSWER))
+ANSWER = bytes([0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0])
+print("up", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.ros
+def test_a_live_node_survives_and_a_killed_one_is_swept(
+    make_node: Callable[[int], Any], ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sweeping under a live pair costs nothing; after SIGKILL nothing of the dead one is left."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", NODE, str(ros_domain)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        theirs = _names_of(process.pid)
+        assert theirs
+        _judge_only(theirs, monkeypatch)
+        client = make_node(ros_domain).client("/left", SET_BOOL)
+        wait_for(client.available, "discovery")
+        answers: list[bytes] = []
+        for _ in range(5):
+            assert not theirs & set(shared_memory.sweep())
+            client.call(b"\x00\x01\x00\x00\x01", answers.append)
+        wait_for(lambda: len(answers) == 5, "responses while sweeping")
+    finally:
+        process.kill()
+        process.wait()
+    shared_memory.sweep()
+    left = theirs & set(os.listdir(shared_memory.FOLDER)) - shared_memory._used_names()
+    assert left == set()
+    assert theirs - _names_of(os.getpid())
+
+
+def _judge_only(names: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judge these files at once, and leave alone the fresh ones of whoever else runs here."""
+    groups = shared_memory._groups
+    monkeypatch.setattr(shared_memory, "SETTLED_S", 0.0)
+    monkeypatch.setattr(
+        shared_memory,
+        "_groups",
+        lambda: {group: found for group, found in groups().items() if names & set(found)},
+    )
+
+
+def _names_of(pid: int) -> set[str]:
+    """Return the Fast DDS files that a process maps."""
+    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    return {line.rsplit("/", 1)[1] for line in lines if "/dev/shm/fastdds_" in line}

@@ -1,0 +1,56 @@
+"""A store in memory that can crash its user at any write, and keeps only what was written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fogft.core.history import Event, History
+from fogft.core.intent import Intent
+from fogft.core.membership import is_newer
+from fogft.core.model import Membership
+from fogft.core.spec import PoolSpec
+from fogft.pool.store import Identity
+
+
+class MemoryStore:
+    """Implements `fogft.pool.store.Store`; `crash_point` is called around every write."""
+
+    def __init__(self, identity: Identity, spec: PoolSpec) -> None:
+        self._identity = identity
+        self.the_spec = spec
+        self.the_intent = Intent()
+        self.events: list[Event] = []
+        self.published: Membership | None = None
+        self.crash_point: Callable[[], None] = lambda: None
+        self._history = History()
+
+    def identity(self) -> Identity:
+        return self._identity
+
+    def spec(self) -> PoolSpec:
+        return self.the_spec
+
+    def intent(self) -> Intent:
+        return self.the_intent
+
+    def history(self) -> History:
+        return self._history
+
+    def append(self, event: Event) -> None:
+        self.crash_point()
+        self.events.append(event)
+        self._history.add(event)
+        self.crash_point()
+
+    def membership(self) -> Membership | None:
+        return self.published
+
+    def write_membership(self, membership: Membership) -> None:
+        self.crash_point()
+        assert is_newer(membership, self.published), "a membership went back in time"
+        self.published = membership
+        self.crash_point()
+
+    def reopen(self) -> None:
+        """Forget what was only in memory, as a new process does."""
+        self._history = History(self.events)

@@ -1,0 +1,306 @@
+"""An emulated AWS: moto's EC2, IAM and STS, whose instances are VMs that really answer ssh.
+
+Three servers, all inside a network namespace of the test's own:
+
+* port 5566: AWS's interface. An instance that runs is a `vm.sh`; terminating kills it.
+* 169.254.169.254:80: instance metadata (version 2, with token), each VM by its own address.
+* port 5567: what a test does to the cloud, and what it may look at.
+    GET  /instances                     all of them, of all regions
+    GET  /log                           what happened, with times
+    POST /capacity?place=P&has=0|1      P: a region or a zone; without capacity for spot
+    POST /notice?id=I&in_s=S            a preemption notice: taken in S seconds (AWS: 120)
+    POST /rebalance?id=I                a rebalance recommendation
+    POST /preempt?id=I                  taken now
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.parse
+from collections.abc import Iterator
+from datetime import datetime, timedelta, timezone
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import boto3
+import yaml
+from moto.core.responses import ActionResult
+from moto.ec2.exceptions import EC2ClientError
+from moto.ec2.models import ec2_backends, elastic_network_interfaces, instances
+from moto.ec2.responses import spot_instances
+from moto.server import ThreadedMotoServer
+
+HERE = Path(__file__).resolve().parent
+IMAGE = Path(os.environ["EMULATION"])
+HIDDEN = [folder for folder in os.environ.get("HIDDEN", "").split(":") if folder]
+SPOT = {"us-east-1": 0.019, "us-west-2": 0.024, "eu-west-1": 0.039}
+REGIONS = tuple(SPOT)
+METADATA = "169.254.169.254"
+
+
+class World:
+    """What is not in moto: the VMs, capacity and notices."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.full: set[str] = set()
+        self.vms: dict[str, subprocess.Popen[bytes]] = {}
+        self.notices: dict[str, str] = {}
+        self.rebalance: dict[str, str] = {}
+        self.log: list[dict[str, Any]] = []
+        self._addresses = (f"10.66.{n // 250}.{n % 250 + 1}" for n in itertools.count(2))
+
+    def address(self, *_: Any, **__: Any) -> str:
+        return next(self._addresses)
+
+    def say(self, event: str, **what: Any) -> None:
+        self.log.append({"event": event, "at": time.time(), **what})
+        print(json.dumps(self.log[-1]), flush=True)
+
+    def boot(self, instance: Any) -> None:
+        user, key = user_of(instance)
+        name = "f" + instance.id[-8:]
+        with (IMAGE / f"{instance.id}.log").open("wb") as log:
+            self.vms[instance.id] = subprocess.Popen(
+                ["bash", HERE / "vm.sh", name, instance.public_ip, IMAGE, IMAGE / "host", user, key,
+                 *HIDDEN],
+                stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+            )  # fmt: skip
+        spot = getattr(instance, "lifecycle", None) == "spot"
+        self.say(
+            "boot", id=instance.id, ip=instance.public_ip, zone=instance.placement.zone, spot=spot
+        )
+
+    def kill(self, id: str) -> None:
+        with self.lock:
+            vm = self.vms.pop(id, None)
+        if vm is None:
+            return
+        os.killpg(vm.pid, signal.SIGKILL)
+        vm.wait()
+        name = "f" + id[-8:]
+        subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
+        subprocess.run(["rm", "-rf", IMAGE / "vm" / name], check=False)
+        self.say("kill", id=id)
+
+    def preempt(self, id: str) -> None:
+        for _, backend, instance in all_instances():
+            if instance.id == id and instance.state != "terminated":
+                self.say("preempt", id=id)
+                backend.terminate_instances([id])
+
+
+WORLD = World()
+
+
+def user_of(instance: Any) -> tuple[str, str]:
+    """Return the account and the key that SkyPilot asks cloud-init for."""
+    text = str(instance.user_data or "")
+    for _ in range(3):  # encoded by boto3, and kept encoded by moto
+        if text.startswith("#cloud-config"):
+            break
+        text = base64.b64decode(text).decode()
+    account = yaml.safe_load(text)["users"][0]
+    return account["name"], account["ssh_authorized_keys"][0]
+
+
+def all_instances() -> Iterator[tuple[str, Any, Any]]:
+    for account in list(ec2_backends.values()):
+        for region, backend in list(account.items()):
+            for reservation in list(backend.reservations.values()):
+                for instance in reservation.instances:
+                    yield region, backend, instance
+
+
+def patch_moto() -> None:
+    elastic_network_interfaces.random_public_ip = WORLD.address
+    run = instances.InstanceBackend.run_instances
+
+    def run_instances(self: Any, image: str, count: int, data: Any, groups: Any, **kw: Any) -> Any:
+        zone = kw.get("placement") or ""
+        for card in kw.get("nics") or []:
+            if card.get("SubnetId"):
+                zone = self.get_subnet(card["SubnetId"]).availability_zone
+        if kw.get("instance_market_options") and WORLD.full & {zone, self.region_name}:
+            WORLD.say("refused", zone=zone)
+            raise EC2ClientError(
+                "InsufficientInstanceCapacity",
+                f"There is no Spot capacity available that matches your request in {zone}.",
+            )
+        made = run(self, image, count, data, groups, **kw)
+        for instance in made.instances:
+            WORLD.boot(instance)
+        return made
+
+    instances.InstanceBackend.run_instances = run_instances
+    spot_instances.SpotInstances.describe_spot_price_history = price_history
+    for name in ("terminate", "stop"):
+        setattr(instances.Instance, name, killing(getattr(instances.Instance, name)))
+
+
+def price_history(self: Any) -> ActionResult:
+    """Answer with prices a little below the catalogue's, so that a test can tell them apart."""
+    kinds = self._get_param("InstanceTypes", [])
+    region = self.ec2_backend.region_name
+    found = self.ec2_backend.describe_spot_price_history(kinds, {})
+    cpus = {"m6i.large": 2, "m6i.xlarge": 4}
+    return ActionResult(
+        {
+            "SpotPriceHistory": [
+                {
+                    "InstanceType": p["InstanceType"],
+                    "ProductDescription": "Linux/UNIX",
+                    "SpotPrice": f"{SPOT[region] * cpus.get(p['InstanceType'], 2) / 2:.6f}",
+                    "AvailabilityZone": p["Location"],
+                    "Timestamp": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
+                }
+                for p in found
+            ]
+        }
+    )
+
+
+def killing(method: Any) -> Any:
+    def wrapped(self: Any, *args: Any, **kw: Any) -> Any:
+        WORLD.kill(self.id)
+        return method(self, *args, **kw)
+
+    return wrapped
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers JSON or text, and logs nothing."""
+
+    def log_message(self, *_: Any) -> None: ...
+
+    def answer(self, body: Any, status: int = 200) -> None:
+        data = body.encode() if isinstance(body, str) else json.dumps(body).encode()
+        self.send_response(status)
+        self.send_header("content-length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+
+class Control(Handler):
+    def do_GET(self) -> None:
+        if self.path == "/log":
+            return self.answer(WORLD.log)
+        return self.answer(
+            [
+                {
+                    "id": i.id, "region": region, "zone": i.placement.zone, "state": i.state,
+                    "ip": i.public_ip, "spot": getattr(i, "lifecycle", None) == "spot",
+                    "labels": {tag["key"]: tag["value"] for tag in i.get_tags()},
+                }
+                for region, _, i in all_instances()
+            ]
+        )  # fmt: skip
+
+    def do_POST(self) -> None:
+        url = urllib.parse.urlparse(self.path)
+        asked = dict(urllib.parse.parse_qsl(url.query))
+        now = datetime.now(timezone.utc)
+        if url.path == "/capacity":
+            (WORLD.full.discard if asked["has"] == "1" else WORLD.full.add)(asked["place"])
+        elif url.path == "/preempt":
+            WORLD.preempt(asked["id"])
+        elif url.path == "/notice":
+            in_s = float(asked["in_s"])
+            WORLD.notices[asked["id"]] = f"{now + timedelta(seconds=in_s):%Y-%m-%dT%H:%M:%SZ}"
+            WORLD.say("notice", id=asked["id"], in_s=in_s)
+            timer = threading.Timer(in_s, WORLD.preempt, [asked["id"]])
+            timer.daemon = True
+            timer.start()
+        elif url.path == "/rebalance":
+            WORLD.rebalance[asked["id"]] = f"{now:%Y-%m-%dT%H:%M:%SZ}"
+        else:
+            return self.answer({"error": "not found"}, 404)
+        return self.answer({})
+
+
+class Metadata(Handler):
+    """Instance metadata, version 2 only: a request without a token is refused."""
+
+    def do_PUT(self) -> None:
+        ttl = self.headers.get("X-aws-ec2-metadata-token-ttl-seconds")
+        self.answer("t0k3n" if ttl else "", 200 if ttl else 400)
+
+    def do_GET(self) -> None:
+        if self.headers.get("X-aws-ec2-metadata-token") != "t0k3n":
+            return self.answer("", 401)
+        found = next(
+            (i for _, _, i in all_instances()
+             if i.public_ip == self.client_address[0] and i.state == "running"), None,
+        )  # fmt: skip
+        if found is None:
+            return self.answer("", 404)
+        credentials = {
+            "Code": "Success", "Type": "AWS-HMAC", "AccessKeyId": "test", "Token": "test",
+            "SecretAccessKey": "test", "LastUpdated": "2024-01-01T00:00:00Z",
+            "Expiration": "2099-01-01T00:00:00Z",
+        }  # fmt: skip
+        taken = WORLD.notices.get(found.id)
+        recommended = WORLD.rebalance.get(found.id)
+        answers: dict[str, Any] = {
+            "instance-id": found.id,
+            "placement/availability-zone": found.placement.zone,
+            "iam/security-credentials/": "skypilot-v1",
+            "iam/security-credentials/skypilot-v1": credentials,
+            "spot/instance-action": taken and {"action": "terminate", "time": taken},
+            "events/recommendations/rebalance": recommended and {"noticeTime": recommended},
+        }
+        body = answers.get(self.path.removeprefix("/latest/meta-data/"))
+        return self.answer(body, 200) if body else self.answer("", 404)
+
+
+def prepare_account() -> None:
+    """Make what an account has: subnets that lead somewhere, and SkyPilot's role.
+
+    SkyPilot would make the role itself, and then sleep 30 s for it to spread.
+    """
+    access = {"aws_access_key_id": "test", "aws_secret_access_key": "test",
+              "endpoint_url": "http://127.0.0.1:5566"}  # fmt: skip
+    iam = boto3.client("iam", region_name="us-east-1", **access)
+    iam.create_instance_profile(InstanceProfileName="skypilot-v1")
+    iam.create_role(RoleName="skypilot-v1", AssumeRolePolicyDocument="{}")
+    iam.add_role_to_instance_profile(InstanceProfileName="skypilot-v1", RoleName="skypilot-v1")
+    for region in REGIONS:
+        ec2 = boto3.client("ec2", region_name=region, **access)
+        default = [{"Name": "is-default", "Values": ["true"]}]
+        vpc = ec2.describe_vpcs(Filters=default)["Vpcs"][0]["VpcId"]
+        gateway = ec2.create_internet_gateway()["InternetGateway"]["InternetGatewayId"]
+        ec2.attach_internet_gateway(InternetGatewayId=gateway, VpcId=vpc)
+        of_vpc = [{"Name": "vpc-id", "Values": [vpc]}]
+        table = ec2.describe_route_tables(Filters=of_vpc)["RouteTables"][0]["RouteTableId"]
+        ec2.create_route(RouteTableId=table, DestinationCidrBlock="0.0.0.0/0", GatewayId=gateway)
+
+
+def main() -> None:
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    patch_moto()
+    ThreadedMotoServer(ip_address="0.0.0.0", port=5566, verbose=False).start()
+    prepare_account()
+
+    def stop(*_: Any) -> None:
+        for id in list(WORLD.vms):
+            WORLD.kill(id)
+        os._exit(0)
+
+    signal.signal(signal.SIGTERM, stop)
+    metadata = ThreadingHTTPServer((METADATA, 80), Metadata)
+    threading.Thread(target=metadata.serve_forever, daemon=True).start()
+    ThreadingHTTPServer(("127.0.0.1", 5567), Control).serve_forever()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

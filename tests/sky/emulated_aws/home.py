@@ -1,0 +1,68 @@
+"""Make the home of whoever launches: credentials, SkyPilot's configuration and its catalogue.
+
+The catalogue is a small one of the emulation's own: three regions with two zones each. SkyPilot
+maps zone ids (`use1-az1`) to names by asking AWS, as it does with the real catalogue.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+REGIONS = {"us-east-1": ("use1", 0.020), "us-west-2": ("usw2", 0.025), "eu-west-1": ("euw1", 0.040)}
+IMAGE = "ami-1e749f67"  # one that moto has in every region
+VMS = (
+    "InstanceType,AcceleratorName,AcceleratorCount,vCPUs,MemoryGiB,GpuInfo,Price,SpotPrice,"
+    "Region,AvailabilityZone,Arch"
+)
+
+
+def main(home: Path) -> None:
+    spec = find_spec("sky")
+    assert spec is not None
+    assert spec.origin is not None
+    constants = (Path(spec.origin).parent / "skylet" / "constants.py").read_text()
+    version = re.search(r"CATALOG_SCHEMA_VERSION\s*=\s*'([^']+)'", constants)
+    assert version is not None
+    catalogue = home / ".sky" / "catalogs" / version[1]
+    rows = [
+        [kind, "", "", cpus, 4 * cpus, "", 0.05 * cpus, spot * cpus / 2 + n / 1000, region,
+         f"{zone}-az{n}", "x86_64"]
+        for region, (zone, spot) in REGIONS.items()
+        for n in (1, 2)
+        for kind, cpus in (("m6i.large", 2), ("m6i.xlarge", 4))
+    ]  # fmt: skip
+    write(catalogue / "aws/vms.csv", VMS.split(","), rows)
+    tags = ("cpu-ubuntu", "gpu-ubuntu", "gpu-ubuntu-cuda13")
+    images = [
+        [f"skypilot:custom-{tag}", region, "ubuntu", "22.04", IMAGE, "20240101"]
+        for region in REGIONS
+        for tag in tags
+    ]
+    header = ["Tag", "Region", "OS", "OSVersion", "ImageId", "CreationDate"]
+    write(catalogue / "aws/images.csv", header, images)
+    quotas = ["InstanceType", "OnDemandInstanceCode", "SpotInstanceCode"]
+    write(catalogue / "aws/instance_quota_mapping.csv", quotas, [])
+    write(catalogue / "common/metadata.csv", ["GPU", "MemoryGB"], [])
+    text(
+        home / ".aws/credentials", "[default]\naws_access_key_id=test\naws_secret_access_key=test\n"
+    )
+    text(home / ".sky/config.yaml", "allowed_clouds: [aws]\naws:\n  remote_identity: skypilot-v1\n")
+
+
+def write(path: Path, header: list[str], rows: list[list[object]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+
+
+def text(path: Path, content: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

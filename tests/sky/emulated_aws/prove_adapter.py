@@ -1,0 +1,270 @@
+"""The adapter against unmodified SkyPilot on the emulated AWS: every launch, loss and end is real.
+
+Runs inside a world (`world.sh`). The server proxy's place is taken by a plain web server, after
+fogft's own set-up has run on the VM: what is proved here is the cloud, not the wire.
+Prints a table of steps and writes it to RESULTS; ends with status 1 at the first thing wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.port import Launch
+from fogft.cloud.sky import template
+from fogft.cloud.sky.adapter import SkyCloud
+from fogft.cloud.sky.aws import Aws
+from fogft.cloud.sky.installed import InstalledSky
+from fogft.core.errors import CloudUnreachable
+from fogft.core.model import Machine, MachinePhase, Offer, ReplicaId
+
+UID = "00000000000000aa"
+CONTROL = os.environ["EMULATED_AWS"]
+RESOURCES = {
+    "cpus": "2",
+    "use_spot": True,
+    "any_of": [{"infra": f"aws/{region}"} for region in ("us-east-1", "us-west-2", "eu-west-1")],
+}
+TASK = {
+    "resources": RESOURCES,
+    "envs": {"GREETING": "hello"},
+    "setup": "echo setup of the pool file: $GREETING > ~/setup-ran",
+    "run": "unused",
+}
+FILES = {"replica.yaml": b"slot: 0\n", "replica.key": b"secret\n"}
+STEPS: list[tuple[str, float]] = []
+
+
+def control(path: str, *, post: bool = True) -> Any:
+    request = urllib.request.Request(CONTROL + path, method="POST" if post else "GET")
+    return json.load(urllib.request.urlopen(request, timeout=30))
+
+
+def running() -> list[dict[str, Any]]:
+    return [i for i in control("/instances", post=False) if i["state"] == "running"]
+
+
+@contextmanager
+def step(name: str) -> Iterator[None]:
+    start = time.monotonic()
+    yield
+    STEPS.append((name, time.monotonic() - start))
+    print(f"{STEPS[-1][1]:7.1f} s  {name}", flush=True)
+
+
+def until(what: str, is_so: Callable[[], Any], limit_s: float = 600.0) -> Any:
+    pause, end = threading.Event(), time.monotonic() + limit_s
+    while time.monotonic() < end:
+        found = is_so()
+        if found:
+            return found
+        pause.wait(0.25)
+    raise AssertionError(f"not within {limit_s:.0f} s: {what}")
+
+
+def get(endpoint: str, path: str = "/") -> str:
+    try:
+        return str(urllib.request.urlopen(f"http://{endpoint}{path}", timeout=3).read().decode())
+    except (OSError, urllib.error.URLError):
+        return ""
+
+
+class Proof:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.cloud = self.another_process()
+
+    def another_process(self) -> SkyCloud:
+        return SkyCloud(self.folder, InstalledSky(), [Aws()], owner="proof", base=Path("/tmp"))
+
+    def offer(self, region: str) -> Offer:
+        offers = self.cloud.offers(RESOURCES)
+        return next(o for o in offers if o.placement.region == region and o.placement.spot)
+
+    def launch(self, slot: int, generation: int, region: str, **task: Any) -> ReplicaId:
+        id, offer = ReplicaId(UID, slot, generation), self.offer(region)
+        self.cloud.launch(
+            Launch(
+                id, "proof", offer.placement, offer.usd_per_hour, "abcd", {**TASK, **task}, FILES
+            )
+        )
+        return id
+
+    def machine(self, id: ReplicaId) -> Machine | None:
+        return next((m for m in self.cloud.machines(UID) if m.id == id), None)
+
+    def phase(self, id: ReplicaId) -> MachinePhase | None:
+        machine = self.machine(id)
+        if machine is not None and machine.phase is MachinePhase.FAILED:
+            print(f"{id.short}: {machine.failure}", flush=True)
+        return machine and machine.phase
+
+    def runs(self, id: ReplicaId) -> Machine:
+        ended = (MachinePhase.RUNNING, MachinePhase.FAILED)
+        until(f"{id.short} runs", lambda: self.phase(id) in ended)
+        machine = self.machine(id)
+        assert machine is not None
+        assert machine.phase is MachinePhase.RUNNING, machine.failure
+        return machine
+
+    def run(self) -> None:
+        a, b = self.two_regions()
+        self.preemption(a)
+        self.capacity_and_setup()
+        self.another_takes_over(b)
+        self.server_dies(b)
+        self.everything_ends(b)
+
+    def two_regions(self) -> tuple[ReplicaId, ReplicaId]:
+        with step("check credentials"):
+            assert self.cloud.check(["aws"]) == {"aws": ""}
+        with step("offers"):
+            offers = self.cloud.offers(RESOURCES)
+        assert {o.source for o in offers} == {"live"}
+        assert offers[0].usd_per_hour == 0.019
+        assert {o.placement.region for o in offers} == {"us-east-1", "us-west-2", "eu-west-1"}
+        with step("launch two, until SkyPilot has accepted both"):
+            a = self.launch(0, 1, "us-east-1")
+            b = self.launch(1, 1, "us-west-2")
+        assert {m.phase for m in self.cloud.machines(UID)} == {MachinePhase.PROVISIONING}
+        with step("... until both run"):
+            first, second = self.runs(a), self.runs(b)
+        assert first.endpoint is not None
+        assert second.endpoint is not None
+        assert {first.placement.region, second.placement.region} == {"us-east-1", "us-west-2"}
+        with step("... until set-up is done and the service answers"):
+            until("a answers", lambda: get(first.endpoint or ""))
+            until("b answers", lambda: get(second.endpoint or ""))
+        # What the VM got: the user's set-up, fogft from our wheel, the replica's files and no more.
+        assert "hello" in get(first.endpoint, "/setup-ran")
+        assert "Usage: fogft" in get(first.endpoint, "/fogft-help")
+        assert get(first.endpoint, "/modes").split() == ["700", "600"]
+        for instance in running():
+            assert instance["labels"]["fogft-pool"] == UID
+            assert instance["spot"]
+        with step("list, from SkyPilot's memory"):
+            assert len(self.cloud.machines(UID)) == 2
+        return a, b
+
+    def preemption(self, a: ReplicaId) -> None:
+        mine = next(i for i in running() if i["labels"]["fogft-slot"] == "0")
+        control(f"/preempt?id={mine['id']}")
+        with step("detect a preemption: targeted refresh, then the list"):
+            self.cloud.refresh(a)
+            left = self.cloud.machines(UID)
+        assert [m.id.slot for m in left] == [1], left
+        with step("terminate what is gone already"):
+            self.cloud.terminate(a)
+
+    def capacity_and_setup(self) -> None:
+        for region in ("us-east-1", "us-west-2"):
+            control(f"/capacity?place={region}&has=0")
+        with step("a launch without capacity, until it is listed as failed"):
+            c = self.launch(0, 2, "us-east-1")
+            until("c has failed", lambda: self.phase(c) is MachinePhase.FAILED)
+        machine = self.machine(c)
+        assert machine is not None
+        assert machine.failure.startswith("capacity: "), machine.failure
+        self.cloud.terminate(c)
+        with step("a launch whose set-up fails, until its VM is gone"):
+            d = self.launch(0, 3, "eu-west-1", setup="echo no such package: yolo; exit 3")
+            until("d has failed", lambda: self.phase(d) is MachinePhase.FAILED)
+            until("d's VM is gone", lambda: len(running()) == 1)
+        machine = self.machine(d)
+        assert machine is not None
+        assert machine.failure.startswith("setup: "), machine.failure
+        assert "yolo" in machine.failure, machine.failure
+        self.cloud.terminate(d)
+        for region in ("us-east-1", "us-west-2"):
+            control(f"/capacity?place={region}&has=1")
+
+    def another_takes_over(self, b: ReplicaId) -> None:
+        e = self.launch(0, 4, "us-east-1")
+        self.cloud.close()
+        self.cloud = self.another_process()
+        with step("another process takes a launch over, until it runs"):
+            self.runs(e)
+        assert {m.id for m in self.cloud.machines(UID)} == {b, e}
+        f = self.launch(2, 1, "eu-west-1")
+        until("f's VM exists", lambda: len(running()) == 3)
+        with step("terminate in mid launch"):
+            self.cloud.terminate(f)
+        assert len(running()) == 2
+        with step("terminate a running replica"):
+            self.cloud.terminate(e)
+        assert [i["labels"]["fogft-slot"] for i in running()] == ["1"]
+
+    def server_dies(self, b: ReplicaId) -> None:
+        import psutil
+
+        servers = [
+            process
+            for process in psutil.process_iter(["cmdline"])
+            if "sky.server.server" in " ".join(process.info["cmdline"] or ())
+        ]
+        assert servers
+        for process in [*servers, *(c for s in servers for c in s.children(recursive=True))]:
+            try:
+                process.kill()
+            except psutil.NoSuchProcess:
+                continue
+        with step("SkyPilot's API server is killed; until machines are listed again"):
+
+            def listed() -> bool:
+                try:
+                    return [m.id for m in self.cloud.machines(UID)] == [b]
+                except CloudUnreachable as error:
+                    print(error.message, flush=True)
+                    return False
+
+            until("the list is back", listed)
+
+    def everything_ends(self, b: ReplicaId) -> None:
+        with step("terminate the last one"):
+            self.cloud.terminate(b)
+        with step("sweep: nothing of any pool is left"):
+            assert not self.cloud.sweep()
+        assert not running()
+        assert not self.cloud.machines(UID)
+
+
+def stub_server() -> None:
+    """Let a web server stand where the server proxy will: it shows what the VM looks like."""
+    read = template.read
+
+    def with_stub() -> dict[str, Any]:
+        made = read()
+        made["run"] = (
+            "cd ~ && mkdir -p shown && cp setup-ran shown/ && cd shown\n"
+            "~/.fogft/venv/bin/fogft --help > fogft-help\n"
+            "stat -c %a ~/.fogft/replica ~/.fogft/replica/replica.key > modes\n"
+            "exec python3 -m http.server @PORT@\n"
+        )
+        return made
+
+    template.read = with_stub
+
+
+def main() -> int:
+    stub_server()
+    try:
+        Proof(Path("/robot/fogft/sky")).run()
+    finally:
+        table = "".join(f"{seconds:7.1f} s  {name}\n" for name, seconds in STEPS)
+        Path(sys.argv[1], "adapter.txt").write_text(table)
+    print("every step passed")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

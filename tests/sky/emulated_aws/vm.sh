@@ -1,0 +1,41 @@
+#!/bin/bash
+# One VM: network, mount and process namespaces of its own over the baked image, with a real sshd
+# in the foreground. It ends, with all that runs in it, when this process is killed.
+# usage: vm.sh NAME ADDRESS IMAGE HOST_ROOT USER PUBLIC_KEY HIDDEN...
+set -euo pipefail
+name=$1 address=$2 image=$3 host_root=$4 user=$5 key=$6
+shift 6
+disk=$image/vm/$name
+mkdir -p "$disk/upper" "$disk/work" "$disk/root"
+ip netns add "$name"
+ip link add "v$name" type veth peer name eth0 netns "$name"
+ip link set "v$name" master br0 up
+ip -n "$name" addr add "$address/16" dev eth0
+ip -n "$name" link set eth0 up
+ip -n "$name" link set lo up
+ip -n "$name" route add default via 10.66.0.1  # the emulation: nothing is forwarded from there
+# The outer shell must not be in the way of a kill: exec.
+exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
+  bash -euc '
+    disk=$1 image=$2 host_root=$3 user=$4 key=$5 address=$6
+    shift 6
+    mount --make-rprivate /
+    mount -t overlay overlay \
+      -o "lowerdir=$image/layer:$host_root,upperdir=$disk/upper,workdir=$disk/work" "$disk/root"
+    cd "$disk/root"
+    mount -t proc proc proc
+    mount --rbind /dev dev
+    for folder in dev/shm tmp run; do mount -t tmpfs tmpfs "$folder"; done
+    # What lies on the launching machine is not on a VM.
+    for folder in "$@"; do [ ! -d ".$folder" ] || mount -t tmpfs tmpfs ".$folder"; done
+    chmod 1777 tmp dev/shm
+    mkdir -p run/sshd
+    hostname "ip-${address//./-}"
+    echo "127.0.0.1 localhost ip-${address//./-}" >etc/hosts
+    : >etc/resolv.conf
+    install -d -m700 "home/$user/.ssh"
+    echo "$key" >"home/$user/.ssh/authorized_keys"
+    chown -R --reference="home/$user" "home/$user/.ssh"
+    exec env -i PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
+      chroot . /usr/sbin/sshd -D -e -o UsePAM=no -o PidFile=/run/sshd.pid
+  ' vm "$disk" "$image" "$host_root" "$user" "$key" "$address" "$@"

@@ -1,0 +1,56 @@
+#!/bin/bash
+# Run a command inside a world of its own: an emulated AWS, a network that leads nowhere else, and a
+# root whose every change vanishes. When the command ends, all of it is gone.
+# usage (as root): world.sh VENV RESULTS COMMAND...
+#   VENV     with skypilot[aws], moto[ec2,server], uv and fogft
+#   RESULTS  the one folder that outlives the world
+# `IMAGE_CACHE=FILE.tar` keeps the baked image for the next time.
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+if [ "${1:-}" != --inside ]; then
+  exec unshare --mount --propagation private "$here/world.sh" --inside "$@"
+fi
+shift
+venv=$1 results=$2
+shift 2
+image=$(mktemp -d /tmp/fogft-world.XXXXXX)
+trap 'umount -l "$image"; rmdir "$image"' EXIT
+mount -t tmpfs -o size=14g tmpfs "$image"  # overlays need a file system other than the root's
+start=$SECONDS
+if [ -n "${IMAGE_CACHE:-}" ] && [ -f "$IMAGE_CACHE" ]; then
+  tar -C "$image" --xattrs --xattrs-include='*' -xf "$IMAGE_CACHE"
+else
+  "$here/bake.sh" "$image" "$venv"
+  [ -z "${IMAGE_CACHE:-}" ] ||
+    tar -C "$image" --xattrs --xattrs-include='*' -cf "$IMAGE_CACHE" layer robot
+fi
+echo "world: image ready after $((SECONDS - start)) s, $(du -sh "$image/layer" | cut -f1)" >&2
+
+# The launching machine's root: the same layer (it needs ssh and rsync), and what it writes.
+mkdir -p "$image/vm" "$image/upper" "$image/upper-work" "$image/root" "$image/host"
+mount -t overlay overlay \
+  -o "lowerdir=$image/layer:/,upperdir=$image/upper,workdir=$image/upper-work" "$image/root"
+root=$image/root
+mount --bind / "$image/host"
+mount --rbind /dev "$root/dev"
+mount -t tmpfs tmpfs "$root/dev/shm"
+mount -t tmpfs tmpfs "$root/run"
+mkdir -p "$root$image" "$root/robot" "$root$results"
+mount --bind "$image" "$root$image"
+mount --bind "$image/host" "$root$image/host"
+mount --bind "$results" "$root$results"
+cp -r "$image/robot/." "$root/robot/"
+
+unshare --net --pid --ipc --uts --fork --kill-child bash -euc '
+  root=$1 here=$2 venv=$3 image=$4
+  shift 4
+  ip link set lo up
+  ip link add br0 type bridge
+  ip addr add 10.66.0.1/16 dev br0
+  ip addr add 169.254.169.254/32 dev br0  # where a VM asks for its metadata
+  ip link set br0 up
+  mount -t proc proc "$root/proc"
+  exec chroot "$root" env -i HOME=/robot PATH="$venv/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \
+    LANG=C.UTF-8 PYTHONPATH= EMULATION="$image" HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
+    "$venv/bin/python" "$here/inside.py" "$@"
+' world "$root" "$here" "$venv" "$image" "$@"

@@ -1,0 +1,539 @@
+"""What the adapter does when everything works, and when each part of the cloud does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fogft.cloud.sky import naming
+from fogft.cloud.sky.following import DEFAULT_LIMITS
+from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
+from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
+from fogft.core.model import MachinePhase
+from tests.sky.scene import Scene
+from tests.sky.scripted_sky import EAST, WEST, replica
+
+ID = replica()
+NAME = naming.cluster_name(ID)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return Scene(tmp_path)
+
+
+# -- the good path --------------------------------------------------------------------------
+
+
+def test_a_launch_is_listed_at_once_and_becomes_a_running_machine(scene: Scene):
+    scene.cloud.launch(scene.order())
+    assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.sky.boot(NAME)
+    scene.work()
+    assert scene.machine().progress == "launching"
+    scene.sky.finish(NAME, JobState.SETTING_UP)
+    scene.work()
+    assert scene.machine().progress == "setting up"
+    assert scene.machine().phase is MachinePhase.RUNNING, "the machine runs, whatever runs on it"
+    scene.sky.jobs[NAME] = JobState.RUNNING
+    scene.work()
+    machine = scene.machine()
+    assert (machine.phase, machine.progress) == (MachinePhase.RUNNING, "")
+    assert machine.endpoint is not None
+    assert machine.endpoint.endswith(":7447")
+    assert (machine.usd_per_hour, machine.spec_hash, machine.placement) == (0.021, "abcd", EAST)
+
+
+def test_repeating_a_launch_does_nothing(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.cloud.launch(scene.order())
+    assert scene.sky.asked("launch") == [NAME]
+
+
+def test_terminate_leaves_nothing_in_any_list_and_can_be_repeated(scene: Scene):
+    scene.launched()
+    scene.cloud.terminate(ID)
+    scene.cloud.terminate(ID)
+    assert not scene.machines()
+    assert not scene.sky.records
+    assert not scene.provider.found
+    assert not scene.cloud._journal.files(ID).exists()
+
+
+def test_a_pool_sees_its_own_machines_only(scene: Scene):
+    other = replica(uid="00000000000000bb")
+    scene.cloud.launch(scene.order(other))
+    scene.launched()
+    assert [m.id for m in scene.machines()] == [ID]
+
+
+def test_clusters_of_others_are_never_named_to_skypilot(scene: Scene):
+    """Every call that changes something is about a name that one of our ids makes."""
+    scene.launched()
+    for name in ("dev", "fogft", "fogft-00000000000000aa", "fogft-00000000000000aa-x-1"):
+        scene.sky.records[name] = scene.sky.records[NAME].__class__(name, ClusterState.UP)
+    scene.machines()
+    scene.cloud.terminate(ID)
+    changed = [s for call in ("down", "launch") for s in scene.sky.asked(call)]
+    assert set(changed) == {NAME}
+    assert len(scene.sky.records) == 4
+
+
+def test_the_list_of_clusters_is_asked_once_in_five_seconds(scene: Scene):
+    scene.launched()
+    before = len(scene.sky.asked("clusters"))
+    for _ in range(5):
+        scene.machines()
+    assert len(scene.sky.asked("clusters")) - before <= 1
+
+
+# -- refused, failed and hanging launches -----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("InsufficientInstanceCapacity: no Spot capacity", NoCapacity),
+        ("MaxSpotInstanceCountExceeded: Max spot instance count exceeded", QuotaExceeded),
+        ("something else", CloudError),
+    ],
+)
+def test_a_launch_that_is_refused_at_once_leaves_no_trace(scene: Scene, text: str, error: type):
+    scene.sky.fail_next("launch", RefusedError("ValueError", [text]))
+    with pytest.raises(error):
+        scene.cloud.launch(scene.order())
+    assert not scene.machines()
+    assert not scene.cloud._journal.files(ID).exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ("InsufficientInstanceCapacity", "capacity"),
+        ("VcpuLimitExceeded: You have requested more vCPU", "quota"),
+        ("RequestExpired: Request has expired", "credentials"),
+        ("boom", "error"),
+    ],
+)
+def test_a_launch_that_fails_is_listed_with_its_cause_until_it_is_terminated(
+    scene: Scene, text: str, cause: str
+):
+    kind = "ResourcesUnavailableError" if cause != "error" else "RuntimeError"
+    scene.cloud.launch(scene.order())
+    scene.sky.fail(NAME, kind, "Failed to acquire resources", text)
+    scene.work()
+    machine = scene.machine()
+    assert machine.phase is MachinePhase.FAILED
+    assert machine.failure.split(":")[0] == cause
+    assert text in machine.failure
+    scene.cloud.terminate(ID)
+    assert not scene.machines()
+
+
+def test_a_launch_that_fails_after_the_vm_was_made_leaves_no_vm(scene: Scene):
+    """Nobody has to notice first: the machine is taken down as soon as the failure is known."""
+    scene.cloud.launch(scene.order())
+    scene.sky.boot(NAME)
+    scene.sky.finish(NAME)  # SkyPilot may even call it UP
+    scene.sky.fail(NAME, "CommandError", "Command failed with return code 1")
+    scene.work()
+    assert scene.machine().phase is MachinePhase.FAILED
+    assert not scene.provider.found
+
+
+def test_a_failed_launch_whose_vm_cannot_be_ended_stays_listed(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.boot(NAME)
+    scene.sky.down_fails = 99
+    scene.sky.fail(NAME, "RuntimeError", "ray did not start")
+    scene.work()
+    assert scene.machine().phase is MachinePhase.FAILED
+    scene.sky.down_fails = 0
+    scene.cloud.terminate(ID)
+    assert not scene.provider.found
+    assert not scene.machines()
+
+
+def test_a_launch_that_hangs_is_aborted_and_taken_down(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.boot(NAME)
+    scene.work()
+    scene.pass_s(DEFAULT_LIMITS.launch_s)
+    scene.work()
+    machine = scene.machine()
+    assert machine.failure.startswith("timeout: still launching after 900 s")
+    assert f"provisioning {NAME}" in machine.failure
+    assert scene.sky.asked("cancel")
+    assert not scene.provider.found
+
+
+def test_a_failed_setup_shows_the_end_of_its_log_and_ends_the_vm(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.job_logs[NAME] = "collecting\nERROR: no such package: yolo\n"
+    scene.sky.finish(NAME, JobState.SETUP_FAILED)
+    scene.work()
+    machine = scene.machine()
+    assert machine.failure.startswith("setup: ")
+    assert "no such package: yolo" in machine.failure
+    assert not scene.provider.found
+
+
+def test_a_server_proxy_that_ends_at_once_is_a_failure_with_its_log(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.job_logs[NAME] = "error: `replica.yaml`: key 'run' is missing\n"
+    scene.sky.finish(NAME, JobState.ENDED)
+    scene.work()
+    assert "key 'run' is missing" in scene.machine().failure
+
+
+def test_a_setup_that_hangs_ends_at_its_own_limit(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.finish(NAME, JobState.SETTING_UP)
+    scene.work()
+    scene.pass_s(DEFAULT_LIMITS.launch_s)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.RUNNING
+    scene.pass_s(DEFAULT_LIMITS.setup_s)
+    scene.work()
+    assert scene.machine().failure.startswith("timeout: still setting up")
+    assert not scene.provider.found
+
+
+def test_what_cannot_be_honoured_is_refused_before_anything_is_written(scene: Scene):
+    with pytest.raises(SpecError, match=r"resources\.ports"):
+        scene.cloud.launch(scene.order(task={"resources": {"ports": 8080}}))
+    assert not scene.machines()
+    assert not scene.sky.calls or "launch" not in dict(scene.sky.calls)
+
+
+# -- preemption -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("provider", [True, False])
+def test_a_preempted_machine_is_gone_after_a_refresh_of_it_alone(tmp_path: Path, provider: bool):
+    """The provider's word counts at once; without it SkyPilot refreshes one record."""
+    scene = Scene(tmp_path, with_provider=provider)
+    scene.launched(replica(0))
+    scene.launched(replica(1), WEST)
+    scene.sky.preempt(NAME)
+    scene.pass_s(60)
+    assert len(scene.machines()) == 2, "SkyPilot's memory is not the cloud"
+    before = len(scene.sky.asked("refresh"))
+    scene.cloud.refresh(ID)
+    assert [m.id for m in scene.machines()] == [replica(1)]
+    scene.work()
+    assert scene.sky.asked("refresh")[before:] == [NAME]
+    assert NAME not in scene.sky.records, "the dead record is cleaned up"
+    assert [m.id for m in scene.machines()] == [replica(1)]
+
+
+def test_a_machine_that_the_provider_still_lists_is_left_alone(scene: Scene):
+    scene.launched()
+    scene.pass_s(60)
+    scene.cloud.refresh(ID)
+    assert scene.machine().phase is MachinePhase.RUNNING
+    assert not scene.sky.asked("refresh")
+
+
+def test_a_provider_that_may_not_be_asked_leaves_the_refresh_to_skypilot(scene: Scene):
+    scene.launched()
+    scene.sky.preempt(NAME)
+    scene.provider.allowed = False
+    scene.pass_s(60)
+    scene.cloud.refresh(ID)
+    assert scene.sky.asked("refresh") == [NAME]
+    assert not scene.machines()
+
+
+def test_a_stopped_machine_has_failed(scene: Scene):
+    scene.launched()
+    record = scene.sky.records[NAME]
+    scene.sky.records[NAME] = type(record)(NAME, ClusterState.STOPPED, EAST)
+    scene.pass_s(10)
+    assert scene.machine().phase is MachinePhase.FAILED
+
+
+def test_a_running_replica_that_skypilot_no_longer_understands_is_left_to_its_link(scene: Scene):
+    """Its health comes from the data path: INIT alone ends nothing that answers."""
+    scene.launched()
+    record = scene.sky.records[NAME]
+    scene.sky.records[NAME] = type(record)(NAME, ClusterState.INIT, EAST, "10.0.0.9")
+    scene.pass_s(10)
+    assert scene.machine().phase is MachinePhase.RUNNING
+
+
+# -- cannot tell is not gone -------------------------------------------------------------------
+
+
+def test_credentials_that_expire_while_running_take_nothing_away(scene: Scene):
+    scene.launched()
+    scene.pass_s(10)
+    scene.sky.fail_next("clusters", CloudUnreachable("ExpiredToken"))
+    with pytest.raises(CloudUnreachable):
+        scene.machines()
+    scene.pass_s(60)
+    scene.provider.reachable = False
+    with pytest.raises(CloudUnreachable):
+        scene.cloud.refresh(ID)
+    assert scene.machine().phase is MachinePhase.RUNNING
+
+
+def test_a_server_that_dies_during_a_launch_only_delays_it(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.fail_next("request", CloudUnreachable("connection refused"), times=3)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.sky.finish(NAME)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.RUNNING
+
+
+def test_a_server_that_forgot_a_launch_is_asked_for_the_machine(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.boot(NAME)
+    record = scene.sky.records[NAME]
+    scene.sky.forget_everything()
+    scene.work()
+    assert scene.machine().failure == "error: SkyPilot lost this launch"
+    assert not scene.provider.found, "the provider was asked to end what SkyPilot forgot"
+    assert record.name == NAME
+
+
+def test_an_order_of_unknown_fate_is_listed_and_found_again(scene: Scene):
+    """The connection broke after SkyPilot had heard: the launch is adopted, not repeated."""
+    scene.sky.fail_next("launch-heard", CloudUnreachable("connection reset"))
+    with pytest.raises(CloudUnreachable):
+        scene.cloud.launch(scene.order())
+    assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.sky.finish(NAME)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.RUNNING
+
+
+def test_an_order_that_was_never_heard_fails_after_a_while(scene: Scene):
+    scene.sky.fail_next("launch", CloudUnreachable("connection refused"))
+    with pytest.raises(CloudUnreachable):
+        scene.cloud.launch(scene.order())
+    scene.work()
+    assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.pass_s(DEFAULT_LIMITS.ask_s)
+    scene.work()
+    assert scene.machine().failure == "error: SkyPilot never heard of this launch"
+
+
+def test_down_that_a_cloud_does_not_answer_says_what_may_still_run(scene: Scene):
+    scene.launched()
+    scene.sky.fail_next("down", CloudUnreachable("timed out"), times=5)
+    with pytest.raises(CloudUnreachable) as caught:
+        scene.cloud.terminate(ID)
+    assert NAME in caught.value.message
+    assert f"sky down {NAME}" in caught.value.hint
+    assert scene.machine().phase is MachinePhase.FAILED, "it stays listed, so it is tried again"
+
+
+def test_down_that_claims_success_is_not_believed(tmp_path: Path):
+    scene = Scene(tmp_path, with_provider=False)
+    scene.launched()
+    scene.sky.down_lies = True
+    with pytest.raises(CloudUnreachable, match="still there"):
+        scene.cloud.terminate(ID)
+    scene.sky.down_lies = False
+    scene.cloud.terminate(ID)
+    assert not scene.machines()
+
+
+# -- what SkyPilot has forgotten ---------------------------------------------------------------
+
+
+def test_down_that_only_forgets_is_finished_with_the_provider(scene: Scene):
+    scene.launched()
+    scene.sky.down_forgets = True
+    key = next(iter(scene.provider.found))
+    scene.cloud.terminate(ID)
+    assert scene.provider.terminated == [key]
+    assert not scene.provider.found
+
+
+def test_a_lost_database_of_skypilot_loses_no_machine(scene: Scene):
+    scene.launched()
+    endpoint = scene.machine().endpoint
+    scene.sky.forget_everything()
+    scene.pass_s(10)
+    machine = scene.machine()
+    assert machine.phase is MachinePhase.RUNNING
+    assert machine.endpoint == endpoint
+    scene.cloud.terminate(ID)
+    assert not scene.provider.found
+
+
+def test_a_provider_that_does_not_answer_leaves_a_missing_machine_unknown(scene: Scene):
+    scene.launched()
+    scene.sky.forget_everything()
+    scene.pass_s(10)
+    scene.provider.reachable = False
+    with pytest.raises(CloudUnreachable):
+        scene.machines()
+
+
+def test_without_a_right_to_ask_the_provider_skypilots_word_has_to_do(scene: Scene):
+    scene.launched()
+    scene.provider.allowed = False
+    scene.sky.forget_everything()
+    scene.pass_s(10)
+    assert not scene.machines()
+    assert "may not list" in scene.cloud.unverified("aws")
+    assert "gcp" in scene.cloud.unverified("gcp")
+
+
+def test_a_machine_that_only_the_provider_knows_is_found_and_can_be_ended(scene: Scene):
+    scene.launched()
+    scene.sky.forget_everything()
+    scene.cloud._journal.close(ID)  # and our own notes are lost too
+    scene.pass_s(60)
+    scene.machines()  # begins a census
+    scene.work()
+    machine = scene.machine()
+    assert machine.phase is MachinePhase.FAILED
+    assert machine.usd_per_hour == 0.021
+    scene.cloud.terminate(ID)
+    assert not scene.provider.found
+    assert not scene.machines()
+
+
+def test_without_our_notes_skypilots_labels_tell_the_same(scene: Scene):
+    scene.launched()
+    before = scene.machine()
+    scene.cloud._journal.close(ID)
+    after = scene.machine()
+    assert (after.phase, after.endpoint, after.spec_hash, after.usd_per_hour) == (
+        before.phase,
+        before.endpoint,
+        before.spec_hash,
+        before.usd_per_hour,
+    )
+
+
+def test_sweep_finds_machines_of_every_pool_of_this_user_and_of_nobody_else(scene: Scene):
+    mine, lost = replica(uid="00000000000000bb"), replica(uid="00000000000000cc")
+    for id in (mine, lost):
+        scene.cloud.launch(scene.order(id))
+        scene.sky.boot(naming.cluster_name(id))
+    theirs = replica(uid="00000000000000dd")
+    scene.cloud.launch(scene.order(theirs))
+    name = naming.cluster_name(theirs)
+    scene.sky.boot(name)
+    record = scene.sky.records.pop(name)
+    for id in (lost, theirs):
+        scene.cloud._journal.close(id)
+    for key, instance in list(scene.provider.found.items()):
+        if instance.id == theirs:
+            labels = {**record.labels, naming.OWNER: "bob_laptop"}
+            scene.provider.found[key] = type(instance)(theirs, key, instance.placement, labels)
+    assert [m.id for m in scene.cloud.sweep()] == [mine, lost]
+
+
+# -- a manager that dies -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stage", ["asked", "booted", "finished", "failed", "setting up"])
+def test_another_process_takes_a_launch_over_at_any_stage(scene: Scene, stage: str):
+    """No orphan and no duplicate: the successor lists one machine, and it comes to its end."""
+    scene.cloud.launch(scene.order())
+    if stage == "booted":
+        scene.sky.boot(NAME)
+    elif stage == "finished":
+        scene.sky.finish(NAME)
+    elif stage == "failed":
+        scene.sky.fail(NAME, "ResourcesUnavailableError", "InsufficientInstanceCapacity")
+    elif stage == "setting up":
+        scene.sky.finish(NAME, JobState.SETTING_UP)
+        scene.work()
+    scene._repeated.clear()  # the process is killed: its threads are gone
+    scene.cloud = scene.another_process()
+    assert [m.id for m in scene.machines()] == [ID]
+    if stage in ("asked", "booted", "setting up"):
+        scene.sky.finish(NAME)
+    scene.work()
+    expected = MachinePhase.FAILED if stage == "failed" else MachinePhase.RUNNING
+    assert scene.machine().phase is expected
+    assert scene.sky.asked("launch") == [NAME]
+
+
+def test_a_process_killed_before_skypilot_heard_leaves_a_failed_launch_not_a_lost_one(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+):
+    class Killed(BaseException):
+        pass
+
+    def launch(*_: object) -> str:
+        raise Killed
+
+    monkeypatch.setattr(scene.sky, "launch", launch)
+    with pytest.raises(Killed):
+        scene.cloud.launch(scene.order())
+    scene.cloud = scene.another_process()
+    assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.pass_s(DEFAULT_LIMITS.ask_s)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.FAILED
+
+
+def test_a_process_killed_while_it_ends_a_machine_leaves_it_listed(scene: Scene):
+    scene.launched()
+    scene.sky.fail_next("down", CloudUnreachable("killed"), times=5)
+    with pytest.raises(CloudUnreachable):
+        scene.cloud.terminate(ID)
+    scene.cloud = scene.another_process()
+    machine = scene.machine()
+    assert (machine.phase, machine.failure) == (
+        MachinePhase.FAILED,
+        "error: its end was not confirmed",
+    )
+
+
+def test_down_while_launching_aborts_the_launch(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.boot(NAME)
+    scene.cloud.terminate(ID)
+    assert scene.sky.asked("cancel")
+    assert not scene.provider.found
+    assert not scene.machines()
+    scene.work()
+    assert not scene.machines(), "a follower that was late brings nothing back"
+
+
+def test_a_replica_ended_by_another_process_while_it_was_ordered_does_not_run(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+):
+    real = scene.sky.launch
+
+    def launch(task: dict, name: str) -> str:
+        request = real(task, name)
+        scene.another_process().terminate(ID)
+        scene.sky.boot(name)  # SkyPilot was a moment too fast for the abort
+        return request
+
+    monkeypatch.setattr(scene.sky, "launch", launch)
+    scene.cloud.launch(scene.order())
+    assert not scene.provider.found
+    assert not scene.machines()
+
+
+# -- logs ---------------------------------------------------------------------------------------
+
+
+def test_the_log_is_fetched_from_the_machine(scene: Scene):
+    scene.launched()
+    scene.sky.job_logs[NAME] = "replica_started\n"
+    path = scene.cloud.log(ID)
+    assert path is not None
+    assert Path(path).read_text() == "replica_started\n"
+
+
+def test_secrets_stay_private_on_disk(scene: Scene):
+    scene.cloud.launch(scene.order())
+    key = scene.cloud._journal.files(ID) / "replica.key"
+    assert key.stat().st_mode & 0o077 == 0
+    assert key.parent.stat().st_mode & 0o077 == 0
+    assert b"secret" not in b"".join(p.read_bytes() for p in key.parent.parent.glob("*.json"))

@@ -1,0 +1,136 @@
+"""AWS asked directly: only what carries our labels is seen, and errors say what is known."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from fogft.cloud.sky import naming
+from fogft.cloud.sky.aws import Aws
+from fogft.cloud.sky.provider import NotAllowedError
+from fogft.core.errors import CloudUnreachable
+from fogft.core.model import ReplicaId
+from tests.sky.scripted_sky import replica
+
+needs_moto = pytest.mark.skipif(
+    importlib.util.find_spec("moto") is None or importlib.util.find_spec("boto3") is None,
+    reason="MOTO IS NOT INSTALLED: AWS's interface is not tried (`pip install 'moto[ec2]' boto3`)",
+)
+IMAGE = "ami-1e749f67"
+OTHER = replica(uid="00000000000000bb")
+
+
+def launch(region: str, labels: dict[str, str], **more: Any) -> str:
+    import boto3
+
+    ec2 = boto3.client("ec2", region_name=region)
+    tags = [{"Key": k, "Value": v} for k, v in labels.items()]
+    made = ec2.run_instances(
+        ImageId=IMAGE, MinCount=1, MaxCount=1, InstanceType="m6i.large",
+        TagSpecifications=[{"ResourceType": "instance", "Tags": tags}], **more,
+    )  # fmt: skip
+    return str(made["Instances"][0]["InstanceId"])
+
+
+def labels(id: ReplicaId) -> dict[str, str]:
+    return naming.labels(id, pool="p", owner="ann", spec_hash="abcd", usd_per_hour=0.02)
+
+
+@pytest.fixture
+def account(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    from moto import mock_aws
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN"):
+        monkeypatch.setenv(name, "test")
+    monkeypatch.delenv("AWS_ENDPOINT_URL", raising=False)
+    with mock_aws():
+        yield
+
+
+@needs_moto
+def test_machines_of_ours_are_found_in_every_region_and_nothing_else_is(account: None):
+    spot = {"InstanceMarketOptions": {"MarketType": "spot"}}
+    mine = launch("us-east-1", labels(replica(0)), **spot)
+    launch("us-west-2", labels(replica(1)))
+    launch("us-west-2", labels(OTHER))
+    launch("us-east-1", {"Name": "somebody else"})
+    launch("us-east-1", {naming.POOL: "not-a-uid", naming.SLOT: "0", naming.GENERATION: "1"})
+    aws = Aws()
+    found = aws.instances(None, replica().pool_uid)
+    assert [i.id for i in found] == [replica(0), replica(1)]
+    assert found[0].key == mine
+    assert found[0].placement.region == "us-east-1"
+    assert (found[0].placement.spot, found[1].placement.spot) == (True, False)
+    assert naming.usd_per_hour(found[0].labels) == 0.02
+    assert [i.id for i in aws.instances(["us-west-2"])] == [replica(1), OTHER]
+    assert not aws.instances([])
+
+
+@needs_moto
+def test_terminate_ends_these_and_is_repeatable(account: None):
+    launch("us-east-1", labels(replica(0)))
+    launch("us-east-1", labels(replica(1)))
+    aws = Aws()
+    first, second = aws.instances(["us-east-1"])
+    aws.terminate([first])
+    aws.terminate([first])
+    assert [i.key for i in aws.instances(["us-east-1"])] == [second.key]
+
+
+@needs_moto
+def test_live_prices_are_of_each_zone(account: None):
+    prices = Aws().spot_prices("us-east-1", ["m5.large"])
+    assert prices
+    assert {kind for _, kind in prices} == {"m5.large"}
+    assert all(zone.startswith("us-east-1") for zone, _ in prices)
+    assert all(price > 0 for price in prices.values())
+
+
+class Refusing:
+    """A client whose every call fails, as botocore's do."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def get_paginator(self, name: str) -> Any:
+        raise self.error
+
+    def terminate_instances(self, InstanceIds: list[str]) -> Any:  # noqa: N803
+        raise self.error
+
+
+def client_error(code: str) -> Exception:
+    error = Exception(f"An error occurred ({code}) when calling")
+    error.response = {"Error": {"Code": code}}  # type: ignore[attr-defined]
+    return error
+
+
+@pytest.mark.parametrize(
+    ("code", "expected", "hint"),
+    [
+        ("UnauthorizedOperation", NotAllowedError, ""),
+        ("RequestExpired", CloudUnreachable, "renew"),
+        ("ExpiredToken", CloudUnreachable, "renew"),
+        ("InternalError", CloudUnreachable, ""),
+        ("RequestLimitExceeded", CloudUnreachable, ""),
+    ],
+)
+def test_not_allowed_is_not_the_same_as_cannot_tell(code: str, expected: type, hint: str):
+    """The first hands the question to SkyPilot; from the second nothing may be concluded."""
+    aws = Aws()
+    aws._clients["us-east-1"] = Refusing(client_error(code))
+    with pytest.raises(expected) as caught:
+        aws.instances(["us-east-1"])
+    if hint:
+        assert hint in caught.value.hint
+        assert not aws._clients, "renewed credentials are read from the disk again"
+
+
+def test_no_network_is_cannot_tell():
+    aws = Aws()
+    aws._clients["us-east-1"] = Refusing(ConnectionError("no route"))
+    with pytest.raises(CloudUnreachable):
+        aws.instances(["us-east-1"])

@@ -1,0 +1,65 @@
+"""Calls have a limit, and a server that is slow is not asked the same again meanwhile."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from fogft.cloud.sky.calls import Calls
+from fogft.cloud.sky.sdk import RefusedError
+from fogft.core.errors import CloudError, CloudUnreachable
+
+
+class ApiServerConnectionError(RuntimeError):
+    """Named as SkyPilot's."""
+
+
+class ClusterNotUpError(Exception):
+    """Named as SkyPilot's."""
+
+
+def test_an_answer_in_time_is_returned():
+    assert Calls().within(30, "x", lambda: 7) == 7
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (ApiServerConnectionError("refused"), CloudUnreachable),
+        (ConnectionResetError("reset"), CloudUnreachable),
+        (RuntimeError("Failed to get request 1: 500"), CloudUnreachable),
+        (ClusterNotUpError("not up"), RefusedError),
+        (RuntimeError("something else"), RefusedError),
+        (SystemExit(1), RefusedError),
+        (CloudError("ours"), CloudError),
+    ],
+)
+def test_errors_become_ours(error: BaseException, expected: type[CloudError]):
+    """Nothing of SkyPilot's passes this line, and "nobody knows" stays apart from "no"."""
+
+    def fail() -> None:
+        raise error
+
+    with pytest.raises(CloudError) as caught:
+        Calls().within(30, "x", fail)
+    assert type(caught.value) is expected
+
+
+def test_a_call_without_an_answer_is_given_up_and_not_repeated_while_it_runs():
+    """However often it is asked again, one call of a subject is under way."""
+    calls, begun, go_on = Calls(), threading.Semaphore(0), threading.Event()
+
+    def hang() -> str:
+        begun.release()
+        go_on.wait(60)
+        return "late"
+
+    for _ in range(4):
+        with pytest.raises(CloudUnreachable, match="did not answer"):
+            calls.within(0.02, "x", hang)
+    assert begun.acquire(timeout=30)
+    assert not begun.acquire(blocking=False), "it was asked once"
+    assert calls.within(30, "y", lambda: "other") == "other"
+    go_on.set()
+    assert calls.within(30, "x", lambda: "fresh") == "fresh", "a late answer is thrown away"

@@ -1,0 +1,70 @@
+"""The clouds' own codes decide what a failed launch means."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.cloud.sky.failures import Cause, classify, tail
+
+UNAVAILABLE = "ResourcesUnavailableError"
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ("(InsufficientInstanceCapacity) when calling the RunInstances", Cause.CAPACITY),
+        ("There is no Spot capacity available that matches your request.", Cause.CAPACITY),
+        ("ZONE_RESOURCE_POOL_EXHAUSTED_WITH_DETAILS", Cause.CAPACITY),
+        ("The zone 'z' does not have enough resources available", Cause.CAPACITY),
+        ("(SkuNotAvailable) The requested VM size", Cause.CAPACITY),
+        ("(MaxSpotInstanceCountExceeded) Max spot instance count exceeded", Cause.QUOTA),
+        ("You have requested more vCPU capacity (VcpuLimitExceeded)", Cause.QUOTA),
+        ("Quota 'CPUS' exceeded: quotaExceeded", Cause.QUOTA),
+        ("Operation results in exceeding approved Total Regional Cores quota", Cause.QUOTA),
+        ("An error occurred (RequestExpired): Request has expired.", Cause.CREDENTIALS),
+        ("(UnauthorizedOperation) You are not authorized", Cause.CREDENTIALS),
+        ("google.auth.exceptions.RefreshError: ('invalid_grant'", Cause.CREDENTIALS),
+    ],
+)
+def test_the_codes_of_the_clouds(text: str, cause: Cause):
+    failure = classify(UNAVAILABLE, ["Failed to acquire resources in all zones.", text])
+    assert failure.cause is cause
+    assert str(failure).startswith(cause.value + ": ")
+
+
+def test_quota_outweighs_capacity_whatever_the_order():
+    """Waiting helps against the one and not against the other."""
+    texts = ["InsufficientInstanceCapacity", "VcpuLimitExceeded"]
+    assert classify(UNAVAILABLE, texts).cause is Cause.QUOTA
+    assert classify(UNAVAILABLE, texts[::-1]).cause is Cause.QUOTA
+
+
+def test_without_a_code_the_exceptions_kind_decides():
+    assert classify(UNAVAILABLE, ["?"]).cause is Cause.CAPACITY
+    assert classify("NoCloudAccessError", ["?"]).cause is Cause.CREDENTIALS
+    assert classify("RuntimeError", []).cause is Cause.ERROR
+
+
+def test_words_are_one_short_line_without_colours():
+    failure = classify("X", ["\x1b[31m" + "a " * 500 + "\nQuotaExceeded \x1b[0m" + "b " * 500])
+    assert "\n" not in str(failure)
+    assert "\x1b" not in str(failure)
+    assert len(str(failure)) < 330
+    assert "QuotaExceeded" in failure.words
+
+
+def test_the_tail_of_a_log_is_its_last_lines_that_say_something():
+    log = "\n".join(f"\x1b[36mline {n}\x1b[0m\n" for n in range(50))
+    assert tail(log, lines=3) == "line 47\nline 48\nline 49"
+    assert tail("x" * 900, width=10) == "x" * 10
+    assert tail("") == ""
+
+
+def test_the_tail_leaves_out_who_spoke_and_what_skypilot_says_of_itself():
+    log = (
+        "\x1b[2m├── \x1b[0mWaiting for task resources on 1 node.\n"
+        "\x1b[36m(setup pid=477)\x1b[0m no such package: yolo\n"
+        "(perception, pid=12) (not a speaker) stays\n"
+        "\x1b[32m✓ Job finished (status: FAILED_SETUP).\x1b[0m\n"
+    )
+    assert tail(log) == "no such package: yolo\n(not a speaker) stays"

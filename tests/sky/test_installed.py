@@ -1,0 +1,267 @@
+"""What fogft thinks of SkyPilot against the SkyPilot that is installed.
+
+The scripted SkyPilot of the other tests is only as good as its likeness: here the surface,
+the calls behind it and every name that is matched by text are held to the real thing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+import pytest
+
+from fogft.cloud.sky import answers, task, template
+from fogft.cloud.sky.installed import InstalledSky
+from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
+from fogft.core.errors import CloudUnreachable
+from fogft.core.model import Placement
+from tests.sky.scene import Scene
+from tests.sky.scripted_sky import EAST, ScriptedSky
+
+SURFACE = [name for name in vars(Sky) if not name.startswith("_")]
+needs_skypilot = pytest.mark.skipif(
+    importlib.util.find_spec("sky") is None,
+    reason="SKYPILOT IS NOT INSTALLED: nothing here is held to it (`pip install '.[cloud]'`)",
+)
+
+
+@pytest.mark.parametrize("name", SURFACE)
+@pytest.mark.parametrize("implementation", [InstalledSky, ScriptedSky])
+def test_both_implementations_have_the_surface(name: str, implementation: type):
+    """Same names, same parameters, in the same order."""
+    expected = inspect.signature(getattr(Sky, name)).parameters.values()
+    found = inspect.signature(getattr(implementation, name)).parameters.values()
+    assert [(p.name, p.kind, p.default) for p in found] == [
+        (p.name, p.kind, p.default) for p in expected
+    ]
+
+
+def test_the_reasons_of_sky_check_are_found_in_its_text():
+    told = (
+        "Checking credentials to enable clouds for SkyPilot.\n"
+        "  \x1b[33mAWS: disabled\x1b[0m\n"
+        "    Reason [compute]: AWS credentials are not set. Run the following commands:\n"
+        "      $ aws configure\n"
+        "  GCP: enabled [compute, storage]\n"
+        "\n"
+        "  Azure: disabled\n"
+        "    Reason [compute]: Getting user's Azure identity failed.\n"
+    )
+    reasons = answers.told_reasons(told)
+    assert set(reasons) == {"aws", "azure"}
+    assert reasons["aws"].endswith("Run the following commands: $ aws configure")
+
+
+def test_without_skypilot_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "sky", None)
+    with pytest.raises(Exception, match="not usable here") as caught:
+        InstalledSky().request("r1")
+    assert "fogft[cloud]" in caught.value.hint  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A home with the emulation's catalogue: SkyPilot must not fetch one, nor touch the user's."""
+    folder = tmp_path_factory.mktemp("home")
+    made = Path(__file__).parent / "emulated_aws" / "home.py"
+    subprocess.run([sys.executable, made, str(folder)], check=True, timeout=60)
+    isolated = {
+        "HOME": str(folder),
+        "SKYPILOT_DISABLE_USAGE_COLLECTION": "1",
+        "SKYPILOT_DISABLE_LOCAL_API_SERVER": "1",
+        "AWS_ENDPOINT_URL": "http://127.0.0.1:1",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }
+    with mock.patch.dict(os.environ, isolated):
+        yield folder
+
+
+@pytest.fixture
+def real(home: Path) -> tuple[InstalledSky, Any, Any]:
+    """The adapter on SkyPilot's own functions, which check their arguments and do nothing."""
+    import sky
+    from sky.client import sdk
+
+    silent = mock.create_autospec(sdk)
+    installed = InstalledSky()
+    installed._modules = (sky, silent)
+    return installed, silent, sky
+
+
+def status_record(**changes: Any) -> Any:
+    from sky.schemas.api.responses import StatusResponse
+    from sky.utils.status_lib import ClusterStatus
+
+    chosen = SimpleNamespace(
+        cloud="AWS", region="us-east-1", zone="us-east-1a", instance_type="m6i.large",
+        use_spot=True, labels={"a": "b"},
+    )  # fmt: skip
+    fields: dict[str, Any] = {
+        "name": "c", "launched_at": 5, "status": ClusterStatus.UP, "autostop": 5,
+        "to_down": True, "cluster_hash": "h", "cluster_ever_up": True, "user_hash": "u",
+        "user_name": "n", "workspace": "default", "is_managed": False, "nodes": 1,
+        "handle": SimpleNamespace(head_ip="10.0.0.1", launched_resources=chosen),
+        "labels": {"a": "b"},
+    }  # fmt: skip
+    return StatusResponse(**{**fields, **changes})
+
+
+def payload(**changes: Any) -> Any:
+    from sky.server.requests.payloads import RequestPayload
+
+    fields: dict[str, Any] = {
+        "request_id": "r1", "name": "sky.launch", "entrypoint": "", "request_body": "",
+        "status": "RUNNING", "created_at": 1.0, "user_id": "u", "return_value": "", "error": "",
+        "pid": None, "schedule_type": "long", "cluster_name": "c", "status_msg": None,
+    }  # fmt: skip
+    return RequestPayload(**{**fields, **changes})
+
+
+@needs_skypilot
+def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any, Any]):
+    """`create_autospec` refuses an argument that the real function does not take."""
+    installed, sdk, _ = real
+    sdk.launch.return_value = "r1"
+    assert installed.launch({"run": "true"}, "c") == "r1"
+    sdk.api_status.return_value = [payload(), payload(name="sky.status"), payload(cluster_name="d")]
+    assert [r.state for r in installed.launches("c")] == [RequestState.ACTIVE]
+    assert installed.request("r1") is not None
+    assert installed.request("r2") is None
+    sdk.get.return_value = (3, None)
+    assert installed.launched_job("r1") == 3
+    installed.cancel("r1")
+    sdk.get.return_value = [status_record()]
+    assert installed.clusters("c", refresh=True)[0].head_ip == "10.0.0.1"
+    assert installed.clusters(None, refresh=False)[0].placement == EAST
+    from sky import JobStatus
+
+    sdk.get.return_value = {3: JobStatus.FAILED_SETUP}
+    assert installed.job("c", 3) is JobState.SETUP_FAILED
+    sdk.get.return_value = {None: None}
+    assert installed.job("c", None) is JobState.MISSING
+    installed.job_log("c", 3, 10)
+    installed.provision_log("c", 10)
+    installed.down("c")
+    sdk.stream_and_get.return_value = {"default": {"AWS": ["compute", "storage"]}}
+    assert installed.check(["aws", "gcp"]) == {"aws": "", "gcp": "SkyPilot may not use it"}
+    called = {call[0] for call in sdk.method_calls}
+    assert called >= {
+        *("launch", "api_status", "api_cancel", "status", "job_status", "tail_logs"),
+        *("tail_provision_logs", "down", "check", "stream_and_get", "get"),
+    }
+
+
+@needs_skypilot
+def test_records_read_what_skypilot_says(home: Path):
+    record = answers.cluster_of(status_record())
+    assert (record.state, record.labels, record.launched_at) == (ClusterState.UP, {"a": "b"}, 5.0)
+    early = answers.cluster_of(status_record(handle=None, labels=None, init_status_reason="boots"))
+    assert (early.placement, early.head_ip, early.progress) == (None, "", "boots")
+
+
+@needs_skypilot
+def test_the_names_that_are_matched_by_text_exist(home: Path):
+    """A SkyPilot that renames one of them must not turn "nobody knows" into "no"."""
+    import requests
+    from sky import ClusterStatus, JobStatus, exceptions
+    from sky.server.requests.requests import RequestStatus
+
+    builtin = dir(__import__("builtins")) + dir(requests.exceptions)
+    assert [n for n in answers._UNKNOWN if not hasattr(exceptions, n) and n not in builtin] == []
+    assert {s.value for s in RequestStatus} >= set(answers._STATES)
+    assert {s.value for s in JobStatus} >= set(answers.JOBS)
+    assert {s.value for s in ClusterStatus} >= {"INIT", "UP", "STOPPED"}
+    for name in ("ClusterDoesNotExist", "ResourcesUnavailableError", "CommandError",
+                 "ClusterSetUpError", "RequestCancelled", "PermissionDeniedError"):  # fmt: skip
+        assert hasattr(exceptions, name)
+
+
+@needs_skypilot
+def test_what_skypilot_raises_becomes_ours(real: tuple[InstalledSky, Any, Any]):
+    from sky import exceptions
+
+    installed, sdk, _ = real
+    full = exceptions.ResourcesUnavailableError(
+        "Failed to acquire resources",
+        failover_history=[Exception("InsufficientInstanceCapacity"), Exception("and again")],
+    )
+    sdk.get.side_effect = full
+    with pytest.raises(RefusedError) as refused:
+        installed.launched_job("r1")
+    assert refused.value.kind == "ResourcesUnavailableError"
+    assert "InsufficientInstanceCapacity" in refused.value.texts[1]
+    sdk.get.side_effect = exceptions.CloudError("expired", "botocore", "ExpiredToken")
+    with pytest.raises(RefusedError):
+        installed.launched_job("r1")
+    with pytest.raises(CloudUnreachable):
+        installed.clusters("c", refresh=True)
+    for error in (
+        exceptions.ClusterStatusFetchingError("?"),
+        exceptions.ApiServerConnectionError("http://x"),
+        exceptions.ServerTemporarilyUnavailableError("?"),
+    ):
+        sdk.get.side_effect = error
+        with pytest.raises(CloudUnreachable):
+            installed.clusters("c", refresh=True)
+    sdk.get.side_effect = exceptions.ClusterDoesNotExist("c")
+    installed.down("c")
+    sdk.get.side_effect = RuntimeError("Failed to terminate")
+    with pytest.raises(RefusedError):
+        installed.down("c")
+
+
+@needs_skypilot
+def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: Path):
+    """The template and the merge, judged by SkyPilot's own schema and its catalogue."""
+    import sky
+
+    (tmp_path / "models").mkdir()
+    order = Scene(tmp_path).order(
+        task={
+            "workdir": ".",
+            "file_mounts": {"/models": "models"},
+            "envs": {"A": "b"},
+            "secrets": {"TOKEN": "t"},
+            "setup": "colcon build",
+            "resources": {
+                "cpus": "2+",
+                "disk_size": 100,
+                "any_of": [{"infra": "aws/us-west-2"}, {"infra": "aws/us-east-1"}],
+            },
+        }
+    )
+    built = task.build(
+        order, template.read(), files=tmp_path, wheel=tmp_path, owner="ann", base=tmp_path
+    )
+    made = sky.Task.from_yaml_config(built)
+    (resources,) = made.resources
+    assert (resources.region, resources.zone) == ("us-east-1", "us-east-1a")
+    assert (resources.instance_type, resources.use_spot) == ("m6i.large", True)
+    assert resources.ports == ["7447"]
+    assert resources.autostop_config.down
+    assert resources.disk_size == 100
+    assert made.envs["A"] == "b"
+
+
+@needs_skypilot
+def test_offers_come_from_the_catalogue(real: tuple[InstalledSky, Any, Any]):
+    """With no network the catalogue's zones have ids, not names: then the region is the offer."""
+    installed, _, _ = real
+    offers = installed.offers({"infra": "aws/us-west-2", "cpus": "2", "use_spot": True})
+    assert {o.placement for o in offers} == {Placement("aws", "us-west-2", "", "m6i.large")}
+    assert offers[0].usd_per_hour == pytest.approx(0.026)
+    steady = installed.offers({"infra": "aws/us-west-2", "cpus": "4", "use_spot": False})
+    assert {(o.placement.instance, o.placement.spot) for o in steady} == {("m6i.xlarge", False)}
+    assert installed.offers({"infra": "aws", "cpus": "1000+"}) == []
+    with pytest.raises(RefusedError, match="cpus"):
+        installed.offers({"infra": "aws", "cpus": "two"})

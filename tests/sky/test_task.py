@@ -1,0 +1,202 @@
+"""The pool file's task reaches SkyPilot untouched, and what a pool decides is refused."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fogft.cloud.port import Launch
+from fogft.cloud.sky import naming, task, template
+from fogft.core.errors import SpecError
+from fogft.core.model import Placement
+from tests.sky.scripted_sky import EAST, WEST, replica
+
+
+def built(asked: Mapping[str, Any], place: Placement = EAST) -> dict[str, Any]:
+    order = Launch(replica(3, 7), "perception", place, 0.021, "abcd", asked)
+    return task.build(
+        order,
+        template.read(),
+        files=Path("/state/files"),
+        wheel=Path("/state/wheel"),
+        owner="Ann Lee@robot",
+        base=Path("/home/ann/pool"),
+    )
+
+
+def test_one_location_one_port_our_labels_and_an_end_by_itself():
+    resources = built({"resources": {"cpus": "4+", "any_of": [{"infra": "aws/us-east-1"}]}})[
+        "resources"
+    ]
+    assert resources["infra"] == "aws/us-east-1/us-east-1a"
+    assert resources["instance_type"] == "m6i.large"
+    assert resources["use_spot"] is True
+    assert resources["ports"] == ["7447"]
+    assert resources["autostop"]["down"] is True
+    assert resources["cpus"] == "4+"
+    assert "any_of" not in resources
+    assert naming.replica_of_labels(resources["labels"]) == replica(3, 7)
+    assert resources["labels"][naming.OWNER] == "ann_lee_robot"
+
+
+PASSED_THROUGH: Mapping[str, Any] = {
+    "envs": {"MODEL": "yolo"},
+    "secrets": {"TOKEN": "t"},
+    "config": {"docker": {"run_options": ["--ipc=host"]}},
+    "volumes": {"/data": "my-volume"},
+    "event_callback": "echo",
+    "some_future_field": {"x": [1]},
+}
+
+
+@pytest.mark.parametrize("key", PASSED_THROUGH)
+def test_other_fields_pass_through_untouched(key: str):
+    assert built(PASSED_THROUGH)[key] == PASSED_THROUGH[key]
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {"image_id": "docker:ros:jazzy"},
+        {"image_id": {"us-east-1": "ami-1"}},
+        {"disk_size": 100, "disk_tier": "best"},
+        {"network_tier": "best"},
+        {"max_hourly_cost": 1.5},
+        {"some_future_field": 1},
+    ],
+)
+def test_other_resources_pass_through_untouched(extra: dict[str, Any]):
+    resources = built({"resources": {"infra": "aws", **extra}})["resources"]
+    assert {k: resources[k] for k in extra} == extra
+
+
+def test_the_alternative_that_sells_the_placement_gives_its_own_fields():
+    asked = {
+        "resources": {
+            "disk_size": 50,
+            "labels": {"team": "a"},
+            "any_of": [
+                {"infra": "aws/us-east-1", "image_id": "ami-east"},
+                {"infra": "aws/us-west-2", "image_id": "ami-west", "labels": {"team": "b"}},
+            ],
+        }
+    }
+    west = built(asked, WEST)["resources"]
+    assert (west["image_id"], west["disk_size"], west["labels"]["team"]) == ("ami-west", 50, "b")
+    assert built(asked, EAST)["resources"]["image_id"] == "ami-east"
+
+
+def test_accelerators_that_the_instance_type_does_not_imply_are_named():
+    place = Placement("gcp", "us-west1", "us-west1-a", "n1-standard-8+T4:1")
+    resources = built({"resources": {"accelerators": {"T4": 1, "L4": 1}}}, place)["resources"]
+    assert (resources["instance_type"], resources["accelerators"]) == ("n1-standard-8", "T4:1")
+
+
+def test_files_of_this_machine_are_found_from_the_pool_files_folder():
+    made = built(
+        {
+            "workdir": ".",
+            "file_mounts": {"/models": "../models", "/data": "s3://bucket", "/b": {"name": "x"}},
+        }
+    )
+    assert made["workdir"] == "/home/ann/pool"
+    assert made["file_mounts"]["/models"] == "/home/ann/models"
+    assert made["file_mounts"]["/data"] == "s3://bucket"
+    assert made["file_mounts"]["/b"] == {"name": "x"}
+    assert made["file_mounts"]["~/.fogft/replica"] == "/state/files"
+    assert made["file_mounts"]["~/.fogft/wheel"] == "/state/wheel"
+    git = {"url": "https://example.org/x.git", "ref": "main"}
+    assert built({"workdir": git})["workdir"] == git
+
+
+@pytest.mark.parametrize(
+    ("asked", "key"),
+    [
+        ({"num_nodes": 2}, "num_nodes"),
+        ({"service": {}}, "service"),
+        ({"pool": {}}, "pool"),
+        ({"resources": {"ports": 80}}, "resources.ports"),
+        ({"resources": {"autostop": 5}}, "resources.autostop"),
+        ({"resources": {"any_of": [{"job_recovery": "x"}]}}, r"resources.any_of\[0\].job_recovery"),
+        ({"resources": {"ordered": [{}, {"infra": "k8s/x"}]}}, r"resources.ordered\[1\]"),
+        ({"resources": {"cloud": "Kubernetes"}}, "resources"),
+        ({"resources": {"labels": {"fogft-pool": "x"}}}, "resources.labels.fogft-pool"),
+        ({"file_mounts": {"~/.fogft/replica": "x"}}, "file_mounts"),
+        ({"file_mounts": {"~/a/../.fogft": "x"}}, "file_mounts"),
+    ],
+)
+def test_what_a_pool_decides_itself_is_refused_by_name(asked: dict[str, Any], key: str):
+    with pytest.raises(SpecError, match=f"^{key}"):
+        built(asked)
+
+
+def test_a_single_node_is_what_a_pool_means_anyway():
+    assert "num_nodes" not in built({"num_nodes": 1})
+
+
+def test_the_order_is_not_changed_by_building_it():
+    asked = {"resources": {"labels": {"a": "b"}}, "file_mounts": {"/m": "m"}}
+    before = repr(asked)
+    built(asked)
+    assert repr(asked) == before
+
+
+# -- the scripts, run by a real shell ---------------------------------------------------------
+
+
+def test_setup_of_the_pool_file_is_taken_as_it_is():
+    """No mark inside it is replaced, and no character of it is special to the template."""
+    text = "echo '@PORT@ $HOME @FILES@'\ncat <<'X'\n) || exit 0 #\nX"
+    assert text in built({"setup": text})["setup"]
+
+
+@pytest.fixture
+def vm(tmp_path: Path) -> Path:
+    """A home as on a VM on which fogft is installed already."""
+    (tmp_path / ".fogft/venv/bin").mkdir(parents=True)
+    fogft = tmp_path / ".fogft/venv/bin/fogft"
+    fogft.write_text('#!/bin/sh\necho "fogft $*"\n')
+    fogft.chmod(0o755)
+    (tmp_path / ".fogft/replica").mkdir(mode=0o755)
+    (tmp_path / ".fogft/replica/replica.key").write_text("secret")
+    return tmp_path
+
+
+def shell(home: Path, script: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["bash", "-c", script],
+        cwd=home,
+        env={"HOME": str(home), "PATH": "/usr/local/bin:/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_setup_runs_the_users_part_and_hides_the_key(vm: Path):
+    done = shell(vm, built({"setup": "false\ntouch ran\nexit 0"})["setup"])
+    assert done.returncode == 0, done.stderr
+    assert (vm / "ran").exists()
+    assert (vm / ".fogft/replica/replica.key").stat().st_mode & 0o077 == 0
+
+
+def test_a_failing_setup_of_the_pool_file_fails_the_whole(vm: Path):
+    done = shell(vm, built({"setup": "echo before\nexit 3"})["setup"])
+    assert done.returncode != 0
+    assert "the pool file's setup failed" in done.stdout
+
+
+def test_run_becomes_the_server_proxy(vm: Path):
+    """The user's `run` is the server proxy's child, never SkyPilot's."""
+    made = built({"run": "python3 serve.py"})
+    assert "serve.py" not in made["run"]
+    done = shell(vm, made["run"])
+    assert done.stdout.split() == [
+        *("fogft", "serve", "--config", f"{vm}/.fogft/replica/replica.yaml"),
+        *("--listen", "0.0.0.0:7447", "--workdir", str(vm)),
+    ]

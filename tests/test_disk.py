@@ -1,0 +1,140 @@
+"""Files are replaced whole or not at all; locks end with their holder and forgive a glance."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from fogft import disk
+from fogft.core.errors import PoolBusy, StateError
+
+
+def test_a_file_is_replaced_whole_and_private(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("old")
+    disk.write_whole(path, "new")
+    assert path.read_text() == "new"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_text("old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StateError, match="cannot be written: No space left"):
+        disk.write_whole(path, "new")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_missing_folder_is_a_clear_error(tmp_path):
+    with pytest.raises(StateError, match="cannot be written"):
+        disk.write_whole(tmp_path / "missing" / "file", "x")
+
+
+def test_json_goes_round_and_a_missing_file_is_none(tmp_path):
+    disk.write_json(tmp_path / "x.json", {"a": [1, None]})
+    assert disk.read_json(tmp_path / "x.json") == {"a": [1, None]}
+    assert disk.read_json(tmp_path / "y.json") is None
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"nul"])
+def test_damaged_json_is_a_clear_error(tmp_path, content):
+    (tmp_path / "x.json").write_bytes(content)
+    with pytest.raises(StateError, match=r"x\.json"):
+        disk.read_json(tmp_path / "x.json")
+
+
+def test_a_reader_never_sees_half_a_file(tmp_path):
+    path = tmp_path / "x.json"
+    disk.write_json(path, {"n": 0, "pad": "x" * 10_000})
+    done = threading.Event()
+
+    def write() -> None:
+        for n in range(200):
+            disk.write_json(path, {"n": n, "pad": "x" * 10_000}, durable=False)
+        done.set()
+
+    threading.Thread(target=write).start()
+    while not done.is_set():
+        assert len(json.loads(path.read_text())["pad"]) == 10_000
+
+
+def test_a_lock_is_exclusive_until_it_is_given_back(tmp_path):
+    first, second = disk.Lock(tmp_path / "lock"), disk.Lock(tmp_path / "lock")
+    assert first.acquire(wait=False)
+    assert not second.acquire(wait=False)
+    first.release()
+    assert second.acquire(wait=False)
+    second.release()
+
+
+def test_a_lock_ends_with_its_process_whatever_ends_it(tmp_path):
+    program = (
+        "import sys, time, pathlib; from fogft import disk\n"
+        "disk_lock = disk.Lock(pathlib.Path(sys.argv[1])); disk_lock.acquire(wait=True)\n"
+        "print('held', flush=True); time.sleep(60)\n"
+    )
+    path = tmp_path / "lock"
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        assert disk.is_locked(path)
+        holder.send_signal(signal.SIGKILL)
+    assert not disk.is_locked(path)
+
+
+def test_a_glance_at_a_lock_refuses_nobody(tmp_path):
+    """`is_locked` holds the lock for an instant; who wants it then must still get it."""
+    path = tmp_path / "lock"
+    stop = threading.Event()
+
+    def glance() -> None:
+        while not stop.is_set():
+            disk.is_locked(path)
+
+    path.touch()
+    watcher = threading.Thread(target=glance)
+    watcher.start()
+    try:
+        for _ in range(200):
+            lock = disk.Lock(path)
+            assert lock.acquire(wait=False)
+            lock.release()
+    finally:
+        stop.set()
+        watcher.join()
+
+
+def test_locked_refuses_with_a_clear_error(tmp_path):
+    with disk.locked(tmp_path / "lock"):
+        with pytest.raises(PoolBusy, match="held by another process"):
+            with disk.locked(tmp_path / "lock", wait=False):
+                pass
+    with disk.locked(tmp_path / "lock", wait=False):
+        pass
+
+
+def test_nothing_is_locked_where_there_is_no_file(tmp_path):
+    assert not disk.is_locked(tmp_path / "none")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_in_a_folder_that_is_gone_is_a_clear_error(tmp_path):
+    with pytest.raises(StateError, match="cannot be opened: No such file"):
+        with disk.locked(tmp_path / "missing" / "lock"):
+            pass

@@ -1,0 +1,203 @@
+"""Frames: what goes out comes back, and no bytes whatever do harm."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.wire import frame
+from fogft.wire.frame import FrameError
+from fogft.wire.port import Probe, ProbeAnswer
+
+ids = st.binary(min_size=16, max_size=16)
+tokens = st.binary(min_size=8, max_size=8)
+robots = st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size=64).filter(
+    lambda name: len(name.encode()) <= frame.ROBOT_BYTES_LIMIT and name.isprintable()
+)
+remaining = st.floats(0, frame.REMAINING_LIMIT_S, allow_nan=False)
+reasons = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=64)
+texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=100)
+counts = st.integers(0, 2**53 - 1)
+answers = st.builds(
+    ProbeAnswer,
+    slot=counts,
+    generation=counts,
+    incarnation=texts,
+    ready=st.frozensets(texts, max_size=8),
+    draining=st.booleans(),
+    restarts=counts,
+    in_flight=counts,
+    detail=texts,
+)
+probes = st.builds(
+    Probe,
+    robot=texts,
+    manager_age_s=st.none() | st.floats(0, 1e9, allow_nan=False),
+)
+
+DECODERS: list[Callable[[bytes], Any]] = [
+    frame.decode_request,
+    frame.decode_answer,
+    frame.decode_refusal,
+    frame.decode_probe,
+    frame.decode_probe_answer,
+]
+
+
+@given(request_id=ids, remaining_s=remaining, token=tokens, robot=robots)
+def test_a_request_header_comes_back(
+    request_id: bytes, remaining_s: float, token: bytes, robot: str
+) -> None:
+    """Decoding undoes encoding."""
+    sent = frame.encode_request(request_id, remaining_s, frame.origin(robot, token))
+    assert frame.decode_request(sent) == frame.RequestHeader(request_id, remaining_s, token, robot)
+
+
+@given(request_id=ids)
+def test_an_answer_header_comes_back(request_id: bytes) -> None:
+    """Decoding undoes encoding."""
+    assert frame.decode_answer(frame.encode_answer(request_id)) == request_id
+
+
+@given(request_id=ids, reason=reasons)
+def test_a_refusal_comes_back(request_id: bytes, reason: str) -> None:
+    """Decoding undoes encoding."""
+    assert frame.decode_refusal(frame.encode_refusal(request_id, reason)) == (request_id, reason)
+
+
+@given(probe=probes)
+def test_a_probe_comes_back(probe: Probe) -> None:
+    """Decoding undoes encoding."""
+    assert frame.decode_probe(frame.encode_probe(probe)) == probe
+
+
+@given(answer=answers)
+def test_a_probe_answer_comes_back(answer: ProbeAnswer) -> None:
+    """Decoding undoes encoding."""
+    assert frame.decode_probe_answer(frame.encode_probe_answer(answer)) == answer
+
+
+@pytest.mark.parametrize("decode", DECODERS)
+@given(garbage=st.binary(max_size=200))
+def test_garbage_is_a_frame_error_or_a_frame(
+    decode: Callable[[bytes], Any], garbage: bytes
+) -> None:
+    """Whatever bytes come, a decoder raises nothing but FrameError."""
+    try:
+        decode(garbage)
+    except FrameError:
+        return
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@pytest.mark.parametrize("decode", [frame.decode_probe, frame.decode_probe_answer])
+@given(data=st.data())
+def test_json_of_the_wrong_shape_is_a_frame_error_or_a_frame(
+    decode: Callable[[bytes], Any], data: st.DataObject
+) -> None:
+    """A probe in which any one value is replaced by any JSON at all raises only FrameError."""
+    good = {
+        "v": 1,
+        "robot": "r",
+        "manager_age_s": 1.0,
+        "slot": 0,
+        "generation": 1,
+        "incarnation": "i",
+        "ready": ["/a"],
+        "draining": False,
+        "restarts": 0,
+        "in_flight": 0,
+        "detail": "",
+    }
+    key = data.draw(st.sampled_from(sorted(good)))
+    bad = {**good, key: data.draw(json_values)}
+    try:
+        value = decode(json.dumps(bad).encode())
+    except FrameError:
+        return
+    assert isinstance(value, (Probe, ProbeAnswer))
+
+
+@given(request_id=ids, cut=st.integers(0, 100), grown=st.binary(max_size=80))
+def test_a_header_of_the_wrong_length_is_refused(request_id: bytes, cut: int, grown: bytes) -> None:
+    """An answer's header has one length; every other is a FrameError."""
+    whole = frame.encode_answer(request_id)
+    for wrong in {whole[: cut % len(whole)], whole + grown + b"x"}:
+        with pytest.raises(FrameError):
+            frame.decode_answer(wrong)
+
+
+@pytest.mark.parametrize("version", [0, 2, 255])
+def test_another_version_is_refused(version: int) -> None:
+    """A peer of another version is told apart from garbage by its version."""
+    request = frame.encode_request(bytes(16), 1.0, frame.origin("r", bytes(8)))
+    refusal = frame.encode_refusal(bytes(16), "lost")
+    for sent, decode in ((request, frame.decode_request), (refusal, frame.decode_refusal)):
+        with pytest.raises(FrameError, match=f"version {version}"):
+            decode(bytes([version]) + sent[1:])
+
+
+@pytest.mark.parametrize("remaining_s", [-1.0, math.nan, math.inf, -math.inf, 1e8])
+def test_an_impossible_remaining_time_is_refused(remaining_s: float) -> None:
+    """A deadline is a number of seconds that can be added to a clock."""
+    with pytest.raises(FrameError, match="remaining time"):
+        frame.decode_request(frame.encode_request(bytes(16), remaining_s, bytes(8) + b"r"))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"[" * 5000,
+        b'{"v":1,"robot":"r","manager_age_s":NaN}',
+        b'{"v":1,"robot":"r","manager_age_s":1e999}',
+        b'{"v":1,"robot":"\\ud800"}',
+        b'{"v":true,"robot":"r"}',
+        b'{"robot":"r"}',
+        b"1",
+        b" " * 2000 + b'{"v":1,"robot":"r"}',
+        b"1" * 900,
+    ],
+)
+def test_a_hostile_probe_is_refused(content: bytes) -> None:
+    """Depth, NaN, infinity, lone surrogates, a missing version, too much: all are FrameErrors."""
+    with pytest.raises(FrameError):
+        frame.decode_probe(content)
+
+
+@pytest.mark.parametrize("robot", ["", "x" * 65, "a\nb", "\u00e4" * 33])
+def test_a_robot_name_that_cannot_travel_is_refused_at_once(robot: str) -> None:
+    """The sender learns of it, not the receiver."""
+    with pytest.raises(ValueError, match="robot's name"):
+        frame.origin(robot, bytes(8))
+
+
+def test_a_long_detail_is_cut_and_the_answer_still_travels() -> None:
+    """Detail is for people; it never costs the probe."""
+    answer = ProbeAnswer(0, 1, "i", detail="\ud800" + "x" * 100_000)
+    decoded = frame.decode_probe_answer(frame.encode_probe_answer(answer))
+    assert len(decoded.detail) == frame.DETAIL_LIMIT
+
+
+def test_too_many_services_for_a_frame_are_an_error_at_the_sender() -> None:
+    """A frame that nobody could read is not sent."""
+    answer = ProbeAnswer(0, 1, "i", ready=frozenset(f"/{n:0100}" for n in range(1000)))
+    with pytest.raises(ValueError, match="probe's answer"):
+        frame.encode_probe_answer(answer)
+
+
+def test_a_probe_answer_nested_without_end_is_refused() -> None:
+    """The parser's own recursion limit is a FrameError like any other."""
+    with pytest.raises(FrameError):
+        frame.decode_probe_answer(b"[" * 60_000)

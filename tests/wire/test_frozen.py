@@ -1,0 +1,171 @@
+"""One end is frozen (SIGSTOP): it costs nobody but itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from fogft.core.model import LinkState
+from fogft.wire.config import LinkSettings
+from fogft.wire.port import Refusal
+from fogft.wire.zenoh_link import ZenohLink
+from tests.wire.wire_pool import (
+    LIMIT_S,
+    SERVICE,
+    Authority,
+    Owner,
+    ReplicaProcess,
+    request_id,
+    wait_for,
+)
+
+MEGABYTE = os.urandom(1 << 20)
+# Here a send to a frozen peer blocks for longer than any test waits. So whatever shares a
+# thread, a lock or a queue with such a send fails its test, and no test needs a clock.
+STUCK = LinkSettings(lease_s=300.0, wait_before_close_s=200.0)
+
+
+def test_a_frozen_replica_does_not_delay_a_healthy_one(
+    start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """Every healthy answer to 1 MB requests arrives, and no offer blocks, while it is frozen."""
+    options = {"reply_bytes": 16, "settings": STUCK}
+    healthy, frozen = start_replica(slot=0, **options), start_replica(slot=1, **options)
+    links = [
+        dial(replica.endpoint, slot=n, suspect_after_s=3600.0, settings=STUCK)
+        for n, replica in enumerate((healthy, frozen))
+    ]
+    wait_for(lambda: all(link.usable for link in links))
+    frozen.signal(signal.SIGSTOP)
+    for number in range(40):
+        assert links[1].offer(SERVICE, request_id(number), MEGABYTE, 60.0)
+        assert links[0].offer(SERVICE, request_id(number), MEGABYTE, 60.0)
+        wait_for(lambda n=number: owner.of(n))
+    from_healthy = [a for a in owner.from_slot(0) if a.payload is not None]
+    from_frozen = [a for a in owner.from_slot(1) if a.payload is not None]
+    assert (len(from_healthy), len(from_frozen)) == (40, 0)
+    assert links[1].status().in_flight == 40
+
+
+def test_a_frozen_replica_is_suspected_and_comes_back(
+    start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """What was in flight ends as lost, so that it can be sent again; thawed, it is up again."""
+    replica = start_replica()
+    link = dial(replica.endpoint, suspect_after_s=0.5)
+    wait_for(lambda: link.usable)
+    replica.signal(signal.SIGSTOP)
+    assert link.offer(SERVICE, request_id(1), b"anybody there", 60.0)
+    wait_for(lambda: not link.usable)
+    wait_for(lambda: owner.of(1))
+    assert owner.of(1)[0].refusal == Refusal.LOST
+    wait_for(lambda: "frozen" in link.status().detail)
+    assert link.status().state is LinkState.SUSPECT
+    replica.signal(signal.SIGCONT)
+    wait_for(lambda: link.usable)
+    assert link.offer(SERVICE, request_id(1), b"once more", 60.0)
+    wait_for(lambda: len(owner.of(1)) == 2)
+    assert owner.of(1)[1].payload == b"once more"
+
+
+ROBOT = """
+import json, sys, time
+from pathlib import Path
+from fogft.wire.config import LinkSettings
+from fogft.wire.zenoh_link import ZenohDialer
+from tests.wire.wire_pool import POOL_UID, SERVICE, Files, Owner, keys, peer, request_id, wait_for
+
+files = Files(*(Path(path) for path in sys.argv[1:4]))
+owner = Owner()
+settings = LinkSettings(**json.loads(sys.argv[5]))
+dialer = ZenohDialer(files, robot="frozen", pool_uid=POOL_UID, settings=settings)
+link = dialer.dial(peer(sys.argv[4]), keys(0), owner)
+wait_for(lambda: link.usable)
+for number in range(60):
+    link.offer(SERVICE, request_id(number), b"many bytes, please", 600.0)
+print("offered", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def frozen_robot(authority: Authority) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+    """Start a robot that asks for 60 answers, to be frozen by the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(endpoint: str) -> subprocess.Popen[str]:
+        files = authority.robot("frozen")
+        paths = [str(files.ca), str(files.certificate), str(files.key)]
+        started.append(
+            subprocess.Popen(
+                [sys.executable, "-c", ROBOT, *paths, endpoint, json.dumps(asdict(STUCK))],
+                stdout=subprocess.PIPE,
+                text=True,
+                cwd=Path(__file__).parents[2],
+            )
+        )
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def test_a_frozen_robot_does_not_delay_another_robots_replies(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+    frozen_robot: Callable[[str], subprocess.Popen[str]],
+) -> None:
+    """60 MB of replies wait for a robot that takes none; the other's 1 MB replies all arrive.
+
+    Nor is its link suspected meanwhile: probes have a way of their own.
+    """
+    replica = start_replica(delay_s=1.0, reply_bytes=1 << 20, settings=STUCK)
+    robot = frozen_robot(replica.endpoint)
+    assert robot.stdout is not None
+    assert robot.stdout.readline() == "offered\n"
+    wait_for(lambda: replica.count("requests") == 60)
+    robot.send_signal(signal.SIGSTOP)
+    link = dial(replica.endpoint)
+    wait_for(lambda: link.usable)
+    wait_for(lambda: replica.count("replies") >= 60)
+    replica.ask(delay_s=0.0)
+    for number in range(100, 130):
+        assert link.offer(SERVICE, request_id(number), b"me too", 60.0)
+        wait_for(lambda n=number: owner.of(n))
+    assert {len(a.payload or b"") for a in owner.from_slot(0)} == {1 << 20}
+    assert link.status().reopened == 0
+
+
+def test_a_robot_that_slept_suspects_nobody(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An hour passes while the keeper waits for an answer: it is no silence of the replica."""
+    replica = start_replica(settings=STUCK)
+    link = dial(replica.endpoint, suspect_after_s=LIMIT_S, settings=STUCK)
+    wait_for(lambda: link.usable)
+    replica.signal(signal.SIGSTOP)
+    wait_for(lambda: link.status().silent_for_s > 0)
+    real = time.monotonic
+    monkeypatch.setattr("fogft.wire.zenoh_link.time.monotonic", lambda: real() + 3600.0)
+    wait_for(lambda: 0 < link.status().silent_for_s < LIMIT_S)
+    replica.signal(signal.SIGCONT)
+    wait_for(lambda: link.status().silent_for_s == 0)
+    assert link.usable
+    assert link.status().reopened == 0

@@ -1,0 +1,239 @@
+"""Who is let in, who is talked to: everybody else is refused, and is sent nothing."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fogft.core import names
+from fogft.core.model import LinkState
+from fogft.pool import credentials
+from fogft.pool.credentials import Role
+from fogft.wire import config
+from fogft.wire.config import LinkSettings
+from fogft.wire.port import Refusal
+from fogft.wire.zenoh_link import ZenohLink
+from tests.wire.wire_pool import (
+    POOL_UID,
+    SERVICE,
+    Authority,
+    Files,
+    Owner,
+    ReplicaProcess,
+    keys,
+    peer,
+    request_id,
+    wait_for,
+)
+
+
+@pytest.fixture
+def stranger(tmp_path: Path) -> Authority:
+    """Another CA, which issues certificates with the very same names."""
+    return Authority(tmp_path / "stranger")
+
+
+def _refused(link: ZenohLink, words: str) -> None:
+    wait_for(lambda: words in link.status().detail)
+    assert not link.usable
+    assert link.status().state is LinkState.CONNECTING
+    assert not link.offer(SERVICE, request_id(1), b"secret", 1.0)
+
+
+def _heard_nothing(replica: ReplicaProcess) -> bool:
+    counters = replica.ask()
+    return not {"requests", "probes", "malformed"} & set(counters)
+
+
+def test_a_robot_of_another_ca_is_refused(
+    authority: Authority,
+    stranger: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+) -> None:
+    """It even trusts the right CA: its own certificate is what the replica refuses."""
+    replica = start_replica()
+    theirs = stranger.robot()
+    link = dial(replica.endpoint, files=Files(authority.robot().ca, theirs.certificate, theirs.key))
+    _refused(link, "of another CA")
+    assert _heard_nothing(replica)
+
+
+def test_a_replica_of_another_ca_is_refused(
+    stranger: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+) -> None:
+    """It has the right name, from the wrong CA."""
+    replica = start_replica(files=stranger.replica())
+    _refused(dial(replica.endpoint), "certificate is refused")
+    assert _heard_nothing(replica)
+
+
+def test_a_replicas_certificate_cannot_ask(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+) -> None:
+    """A stolen replica's key is no way to the other replicas."""
+    replica = start_replica()
+    _refused(dial(replica.endpoint, files=authority.replica(1)), "certificate")
+    assert _heard_nothing(replica)
+
+
+def test_a_robots_certificate_cannot_answer(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+) -> None:
+    """Not even one that bears a replica's name."""
+    files = authority.issue(names.replica_certificate_name(peer("").id), Role.ROBOT)
+    replica = start_replica(files=files)
+    _refused(dial(replica.endpoint), "certificate is refused")
+    assert _heard_nothing(replica)
+
+
+def test_no_certificate_is_refused(
+    authority: Authority, start_replica: Callable[..., ReplicaProcess]
+) -> None:
+    """A bare Zenoh client with the right CA and no certificate of its own."""
+    replica = start_replica()
+    settings = config.robot_settings(peer(replica.endpoint), authority.robot(), LinkSettings())
+    del settings["transport/link/tls"]["connect_certificate"]
+    del settings["transport/link/tls"]["connect_private_key"]
+    settings["transport/link/tls"]["enable_mtls"] = False
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(config.to_zenoh(settings))
+    assert _heard_nothing(replica)
+
+
+@pytest.mark.parametrize(("begin", "end", "words"), [(1, 2, "not yet valid"), (-2, -1, "expired")])
+def test_a_replica_out_of_its_time_is_refused(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    monkeypatch: pytest.MonkeyPatch,
+    begin: int,
+    end: int,
+    words: str,
+) -> None:
+    """The words tell which of both it is: the robot's clock may be the one that is wrong."""
+    day = datetime.timedelta(days=1)
+    monkeypatch.setattr(credentials, "BACKDATE", -begin * day)
+    name = names.replica_certificate_name(peer("").id)
+    replica = start_replica(files=authority.issue(name, Role.REPLICA, days=end))
+    _refused(dial(replica.endpoint), words)
+    assert _heard_nothing(replica)
+
+
+@pytest.mark.parametrize(("slot", "generation"), [(1, 1), (0, 2)])
+def test_another_replica_at_the_endpoint_is_sent_nothing(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    slot: int,
+    generation: int,
+) -> None:
+    """Same CA, same role, another slot or generation: it even serves slot 0's keys in vain."""
+    impostor = start_replica(files=authority.replica(slot, generation))
+    _refused(dial(impostor.endpoint), f"`replica.{slot}.{generation}.{POOL_UID}`, not of")
+    assert _heard_nothing(impostor)
+
+
+def test_an_impostor_after_a_restart_is_sent_nothing(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+) -> None:
+    """The link was up; then another slot's certificate answers at the same port."""
+    replica = start_replica()
+    link = dial(replica.endpoint)
+    wait_for(lambda: link.usable)
+    replica.kill()
+    impostor = start_replica(endpoint=replica.endpoint, files=authority.replica(1))
+    wait_for(lambda: "has the certificate of" in link.status().detail)
+    assert not link.offer(SERVICE, request_id(1), b"secret", 1.0)
+    assert _heard_nothing(impostor)
+    assert link.status().state is LinkState.SUSPECT
+
+
+def test_nothing_is_sent_to_an_impostor_after_a_reconnect(
+    authority: Authority, start_replica: Callable[..., ReplicaProcess]
+) -> None:
+    """Zenoh's own reconnecting is covered too: the session's access list knows one name only.
+
+    The session is used bare here, since a link throws its session away at the first loss.
+    """
+    replica = start_replica()
+    settings = config.robot_settings(peer(replica.endpoint), authority.robot(), LinkSettings())
+    session = zenoh.open(config.to_zenoh(settings))
+    try:
+        probe_key = names.probe_key(POOL_UID, 0)
+        list(session.get(probe_key, payload=b"{}", timeout=5.0))
+        assert replica.count("malformed") == 1
+        replica.kill()
+        wait_for(lambda: not session.info.links())
+        impostor = start_replica(endpoint=replica.endpoint, files=authority.replica(1))
+        wait_for(lambda: [li.auth_identifier for li in session.info.links()] != [])
+        for key in (probe_key, keys(0)[SERVICE], "**"):
+            assert list(session.get(key, payload=b"secret", timeout=1.0)) == []
+        assert _heard_nothing(impostor)
+    finally:
+        session.close()
+
+
+def test_a_robot_can_declare_and_publish_nothing(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+) -> None:
+    """A hostile robot, bound by no access list of its own, cannot answer in a replica's place."""
+    replica = start_replica()
+    settings = config.robot_settings(peer(replica.endpoint), authority.robot("eve"), LinkSettings())
+    del settings["access_control"]
+    session = zenoh.open(config.to_zenoh(settings))
+    stolen: list[object] = []
+    try:
+        thief = session.declare_queryable(f"fogft/{POOL_UID}/**", stolen.append)
+        listener = session.declare_subscriber("**", stolen.append)
+        away = zenoh.Locality.REMOTE
+        session.put(keys(0)[SERVICE], b"published", allowed_destination=away)
+        for key in (names.probe_key(POOL_UID, 1), "@/**"):
+            assert list(session.get(key, timeout=1.0, allowed_destination=away)) == []
+        link = dial(replica.endpoint)
+        wait_for(lambda: link.usable)
+        for number in range(20):
+            link.offer(SERVICE, request_id(number), b"mine", 10.0)
+        wait_for(lambda: len(owner.answers) == 20)
+        assert {a.payload for _, a in owner.answers} == {b"mine"}
+        assert stolen == []
+        del thief, listener
+    finally:
+        session.close()
+
+
+@pytest.mark.parametrize("attachment", [None, b"", b"garbage", b"\x02" + bytes(40)])
+def test_a_request_that_cannot_be_read_is_refused_and_counted(
+    authority: Authority, start_replica: Callable[..., ReplicaProcess], attachment: bytes | None
+) -> None:
+    """Whoever sent it hears so at once, and the listener goes on."""
+    replica = start_replica()
+    settings = config.robot_settings(peer(replica.endpoint), authority.robot(), LinkSettings())
+    session = zenoh.open(config.to_zenoh(settings))
+    try:
+        for times in (1, 2):
+            replies = list(
+                session.get(keys(0)[SERVICE], payload=b"x", attachment=attachment, timeout=5.0)
+            )
+            assert [r.err is not None for r in replies] == [True]
+            assert replies[0].err is not None
+            assert replies[0].err.payload.to_bytes().endswith(Refusal.MALFORMED.encode())
+            assert replica.count("malformed") == times
+    finally:
+        session.close()
