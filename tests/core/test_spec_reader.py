@@ -13,7 +13,8 @@ from fogft.core import ros_names
 from fogft.core.errors import SpecError
 from fogft.core.names import POOL_NAME_PATTERN
 from fogft.core.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
-from fogft.core.spec_reader import LATER_KEYS, TASK_KEYS, pool_spec
+from fogft.core.spec_keys import LATER_KEYS, TASK_KEYS
+from fogft.core.spec_reader import pool_spec
 from fogft.core.spec_tree import Node, plain, shown
 
 

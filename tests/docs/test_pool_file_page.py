@@ -9,7 +9,7 @@ import pytest
 
 from fogft.core.errors import SpecError
 from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
-from fogft.core.spec_reader import (
+from fogft.core.spec_keys import (
     FOGFT_KEYS,
     HEALTH_KEYS,
     LATER_KEYS,

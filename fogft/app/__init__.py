@@ -1,0 +1,58 @@
+"""The composition root: the only place that picks concrete adapters for the ports.
+
+One function for each thing that the command line can ask. They take and return values and
+never print; imports stand inside them so that a command loads only what it needs.
+
+Owns: which cloud, which reader of pool files, which store; what a command means.
+Not here: text (`fogft.cli`), decisions (`fogft.core`), the parts themselves.
+"""
+
+from fogft.app.chaos import chaos, machine_in
+from fogft.app.clouds import CLOUDS, make_cloud, make_store, pool_name, pools
+from fogft.app.lifecycle import down, order, start
+from fogft.app.looking import (
+    doctor,
+    excluded,
+    file_of,
+    locations,
+    logs,
+    manager_alive,
+    refresh,
+    slots,
+    status,
+    tail,
+)
+from fogft.app.parts import examples, init, run_manager, run_proxy, run_server
+from fogft.app.wishes import drain, exclude, include, scale
+
+__all__ = [
+    "CLOUDS",
+    "chaos",
+    "doctor",
+    "down",
+    "drain",
+    "examples",
+    "exclude",
+    "excluded",
+    "file_of",
+    "include",
+    "init",
+    "locations",
+    "logs",
+    "machine_in",
+    "make_cloud",
+    "make_store",
+    "manager_alive",
+    "order",
+    "pool_name",
+    "pools",
+    "refresh",
+    "run_manager",
+    "run_proxy",
+    "run_server",
+    "scale",
+    "slots",
+    "start",
+    "status",
+    "tail",
+]

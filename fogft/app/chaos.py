@@ -1,0 +1,34 @@
+"""Make things go wrong on the local cloud."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fogft.app.clouds import local_root, make_cloud, make_store
+from fogft.core.errors import FogftError
+
+if TYPE_CHECKING:
+    from fogft.cloud.local.chaos import Chaos
+    from fogft.core.model import ReplicaId
+
+
+def chaos() -> Chaos:
+    """Return what makes things go wrong on the local cloud."""
+    from fogft.cloud.local.chaos import Chaos
+
+    return Chaos(local_root())
+
+
+def machine_in(pool: str, slot: int) -> ReplicaId:
+    """Return the newest machine that the cloud lists in a slot of a pool, to act upon.
+
+    Raises:
+        FogftError: There is none (the hint lists those there are).
+    """
+    identity = make_store(pool).identity()
+    machines = make_cloud(identity.cloud).machines(identity.uid)
+    found = [machine.id for machine in machines if machine.id.slot == slot]
+    if not found:
+        known = ", ".join(sorted({str(machine.id.slot) for machine in machines})) or "none"
+        raise FogftError(f"no machine runs in slot {slot} of `{pool}`", f"slots with one: {known}")
+    return max(found)

@@ -1,0 +1,73 @@
+"""Begin and end a pool."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fogft import disk
+from fogft.app.clouds import CLOUDS, make_cloud, make_store
+from fogft.pool.paths import home
+
+if TYPE_CHECKING:
+    from fogft.pool.preview import Order
+
+
+def order(file: Path, cloud: str | None = None) -> Order:
+    """Read and judge a pool file, and find out what applying it would do. Changes nothing.
+
+    Args:
+        file: The pool file.
+        cloud: Where to run it; None for what its resources name, else `local`.
+
+    Raises:
+        SpecError: The first mistake in the file.
+        CloudError: Its cloud is not supported.
+    """
+    from fogft.pool import pool_file, preview
+    from fogft.ros.types import check_ok_field, check_service_type
+
+    source = pool_file.text(file)
+    spec = pool_file.parse(
+        source,
+        file=str(file),
+        check_types=check_service_type,
+        check_fields=check_ok_field,
+        folder=file.parent,
+    )
+    chosen = cloud or preview.cloud_of(spec, CLOUDS, source, file) or CLOUDS[0]
+    concrete = make_cloud(chosen)
+    store = make_store(spec.name)
+    return preview.order(store, concrete, spec, cloud_name=chosen, source=source, file=file)
+
+
+def start(order: Order) -> bool:
+    """Create the pool or apply the changed file; return whether a manager had to be started.
+
+    Raises:
+        FogftError: The pool is another one's, is being ended, or its manager did not start.
+    """
+    from fogft.pool import startup
+
+    disk.make_folder(home())
+    store, spec = make_store(order.spec.name), order.spec
+    cloud = order.preview.cloud
+    startup.write(store, spec, source=order.source, file=order.file.resolve(), cloud=cloud)
+    return startup.start_manager(store)
+
+
+def down(pool: str, told: Callable[[str], None]) -> None:
+    """End a pool and all that it started; tell each thing as it has been ended.
+
+    Raises:
+        PoolNotFound: There is no such pool.
+        FogftError: Something did not end; run it again.
+    """
+    from fogft.pool import shutdown
+    from fogft.ros import shared_memory
+
+    shutdown.end(make_store(pool), make_cloud, told=told)
+    swept = shared_memory.sweep()  # what killed ROS processes cannot remove themselves
+    if swept:
+        told(f"{len(swept)} shared-memory files of dead processes")

@@ -1,0 +1,89 @@
+"""What one can see of a pool, and of this machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fogft import disk
+from fogft.app.clouds import make_cloud, make_store, pools
+from fogft.pool.paths import PoolPaths, home
+
+if TYPE_CHECKING:
+    from fogft.doctor.finding import Finding
+    from fogft.pool.seen import Seen
+
+
+def manager_alive(pool: str) -> bool:
+    """Whether a manager of this pool runs."""
+    return disk.is_locked(PoolPaths.of(pool).manager_lock)
+
+
+def file_of(pool: str) -> str:
+    """Return the pool file that a pool was started from."""
+    from fogft.pool.store import read_identity
+
+    return read_identity(PoolPaths.of(pool)).file
+
+
+def status(pool: str) -> Seen:
+    """Return what the manager last saw of a pool, how old it is, and who looks now."""
+    from fogft.pool import seen
+
+    return seen.read(PoolPaths.of(pool), time.time())
+
+
+def refresh(pool: str, limit_s: float = 15.0) -> Seen:
+    """Have the manager look again; without one, ask the cloud and the client proxy's report.
+
+    Raises:
+        StateError: The manager did not look again within `limit_s`.
+    """
+    from fogft.pool import seen
+
+    if manager_alive(pool):
+        return seen.renewed(PoolPaths.of(pool), limit_s)
+    store = make_store(pool)
+    return seen.ask(store, make_cloud(store.identity().cloud), time.time())
+
+
+def slots(pool: str) -> list[int]:
+    """Return the slots that hold a replica, sorted."""
+    return sorted({replica.slot for replica in status(pool).status.replicas})
+
+
+def locations(pool: str) -> list[str]:
+    """Return where the replicas are: regions and zones, sorted."""
+    zones = {replica.location for replica in status(pool).status.replicas}
+    return sorted(zones | {zone.rsplit("/", 1)[0] for zone in zones})
+
+
+def excluded(pool: str) -> list[str]:
+    """Return the locations that are excluded now, sorted."""
+    return sorted(make_store(pool).intent().excluded)
+
+
+def logs(pool: str, slot: int | None = None) -> list[tuple[str, Path]]:
+    """Return a pool's logs, each with its name: ``manager``, ``proxy``, ``slot.generation``."""
+    from fogft.pool import logs
+
+    store = make_store(pool)
+    return logs.find(store, make_cloud(store.identity().cloud), slot)
+
+
+def tail(path: Path, lines: int = 8) -> str:
+    """Return the last lines of a log; empty where there is none."""
+    from fogft.pool import process_control
+
+    return process_control.log_tail(path, lines)
+
+
+def doctor(file: Path | None = None) -> Iterator[Finding]:
+    """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come."""
+    from fogft.doctor import checks, finding
+    from fogft.pool import pool_file
+
+    spec = None if file is None else pool_file.read(file)
+    yield from finding.run(checks.ALL, finding.situation(home(), pools(), spec))

@@ -1,0 +1,62 @@
+"""The examples, and the parts of a pool that can be run by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from fogft.app.clouds import make_cloud, make_store
+
+
+def init(example: str, into: Path | None, *, force: bool = False) -> list[Path]:
+    """Write an example's files; return them, the pool file first.
+
+    Args:
+        example: Its name; empty for the default one.
+        into: The folder; None for one with the example's name, here.
+        force: Overwrite files that are there.
+
+    Raises:
+        FogftError: There is no such example, or a file is in the way.
+    """
+    from fogft.pool import init as examples_
+
+    name = example or examples_.DEFAULT_EXAMPLE
+    return examples_.copy_example(name, into or Path(name), force=force)
+
+
+def examples() -> Sequence[str]:
+    """Return the names of the examples that `init` can write."""
+    from fogft.pool import init
+
+    return list(init.examples())
+
+
+def run_proxy(config: Path) -> None:
+    """Run a client proxy until a signal ends it."""
+    from fogft.proxy import client_process
+
+    client_process.run(config)
+
+
+def run_server(
+    config: Path,
+    *,
+    listen: str | None = None,
+    domain_id: int | None = None,
+    workdir: Path | None = None,
+    notice_file: Path | None = None,
+) -> None:
+    """Run a server proxy until a signal ends it."""
+    from fogft.proxy import server_process
+
+    server_process.run(
+        config, listen=listen, domain_id=domain_id, workdir=workdir, notice_file=notice_file
+    )
+
+
+def run_manager(pool: str) -> None:
+    """Run a pool's manager until a signal ends it, or the pool has been ended."""
+    from fogft.pool import manager
+
+    manager.run(make_store(pool), make_cloud)

@@ -1,0 +1,52 @@
+"""What a running pool shall become."""
+
+from __future__ import annotations
+
+import time
+
+from fogft.app.clouds import make_cloud, make_store
+from fogft.core.errors import FogftError
+
+
+def scale(pool: str, by: int) -> tuple[int, int]:
+    """Want `by` more replicas (fewer when negative); return how many before and after."""
+    from fogft.pool import wishes
+
+    return wishes.scale(make_store(pool), by)
+
+
+def drain(pool: str, slot: int) -> str:
+    """Have the replica in a slot replaced; return it as ``slot.generation``."""
+    from fogft.pool import wishes
+
+    return wishes.drain(make_store(pool), slot, time.time())
+
+
+def exclude(pool: str, location: str) -> bool:
+    """Keep out of a location; return whether that is new.
+
+    Raises:
+        FogftError: The pool's cloud has no such location.
+    """
+    from fogft.core.intent import checked_location
+    from fogft.core.spec_tree import nearest
+    from fogft.pool import wishes
+
+    store = make_store(pool)
+    cloud, place = store.identity().cloud, checked_location(location)
+    zones = {offer.placement.location for offer in make_cloud(cloud).offers({})}
+    known = {cloud, *zones, *(zone.rsplit("/", 1)[0] for zone in zones)}
+    if place not in known:
+        in_cloud = f"{cloud}/{place}"
+        raise FogftError(
+            f"the cloud `{cloud}` of pool `{pool}` has no location `{place}`",
+            f"did you mean `{in_cloud}`?" if in_cloud in known else nearest(place, known),
+        )
+    return wishes.exclude(store, place)
+
+
+def include(pool: str, location: str) -> None:
+    """Allow a location again."""
+    from fogft.pool import wishes
+
+    wishes.include(make_store(pool), location)

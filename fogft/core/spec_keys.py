@@ -1,0 +1,65 @@
+"""The keys of a pool file: which there are, where each is at home, and which are not built yet.
+
+Pure. The readers of each section (`spec_reader`, `spec_task`, `spec_services`) use them.
+"""
+
+from __future__ import annotations
+
+DAY_S = 86_400.0
+
+FOGFT_KEYS = (
+    "services",
+    "replicas",
+    "max_surge",
+    "max_usd_per_hour",
+    "health",
+    "orphan_after_s",
+)
+SERVICE_KEYS = ("name", "type", "timeout_s", "on_timeout", "ok_field")
+HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
+# The task schema of SkyPilot 0.14.1, without the keys that it keeps for itself.
+TASK_KEYS = (
+    "name",
+    "workdir",
+    "event_callback",
+    "num_nodes",
+    "resources",
+    "file_mounts",
+    "setup",
+    "run",
+    "envs",
+    "secrets",
+    "managed_secrets",
+    "inputs",
+    "outputs",
+    "config",
+    "volumes",
+    "api_server_access",
+)
+REFUSED_TASK_KEYS = {
+    "service": "it is SkyServe's; list what to replicate under `fogft.services` instead",
+    "pool": "it is for SkyPilot's own worker pools; the file is a pool by its `fogft` section",
+}
+# Designed, not built. Ignoring one would promise what nobody does.
+LATER_KEYS = {
+    "availability": "remove it and say how many: `replicas: 2`",
+    "groups": "remove it; each pool file describes one pool of equal replicas",
+    "topology": "remove it; every replica is linked to the robot directly",
+    "on_demand": "remove it, or set `resources.use_spot: false` for on-demand machines only",
+    "schedule": "remove it, and use `fogft scale` or `fogft down` from a timer",
+    "max_hours": "remove it, and use `fogft down` from a timer",
+    "hedging": "remove it; every request goes to all replicas at once",
+    "state": "remove it; the services must be stateless",
+    "quorum": "remove it; the first successful response is returned",
+}
+
+
+def places(here: tuple[str, ...]) -> dict[str, str]:
+    """Say of every key that is not at home here where it is."""
+    homes = (
+        (HEALTH_KEYS, "under `fogft.health`"),
+        (("timeout_s", "on_timeout", "ok_field"), "in a service, under `fogft.services`"),
+        (FOGFT_KEYS, "under `fogft`"),
+        (("run", "setup", "resources", "workdir", "envs"), "at the top level of the file"),
+    )
+    return {key: place for keys, place in homes for key in keys if key not in here}

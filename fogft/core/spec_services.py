@@ -1,0 +1,65 @@
+"""Judge the `services` section of a pool file."""
+
+from __future__ import annotations
+
+from fogft.core import ros_names
+from fogft.core.spec import ServiceSpec
+from fogft.core.spec_keys import DAY_S, LATER_KEYS, SERVICE_KEYS, places
+from fogft.core.spec_tree import Section, shown
+
+_SERVICES_HINT = "write a list, such as `services: [{name: /detect, type: my_msgs/srv/Detect}]`"
+
+
+def read_services(ours: Section) -> tuple[ServiceSpec, ...]:
+    """Return what `services` asks for.
+
+    Raises:
+        SpecError: The first mistake.
+    """
+    found: dict[str, ServiceSpec] = {}
+    lines: dict[str, int] = {}
+    for section in ours.sections("services", _SERVICES_HINT):
+        section.only(SERVICE_KEYS, later=LATER_KEYS, elsewhere=places(SERVICE_KEYS))
+        service = _service(section)
+        if service.name in found:
+            raise section.error(
+                "name",
+                f"`{service.name}` stands here twice (first in line {lines[service.name]})",
+                "give each service one entry",
+            )
+        found[service.name] = service
+        lines[service.name] = section.children["name"].line
+    return tuple(found.values())
+
+
+def _service(section: Section) -> ServiceSpec:
+    written = section.text("name", "write the service's name, such as `name: /detect`")
+    try:
+        name = ros_names.absolute_service_name(written)
+    except ValueError as error:
+        what = f"{shown(written)} is not a service name: {error}"
+        raise section.error("name", what, "write a name such as `/detect`") from None
+    ok_field = section.text("ok_field", "name a boolean field of the response", default="")
+    if ok_field and not ros_names.is_field_name(ok_field):
+        what = f"{shown(ok_field)} is not the name of a field"
+        raise section.error("ok_field", what, "name a boolean field, such as `success`")
+    return ServiceSpec(
+        name=name,
+        type=_type(section),
+        timeout_s=section.number("timeout_s", DAY_S, "seconds", ServiceSpec.timeout_s),
+        on_timeout=section.choice("on_timeout", ServiceSpec.on_timeout),
+        ok_field=ok_field,
+    )
+
+
+def _type(section: Section) -> str:
+    example = "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`"
+    written = section.text("type", example)
+    if ros_names.is_service_type(written):
+        return written
+    meant = ros_names.suggested_service_type(written)
+    raise section.error(
+        "type",
+        f"{shown(written)} is not a service type",
+        f"did you mean `{meant}`?" if meant else example,
+    )
