@@ -203,7 +203,7 @@ def test_the_strategy_reaches_what_it_should() -> None:
     """Guards the laws above against worlds in which nothing ever happens."""
     seen: set[str] = set()
 
-    @settings(max_examples=300, deadline=None, database=None, derandomize=True)
+    @settings(max_examples=2000, deadline=None, database=None, derandomize=True)
     @given(worlds())
     def look(world: World) -> None:
         planned = world.plan()
