@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -28,9 +29,12 @@ __all__ = ["Notice", "NoticeKind", "Watch", "watch"]
 
 SOURCES = ("auto", "aws", "azure", "gcp")
 POLL_S = 1.0
+FILE_POLL_S = 0.1  # costs nothing, and a local machine may live for a second only
 LOST_POLL_S = 30.0
 _TIMEOUT_S = 2.0
 _METADATA = "169.254.169.254"
+# The variables that the clouds' own clients know. Azure's have none.
+_ELSEWHERE = {"aws": "AWS_EC2_METADATA_SERVICE_ENDPOINT", "gcp": "GCE_METADATA_HOST"}
 
 
 class Source(Protocol):
@@ -100,27 +104,29 @@ def watch(
     source: str,
     on_notice: Callable[[Notice], None],
     *,
-    poll_s: float = POLL_S,
-    metadata: str = _METADATA,
+    poll_s: float | None = None,
+    metadata: str | None = None,
 ) -> Watch:
     """Start to watch on a thread of its own.
 
     Args:
         source: ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers.
         on_notice: Called from that thread, once for each kind of notice; must not block.
-        poll_s: Seconds between two looks.
-        metadata: ``host[:port]`` of the metadata server, for tests.
+        poll_s: Seconds between two looks; None for what suits the source.
+        metadata: ``host[:port]`` of the metadata server; None for the clouds' own address,
+            or for where the environment says that it is.
 
     Raises:
         CloudError: There is no such source.
     """
     if source.startswith("file:") and source != "file:":
         sources: list[Source] = [_File(Path(source.removeprefix("file:")))]
+        poll_s = FILE_POLL_S if poll_s is None else poll_s
     elif source in SOURCES:
         known: dict[str, Source] = {
-            "aws": _Aws(metadata),
-            "gcp": _Gcp(metadata),
-            "azure": _Azure(metadata),
+            "aws": _Aws(metadata or _address("aws")),
+            "gcp": _Gcp(metadata or _address("gcp")),
+            "azure": _Azure(metadata or _METADATA),
         }
         sources = list(known.values()) if source == "auto" else [known[source]]
     else:
@@ -128,7 +134,12 @@ def watch(
             f"there is no source of preemption notices `{source}`",
             f"`file:PATH`, {', '.join(f'`{name}`' for name in SOURCES)}",
         )
-    return Watch(sources, on_notice, poll_s)
+    return Watch(sources, on_notice, POLL_S if poll_s is None else poll_s)
+
+
+def _address(cloud: str) -> str:
+    told = os.environ.get(_ELSEWHERE[cloud], "").split("//")[-1].rstrip("/")
+    return told or _METADATA
 
 
 class _File:

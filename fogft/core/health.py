@@ -28,6 +28,8 @@ from fogft.core.spec import PoolSpec
 # A single replica's silence looks like a dead uplink. When the cloud still answers after this
 # many times `replace_after_s`, the uplink is fine and the replica is not.
 LONE_SILENCE_FACTOR = 4.0
+# A cloud may recommend to move what has just been moved. A hint costs one launch in this time.
+HINT_PAUSE_S = 600.0
 
 
 class Verdict(str, Enum):
@@ -37,6 +39,7 @@ class Verdict(str, Enum):
     FAILED = "failed"  # its launch has failed, or took longer than `start_limit_s`
     LEAVING = "leaving"  # a preemption notice was given, or it asked to be left alone
     UNRESPONSIVE = "unresponsive"  # silent past `replace_after_s` while another answers
+    AT_RISK = "at risk"  # serves, and its cloud recommends to move it
     STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
 
 
@@ -195,6 +198,8 @@ def _verdict(  # noqa: PLR0911 - one line a verdict reads better than nesting
     # A mark of our own comes back in the report: it is not the replica's wish.
     if link is not None and link.draining and not (record and record.draining_since):
         return Verdict.LEAVING, "it asked to be left alone"
+    if serving and link is not None and link.at_risk and _has_settled(record, now):
+        return Verdict.AT_RISK, "the cloud recommends to move it (rebalance)"
     if serving or not context.may_doubt:
         return Verdict.GOOD, ""
     if link is not None and was_heard(link, record) and link.state is not LinkState.UP:
@@ -210,3 +215,8 @@ def _verdict(  # noqa: PLR0911 - one line a verdict reads better than nesting
     if away_s > health.start_limit_s and context.ready_somewhere:
         return Verdict.STUCK, f"its service has been away for {away_s:.0f} s"
     return Verdict.GOOD, ""
+
+
+def _has_settled(record: Record | None, now: float) -> bool:
+    ready_at = record.first_ready_at if record is not None else None
+    return ready_at is not None and now - ready_at >= HINT_PAUSE_S

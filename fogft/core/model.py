@@ -130,6 +130,7 @@ class LinkReport:
     Attributes:
         ready: Names of the services that this replica says it can answer now.
         draining: The replica asked to be left alone (a preemption notice, a drain).
+        at_risk: Its cloud recommends to move it; it serves on meanwhile.
         heard_age_s: Since the server proxy last answered a probe; None if never.
         silent_for_s: How long probes have gone unanswered; 0 while they are answered.
         rtt_s: Round trip of the last probe.
@@ -141,6 +142,7 @@ class LinkReport:
     state: LinkState
     ready: frozenset[str] = frozenset()
     draining: bool = False
+    at_risk: bool = False
     heard_age_s: float | None = None
     silent_for_s: float = 0.0
     rtt_s: float | None = None

@@ -150,7 +150,7 @@ def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged) -> str:
         return "drained by the user"
     if intent.is_excluded(machine.placement.location):
         return f"excluded location {machine.placement.location}"
-    if judged.verdict is Verdict.STUCK:
+    if judged.verdict in (Verdict.STUCK, Verdict.AT_RISK):
         return judged.why
     if machine.spec_hash != spec.replica_hash:
         return "outdated by a change of the pool file"

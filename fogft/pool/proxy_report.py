@@ -41,7 +41,9 @@ class ProxyReport:
 
     def digest(self) -> object:
         """Return what a manager should react to at once; counters and ages are left out."""
-        return frozenset((link.id, link.state, link.ready, link.draining) for link in self.links)
+        return frozenset(
+            (link.id, link.state, link.ready, link.draining, link.at_risk) for link in self.links
+        )
 
 
 def read(path: Path, pool_uid: str) -> ProxyReport | None:
@@ -76,6 +78,7 @@ def _link(raw: Mapping[str, Any], pool_uid: str) -> LinkReport:
         state=LinkState(raw["state"]),
         ready=frozenset(str(name) for name in raw["ready"]),
         draining=bool(raw.get("draining")),
+        at_risk=bool(raw.get("at_risk")),
         heard_age_s=None if heard is None else float(heard),
         silent_for_s=float(raw.get("silent_for_s") or 0.0),
         rtt_s=None if rtt is None else float(rtt),

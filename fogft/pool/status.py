@@ -40,7 +40,8 @@ class ReplicaStatus:
 
     Attributes:
         link: ``connecting``, ``up`` or ``suspect``; empty when there is no link.
-        verdict: ``good``, ``failed``, ``leaving``, ``unresponsive`` or ``stuck``.
+        verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
+            ``at risk``.
         age_s: Since its launch.
     """
 

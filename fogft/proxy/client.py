@@ -234,6 +234,7 @@ class ClientProxy:
             "state": status.state.value,
             "ready": sorted(link.ready),
             "draining": self._draining(link),
+            "at_risk": bool(answer and answer.at_risk),
             "heard_age_s": status.heard_age_s,
             "silent_for_s": status.silent_for_s,
             "rtt_s": status.rtt_s,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fogft.cloud.notice import SOURCES as NOTICE_SOURCES
 from fogft.core import names
 from fogft.core.errors import StateError
 from fogft.core.model import ReplicaId
@@ -46,7 +47,12 @@ class ClientProxyConfig:
 
 @dataclass(frozen=True)
 class ServerProxyConfig:
-    """All that `fogft serve` needs to know."""
+    """All that `fogft serve` needs to know.
+
+    Attributes:
+        notice: Where preemption notices come from: ``none``, ``file:PATH`` with an absolute
+            path, or a source of `fogft.cloud.notice.watch`.
+    """
 
     pool: str
     id: ReplicaId
@@ -58,7 +64,7 @@ class ServerProxyConfig:
     envs: Mapping[str, str] = field(default_factory=dict)
     domain_id: int | None = None
     orphan_after_s: float = 3600.0
-    notice_file: Path | None = None
+    notice: str = "auto"
     max_in_flight: int = 512
     log_level: str = "info"
 
@@ -94,7 +100,6 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
     """
     with _Reading(path) as (in_file, base):
         raw = {**in_file, **{key: value for key, value in override.items() if value is not None}}
-        notice = raw.get("notice_file")
         return ServerProxyConfig(
             pool=str(raw["pool"]),
             id=ReplicaId(_uid(raw["pool_uid"]), int(raw["slot"]), int(raw["generation"])),
@@ -106,7 +111,7 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
             envs={str(k): str(v) for k, v in (raw.get("envs") or {}).items()},
             domain_id=_optional_int(raw.get("domain_id")),
             orphan_after_s=_seconds(raw.get("orphan_after_s") or 3600.0),
-            notice_file=base / notice if notice else None,
+            notice=_notice(raw.get("notice"), base),
             max_in_flight=int(raw.get("max_in_flight") or 512),
             log_level=str(raw.get("log_level") or "info"),
         )
@@ -170,6 +175,17 @@ def _robot(raw: Any) -> str:
     if not robot.isprintable() or not 0 < len(robot.encode()) <= ROBOT_BYTES_LIMIT:
         raise ValueError(f"a robot's name has 1 to {ROBOT_BYTES_LIMIT} printable bytes")
     return robot
+
+
+def _notice(raw: Any, base: Path) -> str:
+    source = "auto" if raw is None else str(raw)
+    kind, colon, path = source.partition(":")
+    if colon and kind == "file" and path:
+        return f"file:{base / path}"
+    if source != "none" and source not in NOTICE_SOURCES:
+        known = ", ".join(("file:PATH", "none", *NOTICE_SOURCES))
+        raise ValueError(f"notice: {raw!r:.40} is none of {known}")
+    return source
 
 
 def _optional_int(raw: Any) -> int | None:

@@ -19,6 +19,7 @@ import secrets
 import time
 from collections.abc import Callable
 
+from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.core import names
 from fogft.core.model import ReplicaId
 from fogft.core.spec import ServiceSpec
@@ -69,7 +70,8 @@ class ServerProxy:
         self._node: RosNode | None = None
         self._clients: dict[str, RosClient] = {}
         self._servers: dict[str, int] = {}
-        self.draining = False
+        self._draining = False
+        self._at_risk = False
         self.responder = Responder(
             lambda name: name in self._ready, max_in_flight=max_in_flight, clock=clock
         )
@@ -123,6 +125,17 @@ class ServerProxy:
         """Whether nothing was heard of a manager for `orphan_after_s`."""
         return self._clock() - self._manager_seen > self._orphan_after_s
 
+    def noticed(self, notice: Notice) -> None:
+        """Pass on what the machine was told by its cloud. From any thread; never taken back.
+
+        A preemption asks the robot to prefer the others, and the manager to replace this
+        replica; a rebalance is a hint, and the replica serves on as before.
+        """
+        if notice.kind is NoticeKind.PREEMPTION:
+            self._draining = True
+        else:
+            self._at_risk = True
+
     def _join_ros(self) -> None:
         self._node = self._make_node()
         self._clients = {s.name: self._node.client(s.name, s.type) for s in self._services}
@@ -147,7 +160,8 @@ class ServerProxy:
             generation=self._id.generation,
             incarnation=self._incarnation,
             ready=self._ready,
-            draining=self.draining,
+            draining=self._draining,
+            at_risk=self._at_risk,
             restarts=max(self._supervisor.restarts, 0),
             in_flight=self.responder.in_flight,
             detail=self._detail(),

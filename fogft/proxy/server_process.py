@@ -12,8 +12,9 @@ import sys
 import threading
 from pathlib import Path
 
+from fogft.cloud import notice
 from fogft.proxy.config import ServerProxyConfig, read_server
-from fogft.proxy.process import Watched, start_log, stop_on_signal
+from fogft.proxy.process import start_log, stop_on_signal
 from fogft.proxy.server import ServerProxy
 from fogft.proxy.supervisor import Supervisor
 from fogft.ros import environment, memory_tuning
@@ -50,17 +51,20 @@ def run(
         listen=listen,
         domain_id=domain_id,
         workdir=str(workdir.resolve()) if workdir else None,
-        notice_file=str(notice_file.resolve()) if notice_file else None,
+        notice=f"file:{notice_file.resolve()}" if notice_file else None,
     )
     start_log(config.log_level)
     stop = stop_on_signal()
     environment.prepare(os.environ)
     memory_tuning.tune()
     proxy = _make(config)
+    watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
     try:
         proxy.start()
         _loop(config, proxy, stop)
     finally:
+        if watching is not None:
+            watching.close()
         proxy.close()
         log.info("replica_stopped replica=%s", config.id)
 
@@ -103,13 +107,9 @@ def run_environment(config: ServerProxyConfig) -> dict[str, str]:
 
 def _loop(config: ServerProxyConfig, proxy: ServerProxy, stop: threading.Event) -> None:
     memory = memory_tuning.Trimmer()
-    notice = Watched(config.notice_file) if config.notice_file else None
     while not stop.wait(_TICK_S):
         proxy.run_once()
         memory.look()
-        if notice is not None and not proxy.draining and notice.changed():
-            proxy.draining = True
-            log.warning("notice_received replica=%s file=%s", config.id, notice.path)
         if proxy.orphaned:
             log.error(
                 "replica_orphaned replica=%s orphan_after_s=%.0f", config.id, config.orphan_after_s

@@ -163,6 +163,7 @@ def encode_probe_answer(answer: ProbeAnswer) -> bytes:
             "incarnation": answer.incarnation,
             "ready": sorted(answer.ready),
             "draining": answer.draining,
+            "at_risk": answer.at_risk,
             "restarts": answer.restarts,
             "in_flight": answer.in_flight,
             "detail": answer.detail[:DETAIL_LIMIT].encode(errors="replace").decode(),
@@ -186,12 +187,16 @@ def decode_probe_answer(frame: bytes) -> ProbeAnswer:
     draining = raw.get("draining")
     if not isinstance(draining, bool):
         raise FrameError("`draining` is neither true nor false")
+    at_risk = raw.get("at_risk", False)
+    if not isinstance(at_risk, bool):
+        raise FrameError("`at_risk` is neither true nor false")
     return ProbeAnswer(
         slot=_count(raw, "slot"),
         generation=_count(raw, "generation"),
         incarnation=_text(raw, "incarnation"),
         ready=frozenset(_check_text(name, "ready") for name in ready),
         draining=draining,
+        at_risk=at_risk,
         restarts=_count(raw, "restarts"),
         in_flight=_count(raw, "in_flight"),
         detail=_text(raw, "detail"),

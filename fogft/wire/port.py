@@ -39,6 +39,8 @@ class ProbeAnswer:
         ready: Names of the services that it can answer now.
         incarnation: Random text made when the server proxy started. A new one at the
             same id means that it forgot every request.
+        draining: It asks to be left alone: its machine will be taken.
+        at_risk: Its cloud recommends to move it; it serves on meanwhile.
         restarts: How often it restarted the user's `run` command.
         in_flight: Requests that it holds.
         detail: Why it is not ready, in words; empty when it is.
@@ -49,6 +51,7 @@ class ProbeAnswer:
     incarnation: str
     ready: frozenset[str] = frozenset()
     draining: bool = False
+    at_risk: bool = False
     restarts: int = 0
     in_flight: int = 0
     detail: str = ""

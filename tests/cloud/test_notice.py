@@ -28,7 +28,7 @@ class Heard:
         self.notices: queue.Queue[Notice] = queue.Queue()
         self.watches: list[Watch] = []
 
-    def watch(self, source: str, metadata: str = "127.0.0.1:1") -> None:
+    def watch(self, source: str, metadata: str | None = "127.0.0.1:1") -> None:
         self.watches.append(watch(source, self.notices.put, poll_s=0.01, metadata=metadata))
 
     def next(self) -> Notice:
@@ -114,6 +114,24 @@ def test_no_proxy_of_the_environment_is_asked(heard: Heard, monkeypatch: pytest.
     with serving("gcp") as fake:
         give(fake)
         heard.watch("gcp", fake.address)
+        assert heard.next().kind is PREEMPTION
+
+
+@pytest.mark.parametrize(
+    ("cloud", "variable", "form"),
+    [
+        ("aws", "AWS_EC2_METADATA_SERVICE_ENDPOINT", "http://{}/"),
+        ("gcp", "GCE_METADATA_HOST", "{}"),
+    ],
+)
+def test_the_environment_says_where_the_metadata_server_is(
+    heard: Heard, monkeypatch: pytest.MonkeyPatch, cloud: str, variable: str, form: str
+):
+    """By the variables that the clouds' own clients read."""
+    with serving(cloud) as fake:
+        monkeypatch.setenv(variable, form.format(fake.address))
+        give(fake)
+        heard.watch(cloud, None)
         assert heard.next().kind is PREEMPTION
 
 

@@ -105,6 +105,7 @@ def replica(
     unready_s: float | None = None,
     outdated: bool = False,
     price: float = 0.1,
+    at_risk: bool = False,
     of: PoolSpec | None = None,
 ) -> Part:
     """Make a replica.
@@ -137,6 +138,7 @@ def replica(
         ready=frozenset({SERVICE.name}) if serving else frozenset(),
         silent_for_s=silent_s,
         in_flight=in_flight,
+        at_risk=at_risk,
     )
     if state in ("provisioning", "failed"):
         link = None
@@ -238,6 +240,7 @@ def parts(draw: st.DrawFn, of: PoolSpec, slot: int, generation: int) -> Part:
         unready_s=draw(st.floats(0.5, 1.0) | st.floats(300, 600)) if state == "unready" else None,
         outdated=draw(st.sampled_from([False, False, True])),
         price=draw(st.sampled_from([0.1, 0.2])),
+        at_risk=draw(st.sampled_from([False, False, True])),
         of=of,
     )
 

@@ -52,6 +52,31 @@ def test_notice_is_replaced_at_once_elsewhere_and_kept_until_then() -> None:
     assert ends(world) == []
 
 
+def test_a_rebalance_is_an_early_hint() -> None:
+    """Its replica serves on, is replaced elsewhere, new before old, and one at a time."""
+    world = World(spec(2)).having(
+        replica(0, at=A, age_s=1000, at_risk=True), replica(1, at=D, age_s=1000, at_risk=True)
+    )
+    [launch] = world.plan().launches
+    assert (launch.slot, launch.generation) == (0, 2)
+    assert launch.offer.placement.location != A.location
+    assert (ends(world), world.plan().draining) == ([], ())
+    coming = world.having(replica(0, 2, at=B, state="provisioning"))
+    assert (launches(coming), ends(coming)) == ([], [])
+
+
+def test_a_rebalance_right_after_a_move_costs_no_second_launch() -> None:
+    """Clouds may recommend to move what has just been moved."""
+    world = World(spec(2)).having(replica(0, at=A, age_s=100, at_risk=True), replica(1, at=D))
+    assert launches(world) == []
+
+
+def test_a_rebalance_waits_where_no_surge_is_allowed() -> None:
+    """A hint takes no replica away: with no room for another one it serves on."""
+    world = World(spec(1, max_surge=0)).having(replica(0, at=A, age_s=1000, at_risk=True))
+    assert (launches(world), ends(world)) == ([], [])
+
+
 def test_notice_does_not_count_against_the_surge() -> None:
     """With no surge allowed, a noticed replica is replaced all the same."""
     world = World(spec(2, max_surge=0)).having(replica(0), replica(1, state="noticed"))

@@ -21,13 +21,15 @@ def main(folder: str) -> None:
     while paths.folder.exists():
         raw = disk.read_json(paths.membership)
         members = membership.from_dict(raw).members if raw is not None else ()
+        left_alone = paths.folder / "draining"  # what these replicas would say of themselves
+        draining = left_alone.read_text().split() if left_alone.exists() else []
         links = [
             {
                 "slot": m.id.slot,
                 "generation": m.id.generation,
                 "state": "up",
                 "ready": ["/plan"],
-                "draining": m.draining,
+                "draining": m.draining or m.id.short in draining,
             }
             for m in members
         ]

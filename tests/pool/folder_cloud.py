@@ -47,10 +47,18 @@ class FolderCloud:
 
     def terminate(self, id: ReplicaId) -> None:
         self._reach()
+        if (self.folder / f"keep-{id.short}").exists():
+            raise CloudUnreachable("told to keep it")
         (self.folder / f"{id}.json").unlink(missing_ok=True)
 
     def log(self, id: ReplicaId) -> str | None:
         return None
+
+    def keep(self, short: str) -> Path:
+        """Let nobody end a machine until the returned file is removed."""
+        path = self.folder / f"keep-{short}"
+        path.touch()
+        return path
 
     def launched(self) -> list[str]:
         """Return every launch ever ordered, as ``slot.generation``."""

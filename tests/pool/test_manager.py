@@ -100,6 +100,27 @@ def test_dead_proxy_is_started_again(scene: Scene) -> None:
     assert scene.cloud.launched() == ["0.1"]
 
 
+def test_a_notice_is_answered_with_a_replacement_while_the_old_one_lives(scene: Scene) -> None:
+    """A replica asks to be left alone: the next one is launched at once, elsewhere.
+
+    The cloud knows of no notice here, as with real clouds: the link alone tells.
+    """
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    lost_in = next(r["location"] for r in scene.status()["replicas"] if r["slot"] == 1)
+    keeping = scene.cloud.keep("1.1")
+    (scene.paths.folder / "draining").write_text("1.1")
+    scene.wait(lambda: "1.2" in scene.cloud.launched())
+    assert "1.1" in scene.running()
+    keeping.unlink()
+    scene.wait(lambda: scene.running() == ["0.1", "1.2"] and scene.whole(2))
+    events = [(e["event"], e["replica"]) for e in scene.status()["events"]]
+    assert events.index(("launched", "1.2")) < events.index(("ending", "1.1"))
+    [after] = [r["location"] for r in scene.status()["replicas"] if r["slot"] == 1]
+    assert after != lost_in
+
+
 def test_unreachable_cloud_changes_nothing(scene: Scene) -> None:
     """While the cloud does not answer, status says so and keeps what was seen last."""
     scene.write(replicas=1)

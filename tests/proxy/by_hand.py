@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +42,8 @@ class Parts:
         self._version = 0
         credentials.create_authority(folder / "ca", UID)
 
-    def replica(self, slot: int, work_s: float = 0.001) -> Replica:
-        return Replica(self, slot, work_s)
+    def replica(self, slot: int, work_s: float = 0.001, **environ: str) -> Replica:
+        return Replica(self, slot, work_s, environ)
 
     def robot(self, name: str, *replicas: Replica) -> Robot:
         return Robot(self, name, replicas)
@@ -55,11 +55,13 @@ class Parts:
     def domain(self) -> int:
         return self._domain()
 
-    def start(self, command: str, config: Path) -> subprocess.Popen[bytes]:
+    def start(
+        self, command: str, config: Path, environ: Mapping[str, str] = {}
+    ) -> subprocess.Popen[bytes]:
         with config.with_suffix(".log").open("ab") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", "fogft", command, "--config", str(config)],
-                cwd=ROOT, stdout=log, stderr=log,
+                cwd=ROOT, stdout=log, stderr=log, env={**os.environ, **environ},
             )  # fmt: skip
         self._processes.append(process)
         return process
@@ -78,20 +80,22 @@ class Parts:
 class Replica:
     """A server proxy with an ordinary service under it."""
 
-    def __init__(self, parts: Parts, slot: int, work_s: float) -> None:
+    def __init__(self, parts: Parts, slot: int, work_s: float, environ: Mapping[str, str]) -> None:
         self.id = ReplicaId(UID, slot, 1)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.endpoint = f"127.0.0.1:{free.getsockname()[1]}"
         parts.issue(names.replica_certificate_name(self.id), credentials.Role.REPLICA, f"r{slot}")
         config = parts.folder / f"replica{slot}.yaml"
+        notice = "auto" if environ else "none"
         config.write_text(
             f'pool: p\npool_uid: "{UID}"\nslot: {slot}\ngeneration: 1\n'
             f"listen: {self.endpoint}\nservices: {SERVICES}\ndomain_id: {parts.domain()}\n"
             f"run: exec {sys.executable} {SERVICE} {work_s}\n"
+            f"notice: {notice}\n"
             f"credentials: {{ca: ca/ca.crt, certificate: r{slot}.crt, key: r{slot}.key}}\n"
         )
-        self.process = parts.start("serve", config)
+        self.process = parts.start("serve", config, environ)
 
     def run_pid(self) -> int:
         """Return the process id of the user's command."""

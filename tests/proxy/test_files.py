@@ -122,6 +122,30 @@ def test_a_value_that_would_break_a_link_later_is_an_error_now(tmp_path, key, wr
         read_client(tmp_path / "proxy.yaml")
 
 
+@pytest.mark.parametrize(
+    ("line", "source"),
+    [
+        ("", "auto"),
+        ("notice: null", "auto"),
+        ("notice: none", "none"),
+        ("notice: gcp", "gcp"),
+        ("notice: file:notice.json", "file:{folder}/notice.json"),
+        ("notice: file:/run/notice", "file:/run/notice"),
+    ],
+)
+def test_where_notices_come_from(tmp_path, line, source):
+    """A file is found from the configuration's own folder."""
+    (tmp_path / "replica.yaml").write_text(f"{REPLICA}{line}\n")
+    assert read_server(tmp_path / "replica.yaml").notice == source.format(folder=tmp_path)
+
+
+@pytest.mark.parametrize("line", ["notice: no", "notice: 'file:'", "notice: ibm", "notice: []"])
+def test_an_unknown_source_of_notices_is_an_error(tmp_path, line):
+    (tmp_path / "replica.yaml").write_text(f"{REPLICA}{line}\n")
+    with pytest.raises(FogftError, match="file:PATH"):
+        read_server(tmp_path / "replica.yaml")
+
+
 def test_a_file_that_stays_bad_is_logged_once(tmp_path, caplog):
     """A full disk would else be told of twice a second, into a log on that disk."""
 

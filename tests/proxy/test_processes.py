@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from fogft.ros import environment
+from tests.cloud.fake_metadata import serving
 from tests.proxy.by_hand import LIMIT_S, Caller, Parts, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
@@ -102,6 +103,32 @@ def test_a_membership_change_under_load_loses_nothing(parts, call):
     old.process.kill()
     caller.ask(20)
     assert caller.all_answered()
+
+
+def test_a_machine_that_is_told_of_its_end_gets_no_more_requests(parts, call):
+    """The metadata server's words reach the robot, which asks the others; none is lost.
+
+    A rebalance is a hint: the replica is marked, and goes on answering.
+    """
+    with serving("aws") as metadata:
+        told = parts.replica(0, AWS_EC2_METADATA_SERVICE_ENDPOINT=f"http://{metadata.address}/")
+        robot = parts.robot("robot", told, parts.replica(1))
+        caller = call(robot)
+        wait_for(lambda: robot.ready() == [0, 1], "both replicas")
+
+        metadata.rebalance = {"noticeTime": "2026-01-01T00:00:00Z"}
+        wait_for(lambda: robot.links()[0]["at_risk"], "the hint")
+        assert not robot.links()[0]["draining"]
+        assert not robot.links()[1]["at_risk"]
+
+        caller.ask(20)
+        metadata.action = {"action": "terminate", "time": "2026-01-01T00:02:00Z"}
+        wait_for(lambda: robot.links()[0]["draining"], "the notice")
+        assert caller.all_answered()
+        told.process.send_signal(signal.SIGSTOP)  # whoever is asked now, it is not this one
+        caller.ask(100)
+        assert caller.all_answered()
+        assert robot.links()[0]["in_flight"] == 0
 
 
 def test_a_proxy_starts_again_without_a_manager(parts, call):
