@@ -91,15 +91,27 @@ def from_dict(raw: Any) -> Membership:
         content = {key: value for key, value in raw.items() if key != "checksum"}
         if raw["checksum"] != _checksum(content):
             raise ValueError("its checksum is wrong")
-        if not POOL_UID_PATTERN.fullmatch(content["pool_uid"]):
+        parts = {key: content[key] for key in ("pool", "pool_uid", "epoch", "version", "members")}
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise StateError(f"not a membership: {error}") from error
+    return from_parts(**parts)
+
+
+def from_parts(*, pool: Any, pool_uid: Any, epoch: Any, version: Any, members: Any) -> Membership:
+    """Return a membership from plain data.
+
+    Raises:
+        StateError: It is none.
+    """
+    try:
+        if not POOL_UID_PATTERN.fullmatch(pool_uid):
             raise ValueError("its pool_uid is not one")
-        uid = content["pool_uid"]
         membership = Membership(
-            pool=_text(content["pool"]),
-            pool_uid=uid,
-            epoch=_count(content["epoch"]),
-            version=_count(content["version"]),
-            members=tuple(_member(uid, entry) for entry in content["members"]),
+            pool=_text(pool),
+            pool_uid=pool_uid,
+            epoch=_count(epoch),
+            version=_count(version),
+            members=tuple(_member(pool_uid, entry) for entry in members),
         )
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error
@@ -109,11 +121,19 @@ def from_dict(raw: Any) -> Membership:
     return membership
 
 
+def is_endpoint(text: str) -> bool:
+    """Whether this is ``host:port``; an IPv6 address stands in brackets."""
+    host, _, port = text.rpartition(":")
+    in_brackets = host.startswith("[") and host.endswith("]")
+    if not host or not (in_brackets or ":" not in host) or not host.isascii():
+        return False
+    return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
+
+
 def _member(uid: str, entry: Mapping[str, Any]) -> Member:
     endpoint = _text(entry["endpoint"])
-    host, _, port = endpoint.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
-        raise ValueError(f"`{endpoint}` is not host:port")
+    if endpoint and not is_endpoint(endpoint):
+        raise ValueError(f"`{endpoint:.80}` is not host:port")
     if not isinstance(entry["draining"], bool):
         raise TypeError("draining is not true or false")
     id = ReplicaId(uid, _count(entry["slot"]), _count(entry["generation"]))

@@ -173,7 +173,11 @@ class Observed:
 
 @dataclass(frozen=True)
 class Member:
-    """A replica that the client proxy shall hold a link to."""
+    """A replica that the client proxy shall hold a link to.
+
+    Attributes:
+        endpoint: ``host:port``; empty where it is not known yet, or the replica dials out.
+    """
 
     id: ReplicaId
     endpoint: str

@@ -52,3 +52,18 @@ def replica_certificate_name(id: ReplicaId) -> str:
 def robot_certificate_name(pool_uid: str, robot: str) -> str:
     """Return the common name of a robot's certificate."""
     return f"robot.{robot}.{pool_uid}"
+
+
+def gateway_certificate_name(pool_uid: str, gateway: str) -> str:
+    """Return the common name of a gateway's certificate."""
+    return f"gateway.{gateway}.{pool_uid}"
+
+
+def rendezvous_certificate_name(pool_uid: str, rendezvous: str) -> str:
+    """Return the common name of a rendezvous's certificate."""
+    return f"rendezvous.{rendezvous}.{pool_uid}"
+
+
+def manager_certificate_name(pool_uid: str) -> str:
+    """Return the common name of the manager's certificate."""
+    return f"manager.{pool_uid}"

@@ -40,6 +40,8 @@ class Role(str, Enum):
     ROBOT = "robot"  # asks
     REPLICA = "replica"  # answers
     GATEWAY = "gateway"  # answers robots, asks replicas
+    RENDEZVOUS = "rendezvous"  # keeps records; its name opens no link
+    MANAGER = "manager"  # signs records; opens no connection
 
 
 @dataclass(frozen=True)
@@ -213,6 +215,8 @@ def _usages(role: Role) -> list[x509.ObjectIdentifier]:
         Role.ROBOT: [asks],
         Role.REPLICA: [answers],
         Role.GATEWAY: [answers, asks],
+        Role.RENDEZVOUS: [answers],
+        Role.MANAGER: [ExtendedKeyUsageOID.CODE_SIGNING],  # good for no TLS connection
     }[role]
 
 
