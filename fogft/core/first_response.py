@@ -9,16 +9,16 @@ An attempt ends as a success, a failure (refusal, crash, lost link) or a rejecti
 response that the service itself marks as not ok. A rejection is kept, and is returned
 only when nothing better can come.
 
-Every replica is owed every request: one that declined it, failed it or came after it is asked
-(again) even while others work on it, because those others may be frozen.
+A replica that declined a request, failed it or came after it may be asked (again) even while
+others work on it, because those others may be frozen. Whether it is, is the policy's to say.
 
-Owns: which answer is returned, and when a request has nobody working on it.
-Not here: sending, locks and clocks (`fogft.proxy.dispatcher`).
+Owns: which answer is returned, who may be asked, and when a request has nobody working on it.
+Not here: whom to ask (`hedging`), sending, locks and clocks (`fogft.proxy.dispatcher`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, TypeVar
@@ -27,6 +27,7 @@ T = TypeVar("T")
 
 RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.32
+_NO_WAIT = (0.0, 0.0)
 
 
 class Verdict(Enum):
@@ -45,7 +46,7 @@ class Pending(Generic[T]):
     Attributes:
         deadline: On the caller's clock, seconds.
         item: What the caller keeps with it (payload, handle).
-        open: Replicas that work on it now.
+        open: Replicas that work on it now, each with the moment when it was asked.
         barred: Replicas that must not be asked again.
         failures: How often an attempt at each replica has failed, those that count.
         waits: Until when a replica that failed it is left alone, and that wait, in seconds.
@@ -54,7 +55,7 @@ class Pending(Generic[T]):
 
     deadline: float
     item: T
-    open: set[int] = field(default_factory=set)
+    open: dict[int, float] = field(default_factory=dict)
     barred: set[int] = field(default_factory=set)
     failures: dict[int, int] = field(default_factory=dict)
     waits: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -71,7 +72,7 @@ class FirstResponse(Generic[T]):
     def __init__(self, *, attempts: int = 3) -> None:
         self._attempts = attempts
         self._pending: dict[bytes, Pending[T]] = {}
-        # Those that some replica does not work on, as far as is known: what `owed` looks at.
+        # Those that some replica may have to be asked for, as far as is known.
         self._short: dict[bytes, None] = {}
 
     def __len__(self) -> int:
@@ -85,27 +86,43 @@ class FirstResponse(Generic[T]):
         return self._pending.get(request)
 
     def register(
-        self, request: bytes, *, deadline: float, item: T, replicas: Iterable[int] = ()
+        self,
+        request: bytes,
+        *,
+        deadline: float,
+        item: T,
+        replicas: Iterable[int] = (),
+        now: float = 0.0,
+        complete: bool = True,
     ) -> Pending[T]:
         """Enter a request, with the replicas that are about to be asked.
+
+        Args:
+            request: Its id.
+            deadline: On the caller's clock, seconds.
+            item: What the caller keeps with it.
+            replicas: Who is about to be asked.
+            now: On the caller's clock, seconds.
+            complete: Whether these are all that there are: until something happens to it, the
+                request need not be looked at again.
 
         Raises:
             ValueError: The id is in the table already.
         """
         if request in self._pending:
             raise ValueError("request id is registered already")
-        pending = Pending(deadline, item, set(replicas))
+        pending = Pending(deadline, item, dict.fromkeys(replicas, now))
         self._pending[request] = pending
-        if not pending.open:
+        if not complete or not pending.open:
             self._short[request] = None
         return pending
 
-    def attempt(self, request: bytes, replica: int) -> Pending[T] | None:
+    def attempt(self, request: bytes, replica: int, now: float = 0.0) -> Pending[T] | None:
         """Enter one more attempt; None where it is not wanted (closed, open or barred)."""
         pending = self._pending.get(request)
         if pending is None or replica in pending.open or replica in pending.barred:
             return None
-        pending.open.add(replica)
+        pending.open[replica] = now
         return pending
 
     def declined(self, request: bytes, replica: int) -> Verdict:
@@ -117,7 +134,7 @@ class FirstResponse(Generic[T]):
         return Verdict.WAIT if pending.open else Verdict.IDLE
 
     def _ended(self, request: bytes, pending: Pending[T], replica: int) -> None:
-        pending.open.discard(replica)
+        pending.open.pop(replica, None)
         self._short[request] = None
 
     def succeeded(self, request: bytes, now: float) -> tuple[Verdict, Pending[T] | None]:
@@ -185,25 +202,31 @@ class FirstResponse(Generic[T]):
             if not self._pending[request].open
         )
 
-    def lacking(self, replica: int) -> list[bytes]:
-        """List requests that a replica which came (back) shall get, oldest first.
+    def short(self) -> list[tuple[bytes, Pending[T]]]:
+        """List requests for which a further replica may have to be asked."""
+        return [(request, self._pending[request]) for request in self._short]
 
-        All that it does not work on and is not barred from: whoever works on them may be
-        frozen, and a link that was reopened sends again what was in flight on it.
-        """
+    def candidates(self, pending: Pending[T], able: Sequence[int], now: float) -> list[int]:
+        """Return who may be asked for a request now: not at work on it, barred, or waiting."""
         return [
-            request
-            for request, pending in self._pending.items()
-            if replica not in pending.open and replica not in pending.barred
+            replica
+            for replica in able
+            if replica not in pending.open
+            and replica not in pending.barred
+            and pending.waits.get(replica, _NO_WAIT)[0] <= now
         ]
 
-    def owed(self, replica: int, now: float) -> list[bytes]:
-        """List requests that a replica has declined or failed and may be asked for again."""
-        owed = []
-        for request in self._short:
-            pending = self._pending[request]
-            if replica in pending.open or replica in pending.barred:
-                continue
-            if pending.waits.get(replica, (0.0, 0.0))[0] <= now:
-                owed.append(request)
-        return owed
+    def came(self, replica: int) -> None:
+        """A replica came (back): it may be asked at once for all that it does not work on.
+
+        Whoever works on those may be frozen, and a link that was reopened is to get again
+        what was in flight on it.
+        """
+        for request, pending in self._pending.items():
+            pending.waits.pop(replica, None)
+            if replica not in pending.open and replica not in pending.barred:
+                self._short[request] = None
+
+    def reconsider(self) -> None:
+        """Put every request before the policy again: there is another one."""
+        self._short = dict.fromkeys(self._pending)

@@ -13,10 +13,11 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from fogft.core import names
 from fogft.core.errors import RosError
+from fogft.core.hedging import NEVER
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.spec import ServiceSpec
 from fogft.proxy.dispatcher import Dispatcher
@@ -24,6 +25,20 @@ from fogft.ros.port import RosNode, RosServer
 from fogft.wire.port import Answer, Dialer, Link, Peer
 
 log = logging.getLogger(__name__)
+
+_TICK_S = 0.02
+
+
+class MakeDispatcher(Protocol):
+    """Makes the dispatcher of a service."""
+
+    def __call__(
+        self,
+        spec: ServiceSpec,
+        respond: Callable[[Any, bytes], None],
+        wake: Callable[[], None],
+    ) -> Dispatcher:
+        """Make it, given how to respond and how to have `tick` called soon."""
 
 
 class _Service:
@@ -52,7 +67,7 @@ class ClientProxy:
         pool_uid: str,
         node: RosNode,
         dialer: Dialer,
-        make_dispatcher: Callable[[ServiceSpec, Callable[[Any, bytes], None]], Dispatcher],
+        make_dispatcher: MakeDispatcher,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._pool_uid = pool_uid
@@ -65,7 +80,9 @@ class ClientProxy:
         self._links: dict[ReplicaId, Link] = {}
         self._members: dict[ReplicaId, Member] = {}
         self._version = (0, 0)
-        self._changed = threading.Event()
+        self._wake = threading.Event()
+        self._next_look = NEVER
+        self._changed = False  # set before the event, so that it is not missed
 
     # -- configuration --------------------------------------------------------------------
 
@@ -94,7 +111,7 @@ class ClientProxy:
             if keys_changed:
                 for id in list(self._links):
                     self._redial(id)
-        self._changed.set()
+        self._change()
 
     def _new_service(self, spec: ServiceSpec) -> _Service:
         service: _Service
@@ -103,7 +120,7 @@ class ClientProxy:
             if service.server is not None:
                 service.server.respond(handle, payload)
 
-        service = _Service(spec, self._make_dispatcher(spec, respond))
+        service = _Service(spec, self._make_dispatcher(spec, respond, self._wake.set))
         return service
 
     # -- membership -----------------------------------------------------------------------
@@ -124,7 +141,7 @@ class ClientProxy:
                 self._members[id] = member
                 if old is None or old.endpoint != member.endpoint:
                     self._redial(id)
-        self._changed.set()
+        self._change()
         return True
 
     def _redial(self, id: ReplicaId) -> None:
@@ -157,12 +174,24 @@ class ClientProxy:
 
     def changed(self, link: Link) -> None:
         """Wake `run_once`: routes are worked out there, not on a link's thread."""
-        self._changed.set()
+        self._change()
+
+    def late(self, link: Link, service: str, request_id: bytes) -> None:
+        """Pass on that an answer came which nobody awaits."""
+        found = self._services.get(service)
+        if found is not None:
+            found.dispatcher.late(link, request_id)
+
+    def _change(self) -> None:
+        self._changed = True
+        self._wake.set()
 
     # -- the proxy's own thread -----------------------------------------------------------
 
-    def run_once(self, timeout_s: float = 0.02) -> bool:
+    def run_once(self, timeout_s: float = _TICK_S) -> bool:
         """Wait for a change or a moment, then route, advertise and tick.
+
+        The moment is at most `timeout_s`, and less where a dispatcher wants its tick earlier.
 
         Returns:
             Whether something had changed.
@@ -172,13 +201,14 @@ class ClientProxy:
         """
         if not self._node.alive:
             raise RosError("ROS does not go on; the log says why", "start the proxy again")
-        changed = self._changed.wait(timeout_s)
-        self._changed.clear()
+        self._wake.wait(max(0.0, min(timeout_s, self._next_look - self._clock())))
+        self._wake.clear()
+        changed, self._changed = self._changed, False
         with self._lock:
             if changed:
                 self._route()
-            for service in self._services.values():
-                service.dispatcher.tick()
+            looks = [service.dispatcher.tick() for service in self._services.values()]
+        self._next_look = min(looks, default=NEVER)
         return changed
 
     def _route(self) -> None:

@@ -106,7 +106,9 @@ def _dialer(config: ClientProxyConfig, sign: ManagerSign) -> Any:
     )
 
 
-def make_dispatcher(spec: ServiceSpec, respond: Callable[[Any, bytes], None]) -> Dispatcher:
+def make_dispatcher(
+    spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
+) -> Dispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type."""
     from fogft.ros import types
 
@@ -117,6 +119,7 @@ def make_dispatcher(spec: ServiceSpec, respond: Callable[[Any, bytes], None]) ->
         empty_response=(
             types.default_response(spec.type) if spec.on_timeout is OnTimeout.EMPTY else None
         ),
+        wake=wake,
     )
 
 

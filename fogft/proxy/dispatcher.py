@@ -1,11 +1,14 @@
-"""One proxied service on the robot: send a request to all replicas, return the first success.
+"""One proxied service on the robot: send a request to replicas, return the first success.
+
+Three questions, three owners: *whom to send to and when* is the policy's (`core.hedging`),
+*which answer is final* is the table's (`core.first_response`), and *what became of it* is
+counted by `outcomes`. The dispatcher does what they say.
 
 `submit` is called by the thread that takes ROS requests and never blocks: a link takes an
-attempt or says no. Answers come from the links' threads. A request that a link did not take,
-or failed, is offered to it again until its deadline.
+attempt or says no. Answers come from the links' threads, which may not send; whatever must be
+sent because of them is left to the next `tick`, which `wake` brings about.
 
-Owns: one service's requests, its counters, and the order of offers.
-Not here: which answer wins (`fogft.core.first_response`), links (`fogft.wire`), ROS.
+Owns: one service's requests and its lock. Not here: links (`fogft.wire`), ROS.
 """
 
 from __future__ import annotations
@@ -14,16 +17,17 @@ import logging
 import os
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 from fogft.core.errors import RosError
 from fogft.core.first_response import FirstResponse, Pending, Verdict
+from fogft.core.hedging import NEVER, All, Hedging
 from fogft.core.model import ReplicaId
 from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.spec import OnTimeout, ServiceSpec
+from fogft.proxy.outcomes import Outcomes
 from fogft.wire.port import Answer, Link, Refusal
 
 log = logging.getLogger(__name__)
@@ -35,7 +39,6 @@ Respond = Callable[[Any, bytes], None]
 _FINAL_REFUSALS = frozenset({Refusal.FORGOTTEN, Refusal.MALFORMED, Refusal.EXPIRED})
 # The replica never began, or may never have seen it: no sign against the request itself.
 _BLAMELESS_REFUSALS = frozenset({Refusal.LOST, Refusal.NOT_READY, Refusal.OVERLOADED})
-_LATENCIES_KEPT = 2000
 
 
 class _Request:
@@ -57,6 +60,7 @@ class Dispatcher:
         respond: Sends a response to the caller of a handle. Any thread.
         is_ok: Whether a response is a success; None when every response is.
         empty_response: The serialised default response, for ``on_timeout: empty``.
+        wake: Has `tick` called soon. Any thread.
         clock: Monotonic seconds.
         max_pending_bytes: Requests kept at once, in bytes; more are turned away and counted.
     """
@@ -68,6 +72,7 @@ class Dispatcher:
         *,
         is_ok: Callable[[bytes], bool] | None = None,
         empty_response: bytes | None = None,
+        wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         max_pending_bytes: int = 256 << 20,
     ) -> None:
@@ -75,125 +80,148 @@ class Dispatcher:
         self._respond = respond
         self._is_ok = is_ok
         self._empty_response = empty_response
+        self._wake = wake
         self._clock = clock
         self._max_pending_bytes = max_pending_bytes
         self._pending_bytes = 0
         self._lock = threading.Lock()
         self._requests: FirstResponse[_Request] = FirstResponse()
-        self._links: tuple[Link, ...] = ()
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
-        self._won: dict[ReplicaId, int] = {}
-        self._count = dict.fromkeys(
-            (
-                *("received", "answered", "late", "rejected", "silent", "empty"),
-                *("turned_away", "undelivered"),
-            ),
-            0,
-        )
-        self._refusals: dict[str, int] = {}
+        self._hedging: Hedging = All()
+        self._next_look = NEVER  # when the policy wants to be asked, as the last tick said
+        self._links: dict[int, Link] = {}
+        self._able: tuple[int, ...] = ()
+        self._outcomes = Outcomes()
 
     # -- requests -------------------------------------------------------------------------
 
     def submit(self, payload: bytes, handle: Any) -> None:
-        """Take a caller's request and offer it to every link that can answer it."""
+        """Take a caller's request and offer it to whom the policy chooses."""
         now = self._clock()
         request = os.urandom(REQUEST_ID_BYTES)
-        links = self._links
+        timeout_s = self.spec.timeout_s
+        count = self._outcomes.count
         with self._lock:
-            self._count["received"] += 1
+            count["received"] += 1
             if self._pending_bytes + len(payload) > self._max_pending_bytes:
-                self._count["turned_away"] += 1
-                turned_away = self._count["turned_away"]
-                links = ()
+                count["turned_away"] += 1
+                turned_away = count["turned_away"]
             else:
                 turned_away = 0
+                links, able = self._links, self._able
+                chosen = self._hedging.first(request, able, now)
                 self._pending_bytes += len(payload)
                 self._requests.register(
                     request,
-                    deadline=now + self.spec.timeout_s,
+                    deadline=now + timeout_s,
                     item=_Request(payload, handle, now),
-                    replicas=[_key(link) for link in links],
+                    replicas=chosen,
+                    now=now,
+                    complete=len(chosen) == len(able),
                 )
+                count["sent"] += len(chosen)
+                soon = self._hedging.look_at
         if turned_away:
-            if turned_away & (turned_away - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
-                log.warning(
-                    "request_turned_away service=%s pending_bytes=%d count=%d",
-                    self.spec.name, self._pending_bytes, turned_away,
-                )  # fmt: skip
+            self._log_rarely("request_turned_away", turned_away, "pending is full")
             return
-        for link in links:
-            if not link.offer(self.spec.name, request, payload, self.spec.timeout_s):
-                with self._lock:
-                    self._requests.declined(request, _key(link))
-        if len(links) > 1 and request not in self._requests:
+        for replica in chosen:
+            if not links[replica].offer(self.spec.name, request, payload, timeout_s):
+                self._declined(request, replica)
+        if len(chosen) > 1 and request not in self._requests:
             # Answered before the last link had it: `answered` could not reach that one.
-            for link in links:
-                link.forget(request)
+            for replica in chosen:
+                links[replica].forget(request)
+        if soon < self._next_look:
+            self._wake()
+
+    def _declined(self, request: bytes, replica: int) -> None:
+        with self._lock:
+            self._outcomes.count["sent"] -= 1
+            self._requests.declined(request, replica)
+            self._hedging.declined(replica)
 
     def answered(self, link: Link, answer: Answer) -> None:
         """Take the end of an attempt from a link's thread."""
         payload = answer.payload
+        replica = key_of(link)
         if payload is None:
-            self._refused(_key(link), answer)
+            self._refused(replica, answer)
             return
         now = self._clock()
         if self._is_ok is not None:
             try:
                 ok = self._is_ok(payload)
             except RosError:  # no response of this type
-                self._refused(_key(link), replace(answer, refusal=Refusal.MALFORMED))
+                self._refused(replica, replace(answer, refusal=Refusal.MALFORMED))
                 return
             if not ok:
-                self._rejected(_key(link), answer.request_id, payload)
+                self._rejected(replica, answer.request_id, payload)
                 return
+        request = answer.request_id
         with self._lock:
-            _, pending = self._requests.succeeded(answer.request_id, now)
+            _, pending = self._requests.succeeded(request, now)
             if pending is None:
-                self._count["late"] += 1
-                return
-            self._close(pending)
-            self._count["answered"] += 1
-            replica = link.peer.id
-            self._won[replica] = self._won.get(replica, 0) + 1
-            self._latencies.append(now - pending.item.arrived)
+                self._hedging.late(request, replica, now)
+            else:
+                losers = self._hedging.answered(request, pending.open, replica, now)
+                self._close(pending)
+                self._outcomes.won(link.peer.id, now - pending.item.arrived)
+        if pending is None:
+            self._outcomes.late()
+            return
         self._return(pending.item.handle, payload)
-        if len(pending.open) > 1:
-            for other in self._links:
-                if other is not link:
-                    other.forget(answer.request_id)
+        self._forget(request, losers)
+
+    def late(self, link: Link, request: bytes) -> None:
+        """Count an answer that came after its link was told to forget the request."""
+        self._outcomes.late()
+
+    def _forget(self, request: bytes, replicas: Iterable[int]) -> None:
+        for replica in replicas:
+            link = self._links.get(replica)
+            if link is not None:
+                link.forget(request)
 
     def _refused(self, replica: int, answer: Answer) -> None:
+        now = self._clock()
         with self._lock:
-            self._refusals[answer.refusal] = self._refusals.get(answer.refusal, 0) + 1
+            self._outcomes.refusal(answer.refusal)
             verdict = self._requests.failed(
                 answer.request_id,
                 replica,
-                self._clock(),
+                now,
                 counts=answer.refusal not in _BLAMELESS_REFUSALS,
                 bar=answer.refusal in _FINAL_REFUSALS,
             )
+            self._hedging.failed(answer.request_id, replica, now)
         if verdict is Verdict.IDLE:
-            self._settle(answer.request_id)
+            self._idle(answer.request_id)
 
     def _rejected(self, replica: int, request: bytes, payload: bytes) -> None:
         with self._lock:
-            self._count["rejected"] += 1
+            self._outcomes.count["rejected"] += 1
             verdict = self._requests.rejected(request, replica, payload)
+            self._hedging.failed(request, replica, self._clock())
         if verdict is Verdict.IDLE:
-            self._settle(request)
+            self._idle(request)
 
-    def _settle(self, request: bytes) -> None:
-        """Nobody works on a request: return its rejection if no other replica can be asked."""
+    def _idle(self, request: bytes) -> None:
+        """Nobody works on a request: end it, or have another replica asked at once."""
+        if not self._settle(request) and self._hedging.moves_on:
+            self._wake()
+
+    def _settle(self, request: bytes) -> bool:
+        """Return the rejection of a request if nobody works on it, and no other can be asked."""
         with self._lock:
             pending = self._requests.get(request)
             if pending is None or pending.open or pending.rejection is None:
-                return
-            if any(_key(link) not in pending.barred for link in self._links):
-                return
+                return False
+            if any(replica not in pending.barred for replica in self._able):
+                return False
             self._requests.close(request)
             self._close(pending)
-            self._count["answered"] += 1
+            self._outcomes.count["answered"] += 1
         self._return(pending.item.handle, pending.rejection)
+        return True
 
     def _return(self, handle: Any, payload: bytes) -> None:
         """Send a response to its caller. One that ROS does not take harms no other request."""
@@ -201,13 +229,13 @@ class Dispatcher:
             self._respond(handle, payload)
         except RosError as error:
             with self._lock:
-                self._count["undelivered"] += 1
-                count = self._count["undelivered"]
-            if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
-                log.warning(
-                    "response_undelivered service=%s reason=%r count=%d",
-                    self.spec.name, error.message, count,
-                )  # fmt: skip
+                self._outcomes.count["undelivered"] += 1
+                count = self._outcomes.count["undelivered"]
+            self._log_rarely("response_undelivered", count, error.message)
+
+    def _log_rarely(self, event: str, count: int, reason: str) -> None:
+        if count & (count - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
+            log.warning("%s service=%s reason=%r count=%d", event, self.spec.name, reason, count)
 
     def _close(self, pending: Pending[_Request]) -> None:
         self._pending_bytes -= len(pending.item.payload)
@@ -216,42 +244,69 @@ class Dispatcher:
 
     def route(self, links: Sequence[Link]) -> None:
         """Set the links that can answer this service now, and offer them what they lack."""
-        added = [link for link in links if link not in self._links]
-        self._links = tuple(links)
-        for link in added:
-            with self._lock:
-                lacking = self._requests.lacking(_key(link))
-            self._offer_again(link, lacking)
+        routed = {key_of(link): link for link in links}
+        with self._lock:
+            added = [key for key, link in routed.items() if self._links.get(key) is not link]
+            self._links, self._able = routed, tuple(routed)
+            for replica in added:
+                self._requests.came(replica)
+        if added:
+            self._offer_more(self._clock())
 
-    def tick(self) -> None:
-        """Let requests expire, and offer again what links did not take or failed. Call at 50 Hz."""
+    def tick(self) -> float:
+        """Let requests expire, and offer them to whom the policy chooses. Call at 50 Hz.
+
+        Returns:
+            When to call again at the latest, on the clock; infinite for no matter when.
+        """
         now = self._clock()
         with self._lock:
             expired = self._requests.expire(now)
             for _, pending in expired:
+                self._hedging.expired(pending.open, now)
                 self._close(pending)
-            owed = [(link, self._requests.owed(_key(link), now)) for link in self._links]
         for request, pending in expired:
             self._expired(request, pending)
-        for link, requests in owed:
-            self._offer_again(link, requests)
+        self._offer_more(now)
         with self._lock:
             idle = [request for request, _ in self._requests.idle()]
         for request in idle:
             self._settle(request)
+        return self._next_look
 
-    def _offer_again(self, link: Link, requests: Sequence[bytes]) -> None:
-        replica = _key(link)
-        for request in requests:
-            with self._lock:
-                pending = self._requests.attempt(request, replica)
+    def _offer_more(self, now: float) -> None:
+        """Ask the policy about each request that may need a further replica."""
+        with self._lock:
+            self._hedging.look_at = NEVER
+            links = self._links
+            full: set[int] = set()
+            steps = [
+                (request, replica)
+                for request, pending in self._requests.short()
+                for replica in self._hedging.more(
+                    pending.open, self._requests.candidates(pending, self._able, now), now
+                )
+            ]
+            self._next_look = self._hedging.look_at
+        for request, replica in steps:
+            self._offer(request, replica, links[replica], full)
+
+    def _offer(self, request: bytes, replica: int, link: Link, full: set[int]) -> None:
+        """Offer a request to a replica, unless that declined another one a moment ago."""
+        now = self._clock()
+        with self._lock:
+            wanted = replica not in full
+            pending = self._requests.attempt(request, replica, now) if wanted else None
             if pending is None:
-                continue
-            remaining_s = pending.deadline - self._clock()
-            if not link.offer(self.spec.name, request, pending.item.payload, remaining_s):
-                with self._lock:
-                    self._requests.declined(request, replica)
-                return  # its window is full: the rest would be declined as well
+                self._hedging.declined(replica)
+                return
+            self._outcomes.count["sent"] += 1
+        remaining_s = pending.deadline - now
+        if not link.offer(self.spec.name, request, pending.item.payload, remaining_s):
+            full.add(replica)
+            self._declined(request, replica)
+        elif request not in self._requests:
+            link.forget(request)  # it was answered meanwhile
 
     def _expired(self, request: bytes, pending: Pending[_Request]) -> None:
         response = pending.rejection
@@ -262,37 +317,33 @@ class Dispatcher:
         else:
             outcome = "silent"
         with self._lock:
-            self._count[outcome] += 1
+            self._outcomes.count[outcome] += 1
         log.warning(
             "request_timed_out service=%s outcome=%s waited_s=%.3f open=%s request=%s",
             self.spec.name, outcome, self.spec.timeout_s, sorted(pending.open), request.hex(),
         )  # fmt: skip
         if response is not None:
             self._return(pending.item.handle, response)
-        for link in self._links:
-            link.forget(request)
+        self._forget(request, tuple(self._links))
 
     # -- what people see ------------------------------------------------------------------
 
     def won(self, replica: ReplicaId) -> int:
         """Return how many requests a replica has answered first."""
-        return self._won.get(replica, 0)
+        return self._outcomes.won_by(replica)
 
     def report(self) -> dict[str, Any]:
         """Return counters and latency quantiles (seconds; None before the first answer)."""
         with self._lock:
-            ordered = sorted(self._latencies)
             return {
-                **self._count,
-                "refused": dict(self._refusals),
+                **self._outcomes.report(),
                 "pending": len(self._requests),
                 "pending_bytes": self._pending_bytes,
-                "p50_s": ordered[len(ordered) // 2] if ordered else None,
-                "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,
+                "hedging": self._hedging.report(),
             }
 
 
-def _key(link: Link) -> int:
+def key_of(link: Link) -> int:
     """Return a small number for the replica of a link: slot and generation."""
     id = link.peer.id
     return id.slot << 32 | id.generation

@@ -121,6 +121,8 @@ class MemoryLink:
             self._events.answered(self, replace(answer, service=attempt.service))
             if session.window.regained_room():
                 self._events.changed(self)
+        elif answer.payload is not None:
+            self._events.late(self, attempt.service, attempt.request_id)
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request."""

@@ -93,6 +93,12 @@ class LinkEvents(Protocol):
         old connection is dropped by the link.
         """
 
+    def late(self, link: Link, service: str, request_id: bytes) -> None:
+        """An answer came to an attempt that was forgotten: the replica worked for nothing.
+
+        Its bytes are dropped. Of a connection that was given up it may not be told.
+        """
+
     def changed(self, link: Link) -> None:
         """The link's `state`, `probe_answer` or room in its window has changed."""
 

@@ -72,6 +72,7 @@ class Connection:
         keys: Service name -> key.
         turns: Shared with the robot's other connections.
         answered: Called with each attempt's end, once. Must not block.
+        late: Called with service and id when a forgotten request was answered. Must not block.
         lost: Called, from any thread and perhaps more than once, when it is no longer of use.
         room: Called when a window that was full has room again.
 
@@ -89,11 +90,13 @@ class Connection:
         *,
         turns: Turns,
         answered: Callable[[Answer], None],
+        late: Callable[[str, bytes], None],
         lost: Callable[[], None],
         room: Callable[[], None],
     ) -> None:
         self._turns = turns
         self._answered = answered
+        self._late = late
         self._on_lost = lost
         self._room = room
         self._keys = {name: zenoh.KeyExpr(key) for name, key in keys.items()}
@@ -215,7 +218,9 @@ class Connection:
         if reply.ok is not None:
             self._credit.heard(attempt.mark)  # requests of one connection arrive in order
         if not self.window.holds(attempt):
-            return  # late: it was forgotten, or has ended
+            if reply.ok is not None:  # it was forgotten, or has ended
+                self._late(attempt.service, attempt.request_id)
+            return
         try:
             payload, refusal = _read_reply(reply, attempt.request_id)
         except frame.FrameError as error:

@@ -177,6 +177,7 @@ class ZenohLink:
                 self._services,
                 turns=self._dialer.turns,
                 answered=self._answered,
+                late=self._late,
                 lost=self._wake.set,
                 room=self._changed,
             )
@@ -323,6 +324,10 @@ class ZenohLink:
             self._events.answered(self, answer)
         except Exception:  # in Zenoh's thread nobody else would tell of it
             log.exception("answer_not_taken request=%s", answer.request_id.hex())
+
+    def _late(self, service: str, request_id: bytes) -> None:
+        if not self._closed:
+            self._events.late(self, service, request_id)
 
     def _changed(self) -> None:
         try:

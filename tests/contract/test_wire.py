@@ -232,7 +232,7 @@ def test_a_full_window_says_no_and_later_tells_of_room(
     assert link.offer(SERVICE, request_id(9999), b"", 1.0)
 
 
-def test_a_forgotten_request_frees_its_room_and_its_answer_is_dropped(
+def test_a_forgotten_request_frees_its_room_and_its_answer_is_late(
     world: World, replica: Replica, link: Link, owner: Owner
 ) -> None:
     link.offer(SERVICE, request_id(1), b"12345", 5.0)
@@ -246,8 +246,9 @@ def test_a_forgotten_request_frees_its_room_and_its_answer_is_dropped(
     world.wait_for(lambda: len(replica.requests) == 2)
     replica.requests[1].reply(b"")
     world.wait_for(lambda: owner.of(3))
-    world.settle()
+    world.wait_for(lambda: owner.too_late)
     assert owner.of(1) == []
+    assert owner.too_late == [(SERVICE, request_id(1))]
 
 
 def test_an_attempt_whose_time_is_up_is_lost(

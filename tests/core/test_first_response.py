@@ -73,23 +73,36 @@ def test_a_lost_link_never_bars_a_replica():
         assert requests.attempt(A, 0) is not None
 
 
+def may_ask(requests: FirstResponse[str], replica: int, now: float = 0.0) -> bool:
+    """Whether a replica may be asked for request A, and somebody looks whether it should be."""
+    return any(
+        request == A and requests.candidates(pending, [replica], now)
+        for request, pending in requests.short()
+    )
+
+
 def test_a_reopened_link_gets_what_was_in_flight_on_it():
     requests = registered(0, 1)
     requests.failed(A, 0, 0.0, counts=False)
-    assert requests.lacking(0) == [A]
-    assert requests.lacking(1) == []
+    assert not may_ask(requests, 0)  # left alone for a moment
+    requests.came(0)
+    assert may_ask(requests, 0)
+    assert not may_ask(requests, 1)
 
 
 def test_a_newcomer_gets_what_others_work_on():
     """Those others may be frozen, and the newcomer the only one that answers."""
-    assert registered(0).lacking(7) == [A]
+    requests = registered(0)
+    assert not may_ask(requests, 7)
+    requests.came(7)
+    assert may_ask(requests, 7)
 
 
-def test_a_replica_that_declined_is_owed_the_request_while_another_works_on_it():
+def test_a_replica_that_declined_may_be_asked_while_another_works_on_the_request():
     requests = registered(0, 1)
-    assert requests.owed(1, 0.0) == []
+    assert not may_ask(requests, 1)
     requests.declined(A, 1)
-    assert (requests.owed(0, 0.0), requests.owed(1, 0.0)) == ([], [A])
+    assert (may_ask(requests, 0), may_ask(requests, 1)) == (False, True)
 
 
 def test_a_replica_that_failed_is_left_alone_longer_each_time():
@@ -98,7 +111,7 @@ def test_a_replica_that_failed_is_left_alone_longer_each_time():
     now, waits = 0.0, []
     for _ in range(8):
         requests.failed(A, 0, now, counts=False)
-        wait = next(n for n in range(1000) if requests.owed(0, now + n / 100))
+        wait = next(n for n in range(1000) if may_ask(requests, 0, now + n / 100))
         waits.append(wait / 100)
         now += wait / 100
         requests.attempt(A, 0)
@@ -106,12 +119,30 @@ def test_a_replica_that_failed_is_left_alone_longer_each_time():
     assert (waits[0], waits[-1]) == (RETRY_FIRST_S, RETRY_LIMIT_S)
 
 
-def test_nothing_is_owed_of_a_request_that_has_ended():
+def test_nobody_is_asked_for_a_request_that_has_ended():
     requests = registered(0, 1)
     requests.declined(A, 1)
     requests.succeeded(A, 0.0)
-    assert requests.owed(1, 0.0) == []
+    requests.came(2)
+    requests.reconsider()
+    assert requests.short() == []
     assert list(requests.idle()) == []
+
+
+def test_a_request_that_not_all_were_asked_for_is_looked_at_again():
+    """A policy that began with one replica wants to be asked about the next."""
+    requests: FirstResponse[str] = FirstResponse()
+    requests.register(A, deadline=1.0, item="", replicas=[0], now=0.5, complete=False)
+    assert may_ask(requests, 1)
+    pending = requests.get(A)
+    assert pending is not None
+    assert pending.open == {0: 0.5}
+
+
+def test_every_request_is_put_before_another_policy():
+    requests = registered(0)
+    requests.reconsider()
+    assert may_ask(requests, 1)
 
 
 def test_a_shorter_deadline_does_not_wait_for_a_longer_one():

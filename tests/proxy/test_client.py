@@ -32,7 +32,7 @@ class Scene:
             UID,
             self.node,
             self.dialer,
-            lambda spec, respond: Dispatcher(spec, respond, clock=self.clock),
+            lambda spec, respond, wake: Dispatcher(spec, respond, wake=wake, clock=self.clock),
             clock=self.clock,
         )
         self.proxy.serve([ServiceSpec(name, SET_BOOL) for name in names or ("/s",)])

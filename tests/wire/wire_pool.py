@@ -83,11 +83,16 @@ class Owner:
         self.answers: list[tuple[int, Answer]] = []
         self.states: list[tuple[int, LinkState]] = []
         self.changes = 0
+        self.too_late: list[tuple[str, bytes]] = []
         self._lock = threading.Lock()
 
     def answered(self, link: Link, answer: Answer) -> None:
         with self._lock:
             self.answers.append((link.peer.id.slot, answer))
+
+    def late(self, link: Link, service: str, request_id: bytes) -> None:
+        with self._lock:
+            self.too_late.append((service, request_id))
 
     def changed(self, link: Link) -> None:
         with self._lock:

@@ -1,0 +1,68 @@
+"""What became of one service's requests: counters, latencies, and who won.
+
+All methods are called under the dispatcher's lock, but `late`, which has its own.
+
+Owns: the numbers. Not here: what they are counted for (`dispatcher`), showing them.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Any
+
+from fogft.core.model import ReplicaId
+
+_LATENCIES_KEPT = 2000
+_COUNTED = (
+    *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
+    *("turned_away", "undelivered"),
+)
+
+
+class Outcomes:
+    """Counts since the start.
+
+    Attributes:
+        count: ``received`` requests and ``sent`` copies of them; how they ended
+            (``answered``, ``silent``, ``empty``, ``turned_away``); answers that came too late
+            to be used (``late``); responses that were not ok (``rejected``); responses that
+            ROS did not take (``undelivered``).
+        refused: Refusals by reason.
+    """
+
+    def __init__(self) -> None:
+        self.count = dict.fromkeys(_COUNTED, 0)
+        self.refused: dict[str, int] = {}
+        self._won: dict[ReplicaId, int] = {}
+        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._late_lock = threading.Lock()
+
+    def won(self, replica: ReplicaId, took_s: float) -> None:
+        """Count a request that a replica has answered first."""
+        self.count["answered"] += 1
+        self._won[replica] = self._won.get(replica, 0) + 1
+        self._latencies.append(took_s)
+
+    def won_by(self, replica: ReplicaId) -> int:
+        """Return how many requests a replica has answered first."""
+        return self._won.get(replica, 0)
+
+    def refusal(self, reason: str) -> None:
+        """Count a refusal."""
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+
+    def late(self) -> None:
+        """Count an answer that came too late to be used. Any thread, no other lock."""
+        with self._late_lock:
+            self.count["late"] += 1
+
+    def report(self) -> dict[str, Any]:
+        """Return counters and latency quantiles (seconds; None before the first answer)."""
+        ordered = sorted(self._latencies)
+        return {
+            **self.count,
+            "refused": dict(self.refused),
+            "p50_s": ordered[len(ordered) // 2] if ordered else None,
+            "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,
+        }
