@@ -8,7 +8,7 @@ Not here: text (`fogft.cli`), decisions (`fogft.core`), the parts themselves.
 """
 
 from fogft.app.chaos import chaos, machine_in
-from fogft.app.clouds import CLOUDS, make_cloud, make_store, pool_name, pools
+from fogft.app.clouds import CLOUDS, cloud_of, make_cloud, make_store, pool_name, pools
 from fogft.app.lifecycle import down, order, start
 from fogft.app.looking import (
     doctor,
@@ -28,6 +28,7 @@ from fogft.app.wishes import drain, exclude, include, scale
 __all__ = [
     "CLOUDS",
     "chaos",
+    "cloud_of",
     "doctor",
     "down",
     "drain",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fogft.app.clouds import local_root, make_cloud, make_store
+from fogft.app.clouds import cloud_of, local_root, make_store
 from fogft.core.errors import FogftError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def machine_in(pool: str, slot: int) -> ReplicaId:
         FogftError: There is none (the hint lists those there are).
     """
     identity = make_store(pool).identity()
-    machines = make_cloud(identity.cloud).machines(identity.uid)
+    machines = cloud_of(identity).machines(identity.uid)
     found = [machine.id for machine in machines if machine.id.slot == slot]
     if not found:
         known = ", ".join(sorted({str(machine.id.slot) for machine in machines})) or "none"

@@ -11,9 +11,11 @@ from fogft.pool.paths import PoolPaths, home
 
 if TYPE_CHECKING:
     from fogft.cloud.port import Cloud
-    from fogft.pool.store import PoolStore
+    from fogft.pool.store import Identity, PoolStore
 
-CLOUDS = ("local",)
+LOCAL = "local"
+SKY = "sky"
+CLOUDS = (LOCAL, SKY)
 
 
 def pools() -> list[str]:
@@ -34,20 +36,38 @@ def pool_name(name: str | None = None) -> str:
     return known.meant(home(), name)
 
 
-def make_cloud(name: str) -> Cloud:
+def make_cloud(name: str, base: Path) -> Cloud:
     """Return a cloud by name.
 
+    Args:
+        name: One of `CLOUDS`.
+        base: Folder of the pool file: relative paths in it start there.
+
     Raises:
-        CloudError: There is no such cloud, or it is not supported yet.
+        CloudError: There is no such cloud.
     """
     if name not in CLOUDS:
+        known = ", ".join(f"`{cloud}`" for cloud in CLOUDS)
         raise CloudError(
-            f"cloud `{name}` is not supported yet",
-            f"supported: {', '.join(f'`{c}`' for c in CLOUDS)}",
+            f"there is no cloud `{name}`",
+            f"there are: {known}; `sky` stands for all real ones, which the pool file names",
         )
+    if name == SKY:
+        from fogft.cloud import sky
+
+        return sky.make(home() / "sky", base)
     from fogft.cloud.local.cloud import LocalCloud
 
     return LocalCloud(local_root())
+
+
+def cloud_of(identity: Identity) -> Cloud:
+    """Return the cloud that a pool runs on.
+
+    Raises:
+        CloudError: This version knows no such cloud.
+    """
+    return make_cloud(identity.cloud, Path(identity.file).parent)
 
 
 def make_store(pool: str) -> PoolStore:
@@ -60,6 +80,13 @@ def make_store(pool: str) -> PoolStore:
         lambda text, file: pool_file.parse(text, file=file),
         time.time,
     )
+
+
+def cloud_names() -> dict[str, str]:
+    """Return which cloud of `CLOUDS` each name stands for that a pool file can name."""
+    from fogft.cloud.names import NO_VM_CLOUDS, VM_CLOUDS
+
+    return {LOCAL: LOCAL, **dict.fromkeys((*VM_CLOUDS, *NO_VM_CLOUDS), SKY)}
 
 
 def local_root() -> Path:

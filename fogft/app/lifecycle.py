@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft import disk
-from fogft.app.clouds import CLOUDS, make_cloud, make_store
+from fogft.app.clouds import LOCAL, cloud_names, cloud_of, make_cloud, make_store
 from fogft.pool.paths import home
 
 if TYPE_CHECKING:
     from fogft.pool.preview import Order
 
 
-def order(file: Path, cloud: str | None = None) -> Order:
+def order(
+    file: Path, cloud: str | None = None, *, told: Callable[[str], None] = lambda _: None
+) -> Order:
     """Read and judge a pool file, and find out what applying it would do. Changes nothing.
 
     Args:
         file: The pool file.
         cloud: Where to run it; None for what its resources name, else `local`.
+        told: Called with what takes long, before it is done.
 
     Raises:
         SpecError: The first mistake in the file.
-        CloudError: Its cloud is not supported.
+        CloudError: There is no such cloud, or a new pool cannot use any that it names.
     """
-    from fogft.pool import pool_file, preview
+    from fogft.cloud.port import Accounts
+    from fogft.pool import named_clouds, pool_file, preview
     from fogft.ros.types import check_ok_field, check_service_type
 
     source = pool_file.text(file)
@@ -36,10 +41,14 @@ def order(file: Path, cloud: str | None = None) -> Order:
         check_fields=check_ok_field,
         folder=file.parent,
     )
-    chosen = cloud or preview.cloud_of(spec, CLOUDS, source, file) or CLOUDS[0]
-    concrete = make_cloud(chosen)
+    chosen = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL
+    concrete = make_cloud(chosen, file.resolve().parent)
     store = make_store(spec.name)
-    return preview.order(store, concrete, spec, cloud_name=chosen, source=source, file=file)
+    if isinstance(concrete, Accounts):
+        told("asking SkyPilot which clouds can be used, and for their prices")
+    return preview.order(
+        store, concrete, spec, cloud_name=chosen, source=source, file=file, now=time.time()
+    )
 
 
 def start(order: Order) -> bool:
@@ -67,7 +76,7 @@ def down(pool: str, told: Callable[[str], None]) -> None:
     from fogft.pool import shutdown
     from fogft.ros import shared_memory
 
-    shutdown.end(make_store(pool), make_cloud, told=told)
+    shutdown.end(make_store(pool), cloud_of, told=told)
     swept = shared_memory.sweep()  # what killed ROS processes cannot remove themselves
     if swept:
         told(f"{len(swept)} shared-memory files of dead processes")

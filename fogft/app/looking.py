@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft import disk
-from fogft.app.clouds import make_cloud, make_store, pools
+from fogft.app.clouds import cloud_of, make_store, pools
 from fogft.pool.paths import PoolPaths, home
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def refresh(pool: str, limit_s: float = 15.0) -> Seen:
     if manager_alive(pool):
         return seen.renewed(PoolPaths.of(pool), limit_s)
     store = make_store(pool)
-    return seen.ask(store, make_cloud(store.identity().cloud), time.time())
+    return seen.ask(store, cloud_of(store.identity()), time.time())
 
 
 def slots(pool: str) -> list[int]:
@@ -70,7 +70,7 @@ def logs(pool: str, slot: int | None = None) -> list[tuple[str, Path]]:
     from fogft.pool import logs
 
     store = make_store(pool)
-    return logs.find(store, make_cloud(store.identity().cloud), slot)
+    return logs.find(store, cloud_of(store.identity()), slot)
 
 
 def tail(path: Path, lines: int = 8) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from fogft.app.clouds import make_cloud, make_store
+from fogft.app.clouds import cloud_of, make_store
 
 
 def init(example: str, into: Path | None, *, force: bool = False) -> list[Path]:
@@ -59,4 +59,4 @@ def run_manager(pool: str) -> None:
     """Run a pool's manager until a signal ends it, or the pool has been ended."""
     from fogft.pool import manager
 
-    manager.run(make_store(pool), make_cloud)
+    manager.run(make_store(pool), cloud_of)

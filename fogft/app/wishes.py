@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from fogft.app.clouds import make_cloud, make_store
+from fogft.app.clouds import cloud_of, make_store
 from fogft.core.errors import FogftError
 
 
@@ -33,14 +33,16 @@ def exclude(pool: str, location: str) -> bool:
     from fogft.pool import wishes
 
     store = make_store(pool)
-    cloud, place = store.identity().cloud, checked_location(location)
-    zones = {offer.placement.location for offer in make_cloud(cloud).offers({})}
-    known = {cloud, *zones, *(zone.rsplit("/", 1)[0] for zone in zones)}
+    identity, place = store.identity(), checked_location(location)
+    resources = store.spec().task.get("resources") or {}
+    sold = [offer.placement for offer in cloud_of(identity).offers(resources)]
+    known = {name for p in sold for name in (p.cloud, f"{p.cloud}/{p.region}", p.location)}
     if place not in known:
-        in_cloud = f"{cloud}/{place}"
+        meant = [f"{cloud}/{place}" for cloud in sorted({p.cloud for p in sold})]
+        meant = [name for name in meant if name in known]
         raise FogftError(
-            f"the cloud `{cloud}` of pool `{pool}` has no location `{place}`",
-            f"did you mean `{in_cloud}`?" if in_cloud in known else nearest(place, known),
+            f"the cloud `{identity.cloud}` of pool `{pool}` has no location `{place}`",
+            f"did you mean `{meant[0]}`?" if meant else nearest(place, known),
         )
     return wishes.exclude(store, place)
 

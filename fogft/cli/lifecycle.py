@@ -14,9 +14,12 @@ from fogft.cli.sections import Command
 from fogft.core.errors import FogftError
 
 if TYPE_CHECKING:
+    from fogft.pool.preview import Preview
     from fogft.pool.seen import Seen
 
 DEFAULT_FILE = Path("pool.yaml")
+LIMIT_S = 300.0
+REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
 
 
 def register(app: typer.Typer) -> None:
@@ -70,8 +73,15 @@ def up(
         bool, typer.Option("--yes", "-y", help="Do not ask. Nothing is asked on the local cloud.")
     ] = False,
     timeout: Annotated[
-        float, typer.Option("--timeout", min=1, metavar="S", help="Wait so long for the services.")
-    ] = 300.0,
+        float | None,
+        typer.Option(
+            "--timeout",
+            min=1,
+            metavar="S",
+            show_default=False,
+            help="Wait so long for the services; 300, on real clouds 1800 unless told.",
+        ),
+    ] = None,
 ) -> None:
     """Start a pool, or make a running one as its file says now.
 
@@ -84,8 +94,12 @@ def up(
     from fogft import app
     from fogft.cli import progress
 
-    order = app.order(file, cloud)
+    order = app.order(file, cloud, told=output.say)
     progress.announce(order.preview)
+    if not yes and must_ask(order.preview) and not output.confirm(question(order.preview)):
+        output.say("nothing was done")
+        raise typer.Exit(1)
+    limit_s = timeout or (REAL_LIMIT_S if order.preview.costs_money else LIMIT_S)
     applied_at = time.time()
     if app.start(order) and not order.preview.is_new:
         output.say("it had no manager: one was started, and takes over what runs")
@@ -93,19 +107,32 @@ def up(
     wanted = {service.name for service in order.spec.services}
     try:
         seen, answers = progress.wait(
-            lambda: managed(name), lambda seen: is_answering(seen, wanted, applied_at), timeout
+            lambda: managed(name), lambda seen: is_answering(seen, wanted, applied_at), limit_s
         )
     except KeyboardInterrupt:
         output.say(f"interrupted: `{name}` goes on starting; `fogft down {name}` ends it")
         raise typer.Exit(130) from None
     if not answers:
-        raise not_answering(seen, timeout)
+        raise not_answering(seen, limit_s)
     status = seen.status
     missing = max(0, status.target - status.ready)
     rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
     if order.preview.replaces_replicas and not missing:
         rest = "; `fogft status` shows them being replaced"
     output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
+
+
+def must_ask(preview: Preview) -> bool:
+    """Whether applying a pool file can cost more than what was agreed to before."""
+    return preview.costs_money and (preview.is_new or bool(preview.changes))
+
+
+def question(preview: Preview) -> str:
+    """Return what is asked before money is spent."""
+    count = len(preview.launches)
+    if not preview.is_new or not count:
+        return "go on?"
+    return f"launch {count} machine{'' if count == 1 else 's'} at these prices?"
 
 
 def managed(pool: str) -> Seen:

@@ -76,6 +76,19 @@ def failure(problem: FogftError) -> None:
     error(problem.message, problem.hint)
 
 
+def confirm(question: str) -> bool:
+    """Ask a yes-or-no question on the terminal; anything but yes is no.
+
+    Raises:
+        FogftError: There is nobody to ask.
+    """
+    if not is_terminal(sys.stdin):
+        raise FogftError("nobody is there to say yes", "add `--yes` to go on without being asked")
+    sys.stderr.write(f"{question} [y/N] ")
+    sys.stderr.flush()
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
 def coloured(stream: IO[str]) -> bool:
     """Whether a stream wants colour: a terminal that is not dumb, and no ``NO_COLOR``."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"

@@ -27,25 +27,35 @@ LOOK_EVERY_S = 0.2
 def announce(preview: Preview) -> None:
     """Say what will be done."""
     spec = preview.spec
+    for name, problem in preview.accounts.items():
+        output.say(f"`{name}` " + (f"cannot be used: {problem}" if problem else "can be used"))
     if preview.is_new:
         output.say(f"pool `{spec.name}`: {_count(spec.replicas, 'replica')} on `{preview.cloud}`")
-        rows = [
-            (f"  {launch.slot}", launch.location, launch.instance, f"${launch.usd_per_hour:.3f}/h")
-            for launch in preview.launches
-        ]
-        if rows:
-            output.say(output.aligned(rows))
-            output.say(f"  together ${sum(x.usd_per_hour for x in preview.launches):.3f}/h")
+        _say_launches(preview)
     elif preview.changes:
         output.say(f"pool `{spec.name}` changes:")
         for change in preview.changes:
             output.say(f"  {change}")
         if preview.replaces_replicas:
             output.say("  so its replicas are replaced one after the other, new before old")
+        if preview.costs_money and preview.launches:
+            output.say(f"  at the prices of now all of it costs ${preview.usd_per_hour:.3f}/h")
     else:
         output.say(f"pool `{spec.name}` is as its file says; nothing changes")
     for note in preview.notes:
         output.warn(note)
+
+
+def _say_launches(preview: Preview) -> None:
+    """Say where each replica will go, at what price, and how sure that is."""
+    rows = [
+        (f"  {x.slot}", x.location, x.instance, f"${x.usd_per_hour:.3f}/h", x.price)
+        for x in preview.launches
+    ]
+    if rows:
+        told = any(launch.price for launch in preview.launches)
+        output.say(output.aligned(row if told else row[:-1] for row in rows))
+        output.say(f"  together ${preview.usd_per_hour:.3f}/h")
 
 
 def wait(

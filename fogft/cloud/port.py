@@ -78,6 +78,31 @@ class Cloud(Protocol):
 
 
 @runtime_checkable
+class Accounts(Protocol):
+    """A cloud that costs money, and needs credentials for each cloud that it stands for."""
+
+    def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
+        """Test credentials: cloud -> empty, or what is wrong and what to do about it.
+
+        Args:
+            clouds: Their names, as a pool file has them; none for all that can be used.
+
+        Raises:
+            CloudError: Nothing can be tested here.
+        """
+
+    def check_task(self, task: Mapping[str, Any]) -> None:
+        """Look for what cannot be honoured on these clouds, before anything is ordered.
+
+        Raises:
+            SpecError: There is something; the message names its key.
+        """
+
+    def unverified(self, cloud: str) -> str:
+        """Return why what exists in a cloud cannot be checked there; empty when it can."""
+
+
+@runtime_checkable
 class Refreshing(Protocol):
     """A cloud whose list is from memory, and may still show what is gone."""
 

@@ -28,7 +28,7 @@ from fogft.pool import configuration, proxy_report, status
 from fogft.pool.lease import Lease
 from fogft.pool.proxy_supervisor import ProxySupervisor
 from fogft.pool.reconciler import Reconciler, Tick
-from fogft.pool.store import PoolStore
+from fogft.pool.store import Identity, PoolStore
 
 log = logging.getLogger(__name__)
 
@@ -187,7 +187,7 @@ class Manager:
 
 def run(
     store: PoolStore,
-    make_cloud: Callable[[str], Cloud],
+    cloud_of: Callable[[Identity], Cloud],
     *,
     proxy_command: Sequence[str] | None = None,
 ) -> None:
@@ -195,7 +195,7 @@ def run(
 
     Args:
         store: The pool.
-        make_cloud: Returns a cloud by the name that the pool's identity has.
+        cloud_of: Returns the cloud that a pool runs on.
         proxy_command: What to start as client proxy, in place of our own.
 
     Raises:
@@ -212,5 +212,5 @@ def run(
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
-    cloud = make_cloud(store.identity().cloud)
+    cloud = cloud_of(store.identity())
     Manager(store, cloud, proxy_command=proxy_command).run(stop)

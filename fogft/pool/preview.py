@@ -6,13 +6,11 @@ Not here: doing it (`startup`) and saying it (`fogft.cli`).
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from fogft.cloud.port import Cloud
+from fogft.cloud.port import Accounts, Cloud
 from fogft.core.errors import CloudError, PoolNotFound, SpecError
 from fogft.core.history import History
 from fogft.core.intent import Intent
@@ -20,18 +18,26 @@ from fogft.core.model import Observed, Offer
 from fogft.core.planner import plan
 from fogft.core.spec import PoolSpec
 from fogft.core.spec_changes import changes, replaces_replicas
-from fogft.pool import yaml_tree
+from fogft.pool.named_clouds import clouds_named, located
 from fogft.pool.store import PoolStore
+
+# What an age is told in: the unit, its length, and from which age on.
+_UNITS = (("days", 86400.0, 2 * 86400.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
 
 
 @dataclass(frozen=True)
 class PreviewedLaunch:
-    """Where a replica would go now."""
+    """Where a replica would go now, and what it would cost there.
+
+    Attributes:
+        price: Where the price comes from and how old it is, in words; empty where it is made up.
+    """
 
     slot: int
     location: str
     instance: str
     usd_per_hour: float
+    price: str = ""
 
 
 @dataclass(frozen=True)
@@ -39,7 +45,9 @@ class Preview:
     """What applying a pool file would do.
 
     Attributes:
-        launches: Of a new pool; by slot.
+        launches: Of a new pool; by slot. Of one that exists: what it would get if it were new.
+        costs_money: Its machines are paid for: nothing is ordered unasked.
+        accounts: Of each cloud whose credentials were tested: empty, or what is wrong.
         changes: Of a pool that exists: what the file now says otherwise, in words.
         notes: What may surprise: fewer placements than replicas, no prices now.
     """
@@ -51,6 +59,13 @@ class Preview:
     changes: tuple[str, ...] = ()
     replaces_replicas: bool = False
     notes: tuple[str, ...] = ()
+    costs_money: bool = False
+    accounts: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def usd_per_hour(self) -> float:
+        """What the launches cost together."""
+        return sum(launch.usd_per_hour for launch in self.launches)
 
 
 @dataclass(frozen=True)
@@ -68,101 +83,103 @@ class Order:
 
 
 def order(
-    store: PoolStore, cloud: Cloud, spec: PoolSpec, *, cloud_name: str, source: str, file: Path
+    store: PoolStore,
+    cloud: Cloud,
+    spec: PoolSpec,
+    *,
+    cloud_name: str,
+    source: str,
+    file: Path,
+    now: float = 0.0,
 ) -> Order:
     """Return what applying a pool file would do. Changes nothing.
 
+    Args:
+        store: The pool's folder, which may not exist yet.
+        cloud: Where the pool shall run.
+        spec: The file, read.
+        cloud_name: The cloud's name.
+        source: The file's text.
+        file: Where it is.
+        now: Seconds since the epoch.
+
     Raises:
         SpecError: The cloud can never meet the file's resources.
+        CloudError: A new pool, and none of the clouds that it names can be used.
     """
-    notes: tuple[str, ...] = ()
+    try:
+        store.identity()
+        before = store.spec()
+    except (PoolNotFound, SpecError):
+        before = None
+    notes: list[str] = []
+    accounts: Mapping[str, str] = {}
+    if isinstance(cloud, Accounts):
+        try:
+            cloud.check_task(spec.task)
+        except SpecError as error:
+            raise located(error, source, file) from None
+        accounts, found = _tested(cloud, clouds_named(spec), may_fail=before is not None)
+        notes += found
     offers: tuple[Offer, ...] = ()
     try:
         offers = tuple(cloud.offers(spec.task.get("resources") or {}))
     except SpecError as error:
         raise located(error, source, file) from None
     except CloudError as error:
-        notes = (f"prices cannot be had now: {error.message}",)
+        notes.append(f"prices cannot be had now: {error.message}")
+    planned = plan("0" * 16, spec, Intent(), Observed(now, (), None, offers), History())
+    preview = Preview(
+        spec,
+        cloud_name,
+        is_new=before is None,
+        launches=tuple(_launch(launch.slot, launch.offer, now) for launch in planned.launches),
+        changes=() if before is None else tuple(changes(before, spec)),
+        replaces_replicas=before is not None and replaces_replicas(before, spec),
+        notes=(*notes, *(planned.notes if before is None and offers else ())),
+        costs_money=isinstance(cloud, Accounts),
+        accounts=accounts,
+    )
+    return Order(preview, source, file)
+
+
+def _tested(
+    cloud: Accounts, named: Sequence[str], *, may_fail: bool
+) -> tuple[Mapping[str, str], list[str]]:
+    """Test credentials; return the outcome by cloud, and what is worth knowing besides."""
     try:
-        store.identity()
-        before = store.spec()
-    except (PoolNotFound, SpecError):
-        found = _of_new(spec, cloud_name, offers, notes)
-    else:
-        found = Preview(
-            spec,
-            cloud_name,
-            is_new=False,
-            changes=tuple(changes(before, spec)),
-            replaces_replicas=replaces_replicas(before, spec),
-            notes=notes,
+        accounts = dict(cloud.check(named))
+    except CloudError as error:
+        if not may_fail:
+            raise
+        return {}, [f"credentials cannot be tested now: {error.message}"]
+    usable = sorted(name for name, problem in accounts.items() if not problem)
+    if not usable and not may_fail:
+        listed = "\n".join(f"  `{name}`: {problem}" for name, problem in accounts.items())
+        raise CloudError(
+            f"no cloud can be used with the credentials that are here\n{listed}".rstrip(),
+            "set one up as `sky check` says, or try the pool on this machine with `--cloud local`",
         )
-    return Order(found, source, file)
+    return accounts, [reason for name in usable if (reason := cloud.unverified(name))]
 
 
-def located(error: SpecError, source: str, file: Path) -> SpecError:
-    """Return a cloud's complaint about a key with the file and the line that it is about."""
-    key, colon, _ = error.message.partition(": ")
-    node = yaml_tree.tree(source, str(file))
-    for part in re.findall(r"[^.\[\]]+", key) if colon else ():
-        value = node.value
-        if isinstance(value, tuple) and part.isdigit() and int(part) < len(value):
-            node = value[int(part)]
-        elif isinstance(value, Mapping) and part in value:
-            node = value[part]
-        else:
-            break
-    return SpecError(f"{file}:{node.key_line}: {error.message}", error.hint)
-
-
-def cloud_of(spec: PoolSpec, supported: Collection[str], source: str, file: Path) -> str | None:
-    """Return the cloud that a pool file's resources name; None where they name none.
-
-    Raises:
-        SpecError: They name one that is not supported, or more than one.
-    """
-    named = dict(_named(spec.task.get("resources") or {}, "resources"))
-    hint = (
-        f"supported: {', '.join(f'`{cloud}`' for cloud in supported)}; "
-        "or try the pool on this machine with `--cloud local`"
+def _launch(slot: int, offer: Offer, now: float) -> PreviewedLaunch:
+    place = offer.placement
+    return PreviewedLaunch(
+        slot, place.location, place.instance, offer.usd_per_hour, price_told(offer, now)
     )
-    for cloud, key in named.items():
-        if cloud not in supported:
-            problem = SpecError(f"{key}: cloud `{cloud}` is not supported yet", hint)
-            raise located(problem, source, file)
-    if len(named) > 1:
-        listed = " and ".join(f"`{cloud}`" for cloud in sorted(named))
-        problem = SpecError(f"resources: name {listed}; one cloud a pool is supported", hint)
-        raise located(problem, source, file)
-    return next(iter(named), None)
 
 
-def _named(resources: Any, key: str) -> Iterator[tuple[str, str]]:
-    """Yield each cloud that is named, with the key that names it."""
-    if not isinstance(resources, Mapping):
-        return
-    for name in ("infra", "cloud"):
-        if isinstance(resources.get(name), str):
-            cloud = resources[name].split("/")[0].strip().lower()
-            if cloud not in ("", "*"):
-                yield cloud, f"{key}.{name}"
-    for name in ("any_of", "ordered"):
-        choices = resources.get(name)
-        for index, choice in enumerate(choices if isinstance(choices, list) else ()):
-            yield from _named(choice, f"{key}.{name}[{index}]")
+def price_told(offer: Offer, now: float) -> str:
+    """Return where an offer's price comes from and how old it is, in words."""
+    if not offer.source or not offer.as_of:
+        return offer.source
+    return f"{offer.source}, {age_told(now - offer.as_of)} old"
 
 
-def _of_new(
-    spec: PoolSpec, cloud_name: str, offers: tuple[Offer, ...], notes: tuple[str, ...]
-) -> Preview:
-    planned = plan("0" * 16, spec, Intent(), Observed(0.0, (), None, offers), History())
-    launches = tuple(
-        PreviewedLaunch(
-            launch.slot,
-            launch.offer.placement.location,
-            launch.offer.placement.instance,
-            launch.offer.usd_per_hour,
-        )
-        for launch in planned.launches
-    )
-    return Preview(spec, cloud_name, is_new=True, launches=launches, notes=notes or planned.notes)
+def age_told(seconds: float) -> str:
+    """Return an age in its one largest unit, in words: ``3 s``, ``5 min``, ``7 h``, ``2 days``."""
+    for unit, length_s, from_s in _UNITS:
+        if seconds >= from_s:
+            return f"{seconds / length_s:.0f} {unit}"
+    return f"{max(0.0, seconds):.0f} s"

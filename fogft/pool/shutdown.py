@@ -23,7 +23,7 @@ from fogft.core.errors import CloudError, FogftError, StateError
 from fogft.core.intent import Intent
 from fogft.core.model import Machine
 from fogft.pool import lease, process_control, proxy_report
-from fogft.pool.store import PoolStore
+from fogft.pool.store import Identity, PoolStore
 
 LIMIT_S = 600.0
 ASK_AGAIN_S = 1.0
@@ -31,7 +31,7 @@ ASK_AGAIN_S = 1.0
 
 def end(
     store: PoolStore,
-    make_cloud: Callable[[str], Cloud],
+    cloud_of: Callable[[Identity], Cloud],
     *,
     told: Callable[[str], None] = lambda _: None,
     limit_s: float = LIMIT_S,
@@ -40,7 +40,7 @@ def end(
 
     Args:
         store: The pool.
-        make_cloud: Returns a cloud by name.
+        cloud_of: Returns the cloud that a pool runs on.
         told: Called with each thing as it has been ended.
         limit_s: How long machines may take to go.
 
@@ -65,7 +65,7 @@ def end(
         report = proxy_report.read(paths.proxy_status, identity.uid)
         proxy_pid = report.pid if report is not None else None
         _end_process(done, "client proxy", paths.proxy_lock, proxy_pid)
-        _end_machines(make_cloud(identity.cloud), identity.uid, done, limit_s)
+        _end_machines(cloud_of(identity), identity.uid, done, limit_s)
         # The identity first: from here on there is no such pool.
         paths.identity.unlink(missing_ok=True)
         shutil.rmtree(paths.folder, ignore_errors=True)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from fogft.core.errors import StateError
 from fogft.core.history import Event, EventKind, History
-from fogft.core.model import Phase, ReplicaId
+from fogft.core.model import LinkState, Phase, ReplicaId
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.core.health import Judged
@@ -192,8 +192,16 @@ def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float)
         in_flight=link.in_flight if link is not None else 0,
         restarts=link.restarts if link is not None else 0,
         age_s=max(0.0, now - launched_at),
-        detail=one.why or (link.detail if link is not None else ""),
+        detail=_detail(one),
     )
+
+
+def _detail(one: Judged) -> str:
+    """Return what is worth knowing of a replica: what is wrong, else what is being done."""
+    link, progress = one.link, one.machine.progress
+    if one.why or (progress and (link is None or link.state is LinkState.CONNECTING)):
+        return one.why or progress
+    return link.detail if link is not None else ""
 
 
 def _services(

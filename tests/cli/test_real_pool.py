@@ -103,6 +103,6 @@ def test_a_manager_run_by_hand_tells_why_it_cannot(fogft, home):
     identity = lay_down(home, None).identity
     identity.write_text(identity.read_text().replace('"local"', '"mars"'))
     said = fogft("manager", "planner", status=1).stderr
-    assert said == "error: cloud `mars` is not supported yet\n\nhint: supported: `local`\n"
+    assert said.startswith("error: there is no cloud `mars`\n\nhint: there are: `local`, `sky`")
     identity.unlink()
     assert "error: there is no pool `planner`" in fogft("manager", "planner", status=1).stderr

@@ -150,8 +150,8 @@ def test_when_a_pool_answers(status, answers):
     [
         (POOL.replace("local/us-west-2", "local/mars"), "7: resources.infra: the local cloud has"),
         (
-            POOL.replace("local/us-west-2", "aws"),
-            "7: resources.infra: cloud `aws` is not supported",
+            POOL.replace("local/us-west-2", "azw"),
+            "7: resources.infra: there is no cloud `azw`",
         ),
         (POOL.replace("GetPlan", "GetPlam"), "6: fogft.services[0].type: "),
         (POOL.replace("replicas", "replica"), "4: fogft.replica: "),
@@ -179,7 +179,9 @@ def test_a_file_for_another_cloud_can_be_tried_here(file, looks, capsys):
     assert "  0  local/us-west-2/a" in capsys.readouterr().err
     assert main.run(["up", str(file), "--cloud", "aws"]) == 1
     assert capsys.readouterr().err == (
-        "error: cloud `aws` is not supported yet\n\nhint: supported: `local`\n"
+        "error: there is no cloud `aws`\n\n"
+        "hint: there are: `local`, `sky`; "
+        "`sky` stands for all real ones, which the pool file names\n"
     )
 
 

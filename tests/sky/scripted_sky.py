@@ -92,6 +92,7 @@ class ScriptedSky:
         self.boots = boots  # whether a launch ends by itself when it is looked at
         self.full: set[str] = set()  # locations without capacity, for launches that do
         self.unreachable = False
+        self.credentials = {"aws": "", "gcp": "run `gcloud auth login`"}
         self._launched: list[_Launch] = []
         self._errors: dict[str, list[CloudError]] = {}
         self._counter = itertools.count(1)
@@ -167,7 +168,8 @@ class ScriptedSky:
         return [o for o in self.sold if resources.get("region") in (None, o.placement.region)]
 
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
-        return {"aws": "", "gcp": "run `gcloud auth login`"}
+        self._meet("check", "")
+        return {c: self.credentials.get(c, "no such") for c in clouds or self.credentials}
 
     # -- what tests do to it ------------------------------------------------------------------
 

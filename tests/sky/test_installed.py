@@ -265,3 +265,12 @@ def test_offers_come_from_the_catalogue(real: tuple[InstalledSky, Any, Any]):
     assert installed.offers({"infra": "aws", "cpus": "1000+"}) == []
     with pytest.raises(RefusedError, match="cpus"):
         installed.offers({"infra": "aws", "cpus": "two"})
+
+
+@needs_skypilot
+def test_the_clouds_that_a_pool_file_can_name_are_skypilots():
+    import sky
+
+    from fogft.cloud.names import NO_VM_CLOUDS, VM_CLOUDS
+
+    assert set(sky.CLOUD_REGISTRY) == {*VM_CLOUDS, *NO_VM_CLOUDS} - {"k8s"}

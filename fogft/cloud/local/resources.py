@@ -15,15 +15,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
+from fogft.cloud.names import VM_CLOUDS
 from fogft.core.errors import SpecError
 from fogft.core.model import Offer, Placement
 from fogft.core.spec_tree import nearest, shown
 
-CLOUDS = (
-    *(CLOUD, "*", "aws", "azure", "cudo", "do", "fluidstack", "gcp", "hyperbolic", "ibm", "lambda"),
-    *("nebius", "oci", "paperspace", "primeintellect", "runpod", "scp", "seeweb", "shadeform"),
-    *("vast", "verda", "vsphere"),
-)
+CLOUDS = (CLOUD, "*", *VM_CLOUDS)
 _PLACE_KEYS = ("infra", "cloud", "region", "zone")
 _MACHINE_KEYS = ("use_spot", "instance_type", "cpus", "memory", "accelerators")
 _IDLE_KEYS = (

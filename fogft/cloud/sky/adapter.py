@@ -25,6 +25,7 @@ from fogft.cloud.sky.presence import Presence
 from fogft.cloud.sky.prices import Prices
 from fogft.cloud.sky.provider import Provider
 from fogft.cloud.sky.sdk import RefusedError, Sky
+from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
 from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
 from fogft.core.model import Machine, Offer, ReplicaId
 from fogft.disk import write_whole
@@ -116,7 +117,7 @@ class SkyCloud:
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """See `Cloud`. Of each location the cheapest machine that SkyPilot would choose."""
-        task.refuse_what_cannot_be_honoured({"resources": resources})
+        refuse_what_cannot_be_honoured({"resources": resources})
         return self._prices.offers(resources)
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
@@ -205,6 +206,14 @@ class SkyCloud:
             CloudUnreachable: SkyPilot does not answer.
         """
         return self._sky.check(clouds)
+
+    def check_task(self, task: Mapping[str, Any]) -> None:
+        """Refuse what a pool decides itself, and what it cannot do.
+
+        Raises:
+            SpecError: Such a field is there; the message names its key.
+        """
+        refuse_what_cannot_be_honoured(task)
 
     def unverified(self, cloud: str) -> str:
         """Return why what exists in a cloud is SkyPilot's word alone; empty when it is not."""

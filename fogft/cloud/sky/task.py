@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fogft.cloud.names import NO_VM_CLOUDS
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming
 from fogft.core.errors import SpecError
@@ -34,7 +35,6 @@ _REFUSED_RESOURCES = {
     "autostop": "a replica runs as long as its pool wants it",
     "job_recovery": "fogft replaces what is lost",
 }
-_NOT_VMS = ("kubernetes", "k8s", "ssh", "slurm")
 
 
 def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
@@ -57,7 +57,7 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
             if str(label).startswith(naming.PREFIX):
                 raise SpecError(f"{where}.labels.{label}: this prefix is fogft's own")
         cloud = _location(entry)[0]
-        if cloud.lower() in _NOT_VMS:
+        if cloud.lower() in NO_VM_CLOUDS:
             raise SpecError(
                 f"{where}: `{cloud}` has no machines of its own",
                 "name clouds that sell VMs, such as `infra: aws/us-west-2`",
