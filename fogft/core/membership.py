@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from fogft.core.errors import StateError
+from fogft.core.holders import holder_of
 from fogft.core.model import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.core.names import POOL_UID_PATTERN
 
@@ -48,17 +49,27 @@ def is_newer(candidate: Membership, current: Membership | None) -> bool:
 
 
 def successor(
-    current: Membership | None, *, pool: str, pool_uid: str, epoch: int, members: tuple[Member, ...]
+    current: Membership | None,
+    *,
+    pool: str,
+    pool_uid: str,
+    epoch: int,
+    members: tuple[Member, ...],
+    revoked: Collection[str] = (),
 ) -> Membership | None:
-    """Return the next membership to write, or None when nothing would change."""
+    """Return the next membership to write, or None when nothing would change.
+
+    What was revoked stays revoked, whether or not it is named again.
+    """
     if current is None or current.pool_uid != pool_uid:
-        return Membership(pool, pool_uid, epoch, 1, members)
+        return Membership(pool, pool_uid, epoch, 1, members, frozenset(revoked))
     if epoch < current.epoch:
         return None  # a manager out of office writes nothing
-    if epoch == current.epoch and members == current.members:
+    all_revoked = current.revoked | frozenset(revoked)
+    if epoch == current.epoch and (members, all_revoked) == (current.members, current.revoked):
         return None
     version = current.version + 1 if epoch == current.epoch else 1
-    return Membership(pool, pool_uid, epoch, version, members)
+    return Membership(pool, pool_uid, epoch, version, members, all_revoked)
 
 
 def to_dict(membership: Membership) -> dict[str, Any]:
@@ -77,6 +88,7 @@ def to_dict(membership: Membership) -> dict[str, Any]:
             }
             for m in membership.members
         ],
+        "revoked": sorted(membership.revoked),
     }
     return {**content, "checksum": _checksum(content)}
 
@@ -92,12 +104,15 @@ def from_dict(raw: Any) -> Membership:
         if raw["checksum"] != _checksum(content):
             raise ValueError("its checksum is wrong")
         parts = {key: content[key] for key in ("pool", "pool_uid", "epoch", "version", "members")}
+        parts["revoked"] = content.get("revoked", ())  # older versions knew none
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error
     return from_parts(**parts)
 
 
-def from_parts(*, pool: Any, pool_uid: Any, epoch: Any, version: Any, members: Any) -> Membership:
+def from_parts(
+    *, pool: Any, pool_uid: Any, epoch: Any, version: Any, members: Any, revoked: Any = ()
+) -> Membership:
     """Return a membership from plain data.
 
     Raises:
@@ -112,6 +127,7 @@ def from_parts(*, pool: Any, pool_uid: Any, epoch: Any, version: Any, members: A
             epoch=_count(epoch),
             version=_count(version),
             members=tuple(_member(pool_uid, entry) for entry in members),
+            revoked=frozenset(_revoked(pool_uid, name) for name in revoked),
         )
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error
@@ -138,6 +154,13 @@ def _member(uid: str, entry: Mapping[str, Any]) -> Member:
         raise TypeError("draining is not true or false")
     id = ReplicaId(uid, _count(entry["slot"]), _count(entry["generation"]))
     return Member(id, endpoint, entry["draining"])
+
+
+def _revoked(uid: str, entry: Any) -> str:
+    holder = holder_of(_text(entry))
+    if holder.pool_uid != uid:
+        raise ValueError("it revokes what is another pool's")
+    return holder.common_name
 
 
 def _count(value: Any) -> int:

@@ -191,6 +191,7 @@ class Membership:
     Attributes:
         epoch: The writing manager's lease; then `version` counts its writes. A lower
             (epoch, version) never replaces a higher one.
+        revoked: Common names of certificates that are no good any more. Only ever grows.
     """
 
     pool: str
@@ -198,3 +199,4 @@ class Membership:
     epoch: int
     version: int
     members: tuple[Member, ...] = field(default_factory=tuple)
+    revoked: frozenset[str] = frozenset()

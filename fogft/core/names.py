@@ -49,21 +49,21 @@ def replica_certificate_name(id: ReplicaId) -> str:
     return f"replica.{id.slot}.{id.generation}.{id.pool_uid}"
 
 
-def robot_certificate_name(pool_uid: str, robot: str) -> str:
-    """Return the common name of a robot's certificate."""
-    return f"robot.{robot}.{pool_uid}"
+def robot_certificate_name(pool_uid: str, robot: str, generation: int = 1) -> str:
+    """Return the common name of a robot's certificate; each rotation has its generation."""
+    return f"robot.{robot}.{generation}.{pool_uid}"
 
 
-def gateway_certificate_name(pool_uid: str, gateway: str) -> str:
+def gateway_certificate_name(pool_uid: str, gateway: str, generation: int = 1) -> str:
     """Return the common name of a gateway's certificate."""
-    return f"gateway.{gateway}.{pool_uid}"
+    return f"gateway.{gateway}.{generation}.{pool_uid}"
 
 
-def rendezvous_certificate_name(pool_uid: str, rendezvous: str) -> str:
+def rendezvous_certificate_name(pool_uid: str, rendezvous: str, generation: int = 1) -> str:
     """Return the common name of a rendezvous's certificate."""
-    return f"rendezvous.{rendezvous}.{pool_uid}"
+    return f"rendezvous.{rendezvous}.{generation}.{pool_uid}"
 
 
 def manager_certificate_name(pool_uid: str) -> str:
-    """Return the common name of the manager's certificate."""
-    return f"manager.{pool_uid}"
+    """Return the common name of the certificate whose key signs the pool's membership."""
+    return f"manager.manager.1.{pool_uid}"

@@ -27,7 +27,7 @@ from fogft.core.records import (
     read_body,
     verified_writer,
 )
-from fogft.core.roster import check_content, revoked_serials
+from fogft.core.roster import check_content, revoked_names
 
 KEYS_LIMIT = 1024
 
@@ -99,17 +99,17 @@ class RecordSet:
             raise RecordError("full", f"a record beyond the {self._limit} that are kept")
         # Last, being the costly step: a flood of old records costs no signature checks.
         writer = verified_writer(record, signed, self._verify)
-        if writer.serial in self._revoked:
+        if writer.common_name in self._revoked:
             raise RecordError("revoked", f"the certificate of `{writer.common_name}` is revoked")
         self._held[record.key] = _Held(record, signed, writer)
         if record.kind is RecordKind.REVOCATION:
-            self._revoke(revoked_serials(record))
+            self._revoke(revoked_names(record))
         return Verdict.ACCEPTED
 
-    def _revoke(self, serials: frozenset[str]) -> None:
+    def _revoke(self, names: frozenset[str]) -> None:
         """Forget what revoked certificates have signed, whatever its order."""
-        self._revoked = serials
-        for key in [k for k, held in self._held.items() if held.writer.serial in serials]:
+        self._revoked = names
+        for key in [k for k, held in self._held.items() if held.writer.common_name in names]:
             if key[0] != RecordKind.REVOCATION.value:
                 del self._held[key]
 
@@ -146,7 +146,7 @@ class RecordSet:
 
     @property
     def revoked(self) -> frozenset[str]:
-        """Serial numbers of the certificates that are good no more."""
+        """Common names of the certificates that are good no more."""
         return self._revoked
 
 

@@ -69,7 +69,8 @@ class Record:
 
     Attributes:
         subject: The slot, the robot's or the gateway's name; empty where the pool is meant.
-        generation: The slot's, or the manager's epoch; 1 for robots and gateways.
+        generation: The slot's, the manager's epoch, or that of the robot's or gateway's
+            certificate.
         sequence: Counts what the writer wrote within a generation.
         content: Plain JSON data; `roster` knows what it means.
     """
@@ -192,8 +193,8 @@ def expected_writer(record: Record) -> tuple[str, str]:
     if not subject:
         raise RecordError("malformed", "a record about nobody")
     if record.kind is RecordKind.ROBOT:
-        return "robot", names.robot_certificate_name(uid, subject)
-    return "gateway", names.gateway_certificate_name(uid, subject)
+        return "robot", names.robot_certificate_name(uid, subject, record.generation)
+    return "gateway", names.gateway_certificate_name(uid, subject, record.generation)
 
 
 # -- bytes ----------------------------------------------------------------------------------

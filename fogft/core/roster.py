@@ -9,19 +9,18 @@ Not here: who may write them (`records`) and which one stands (`record_set`).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fogft.core import membership as memberships
 from fogft.core.errors import StateError
+from fogft.core.holders import holder_of
 from fogft.core.model import Member, Membership
 from fogft.core.records import COUNT_LIMIT, Record, RecordError, RecordKind
 
 SERVICES_LIMIT = 256
 NAME_LIMIT = 256
-_SERIAL = re.compile(r"[0-9a-f]{1,64}")
 
 
 @dataclass(frozen=True)
@@ -121,18 +120,22 @@ def admission(record: Record) -> Membership:
         raise RecordError("malformed", error.message) from error
 
 
-def revoked_serials(record: Record) -> frozenset[str]:
-    """Return the serial numbers that a revocation record names.
+def revoked_names(record: Record) -> frozenset[str]:
+    """Return the common names of certificates that a revocation record takes back.
 
     Raises:
         RecordError: Its content is none.
     """
-    serials = record.content.get("serials")
-    if not isinstance(serials, list) or not all(
-        isinstance(serial, str) and _SERIAL.fullmatch(serial) for serial in serials
-    ):
-        raise RecordError("malformed", "serial numbers that are none")
-    return frozenset(serials)
+    listed = record.content.get("names")
+    if not isinstance(listed, list):
+        raise RecordError("malformed", "names that are no list")
+    try:
+        holders = [holder_of(name) for name in listed]
+    except (ValueError, TypeError, AttributeError):
+        raise RecordError("malformed", "names that are none") from None
+    if any(holder.pool_uid != record.pool_uid for holder in holders):
+        raise RecordError("malformed", "names of another pool")
+    return frozenset(holder.common_name for holder in holders)
 
 
 def check_content(record: Record) -> None:
@@ -144,7 +147,7 @@ def check_content(record: Record) -> None:
     if record.kind is RecordKind.ADMISSION:
         admission(record)
     elif record.kind is RecordKind.REVOCATION:
-        revoked_serials(record)
+        revoked_names(record)
     elif record.kind is RecordKind.SLOT:
         slot_state(record)
     elif record.kind in (RecordKind.ROBOT, RecordKind.GATEWAY):

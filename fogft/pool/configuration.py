@@ -16,7 +16,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.cloud.port import Launch
-from fogft.core import names
+from fogft.core import holders, names
 from fogft.core.errors import CredentialError
 from fogft.core.model import ReplicaId
 from fogft.core.planner import PlannedLaunch
@@ -32,7 +32,8 @@ RENEW_BEFORE = datetime.timedelta(days=60)
 
 def robot_name() -> str:
     """Return this machine's name, fit for a certificate."""
-    return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:40] or "robot"
+    name = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[: holders.NAME_LIMIT].strip("-")
+    return name or "robot"
 
 
 def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> bool:
@@ -87,7 +88,7 @@ def certify_robot(paths: PoolPaths, identity: Identity, now: datetime.datetime) 
         pass  # there is none yet, or it is damaged: a new one is issued
     name = names.robot_certificate_name(identity.uid, robot_name())
     issued = credentials.issue(
-        paths.credentials, name, role=credentials.Role.ROBOT, days=CERTIFICATE_DAYS
+        paths.credentials, name, role=holders.Role.ROBOT, days=CERTIFICATE_DAYS
     )
     credentials.write(issued, paths.credentials, "robot")
     return True
@@ -105,7 +106,7 @@ def build_order(
     issued = credentials.issue(
         paths.credentials,
         names.replica_certificate_name(id),
-        role=credentials.Role.REPLICA,
+        role=holders.Role.REPLICA,
         days=CERTIFICATE_DAYS,
     )
     return Launch(

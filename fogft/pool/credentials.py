@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import datetime
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft import disk
 from fogft.core.errors import CredentialError
+from fogft.core.holders import Role
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -32,16 +32,6 @@ LEAF_DAYS = 30.0
 # Robots' clocks are wrong; a certificate that begins tomorrow, by their clock, is refused.
 BACKDATE = datetime.timedelta(hours=24)
 _COMMON_NAME_LIMIT = 64  # X.520's upper bound
-
-
-class Role(str, Enum):
-    """What the holder of a certificate may do."""
-
-    ROBOT = "robot"  # asks
-    REPLICA = "replica"  # answers
-    GATEWAY = "gateway"  # answers robots, asks replicas
-    RENDEZVOUS = "rendezvous"  # keeps records; its name opens no link
-    MANAGER = "manager"  # signs records; opens no connection
 
 
 @dataclass(frozen=True)
@@ -216,7 +206,8 @@ def _usages(role: Role) -> list[x509.ObjectIdentifier]:
         Role.REPLICA: [answers],
         Role.GATEWAY: [answers, asks],
         Role.RENDEZVOUS: [answers],
-        Role.MANAGER: [ExtendedKeyUsageOID.CODE_SIGNING],  # good for no TLS connection
+        # Good for no connection at all: neither end of TLS accepts it.
+        Role.MANAGER: [ExtendedKeyUsageOID.CODE_SIGNING],
     }[role]
 
 

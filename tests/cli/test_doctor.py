@@ -38,7 +38,7 @@ def folder(tmp_path: Path) -> Path:
     path = PoolPaths.of("planner", tmp_path).credentials
     path.parent.mkdir(parents=True)
     credentials.create_authority(path, UID)
-    issued = credentials.issue(path, f"robot.r.{UID}", role=credentials.Role.ROBOT)
+    issued = credentials.issue(path, f"robot.r.1.{UID}", role=credentials.Role.ROBOT)
     credentials.write(issued, path, "robot")
     return path
 

@@ -22,9 +22,9 @@ from fogft.core.roster import SlotState, admission_content
 UID = "0123456789abcdef"
 
 
-def signer(role: str, common_name: str, serial: str = "") -> Sign:
+def signer(role: str, common_name: str) -> Sign:
     """Return how this writer signs."""
-    certificate = f"{role}|{common_name}|{serial or hashlib.md5(common_name.encode()).hexdigest()}"
+    certificate = f"{role}|{common_name}|{hashlib.md5(common_name.encode()).hexdigest()}"
 
     def sign(message: bytes) -> tuple[bytes, bytes]:
         return certificate.encode(), hashlib.sha256(certificate.encode() + message).digest()
@@ -40,9 +40,9 @@ def verify(certificate: bytes, signature: bytes, message: bytes) -> Writer:
     return Writer(role, common_name, serial)
 
 
-def signed(record: Record, serial: str = "") -> SignedRecord:
+def signed(record: Record) -> SignedRecord:
     """Return a record signed by the one who may write it."""
-    return sign_record(record, signer(*expected_writer(record), serial))
+    return sign_record(record, signer(*expected_writer(record)))
 
 
 def admission(epoch: int, version: int, *members: Member) -> SignedRecord:
@@ -52,15 +52,15 @@ def admission(epoch: int, version: int, *members: Member) -> SignedRecord:
 
 
 def slot(
-    number: int, generation: int, sequence: int, state: SlotState | None = None, serial: str = ""
+    number: int, generation: int, sequence: int, state: SlotState | None = None
 ) -> SignedRecord:
     content = (state or SlotState()).to_content()
     record = Record(UID, RecordKind.SLOT, str(number), generation, sequence, content)
-    return signed(record, serial)
+    return signed(record)
 
 
-def revocation(sequence: int, *serials: str, epoch: int = 1) -> SignedRecord:
-    content = {"serials": list(serials)}
+def revocation(sequence: int, *revoked: str, epoch: int = 1) -> SignedRecord:
+    content = {"names": list(revoked)}
     return signed(Record(UID, RecordKind.REVOCATION, "", epoch, sequence, content))
 
 

@@ -23,8 +23,17 @@ members = st.lists(
     unique_by=lambda m: m.id,
     max_size=5,
 ).map(tuple)
+revoked = st.frozensets(
+    st.builds("robot.{}.{}.{}".format, st.sampled_from("ab"), st.integers(1, 3), st.just(UID))
+)
 made = st.builds(
-    Membership, st.just("pool"), st.just(UID), st.integers(0, 5), st.integers(0, 5), members
+    Membership,
+    st.just("pool"),
+    st.just(UID),
+    st.integers(0, 5),
+    st.integers(0, 5),
+    members,
+    revoked,
 )
 
 
@@ -127,3 +136,26 @@ def test_members_are_those_to_talk_to() -> None:
         ("1.1", True),
         ("2.1", True),
     ]
+
+
+@given(made, st.integers(0, 6), members, revoked)
+def test_a_revocation_is_never_taken_back(
+    current: Membership, epoch: int, new: tuple[Member, ...], more: frozenset[str]
+) -> None:
+    """Whoever writes next, with whatever in mind: what was revoked stays revoked."""
+    after = memberships.successor(
+        current, pool="pool", pool_uid=UID, epoch=epoch, members=new, revoked=more
+    )
+    if after is not None:
+        assert after.revoked == current.revoked | more
+    else:
+        assert epoch < current.epoch or (more <= current.revoked and new == current.members)
+
+
+@pytest.mark.parametrize("name", [f"robot.a.1.{STRANGER}", "robot", 7, None])
+def test_a_name_of_nobody_in_the_pool_cannot_be_revoked(name: object) -> None:
+    raw = memberships.to_dict(Membership("pool", UID, 1, 1))
+    raw["revoked"] = [name]
+    del raw["checksum"]
+    with pytest.raises(StateError):
+        memberships.from_dict({**raw, "checksum": memberships._checksum(raw)})

@@ -120,7 +120,7 @@ def test_a_slot_is_written_by_its_own_launch_only(role, common_name):
 
 @pytest.mark.parametrize("kind", [RecordKind.ADMISSION, RecordKind.TOPOLOGY, RecordKind.REVOCATION])
 def test_only_the_manager_admits_and_revokes(kind):
-    content = {"name": "p", "members": [], "serials": []}
+    content = {"name": "p", "members": [], "names": []}
     record = Record(UID, kind, "", 9, 9, content)
     held = merged(world.signed(record))
     assert held.get(kind) == record
@@ -146,14 +146,33 @@ def test_a_changed_body_is_forged_and_another_pools_is_refused():
 
 
 def test_revocation_takes_back_what_was_signed_and_admits_no_more():
-    """Its own record excepted: a manager whose certificate is exchanged may revoke the old one."""
-    held = merged(world.slot(0, 1, 1, serial="aa"), world.slot(1, 1, 1, serial="bb"))
-    held.offer(world.revocation(1, "aa"))
+    """The next launch of the slot has a name of its own, and is let in."""
+    bad = names.replica_certificate_name(ReplicaId(UID, 0, 1))
+    held = merged(world.slot(0, 1, 1), world.slot(1, 1, 1))
+    held.offer(world.revocation(1, bad))
     assert [r.subject for r in held.of(RecordKind.SLOT)] == ["1"]
-    assert held.offer(world.slot(0, 1, 2, serial="aa")) is Verdict.REFUSED
+    assert held.offer(world.slot(0, 1, 2)) is Verdict.REFUSED
     assert held.counts["refused_revoked"] == 1
-    assert held.offer(world.slot(0, 2, 1, serial="cc")) is Verdict.ACCEPTED
-    assert held.revoked == {"aa"}
+    assert held.offer(world.slot(0, 2, 1)) is Verdict.ACCEPTED
+    assert held.revoked == {bad}
+
+
+@pytest.mark.parametrize("listed", [None, "x", ["x"], [7], [f"robot.r.1.{UID[::-1]}"]])
+def test_a_revocation_of_what_is_no_name_of_the_pool_is_refused(listed):
+    record = Record(UID, RecordKind.REVOCATION, "", 1, 1, {"names": listed})
+    held = RecordSet(UID, verify)
+    assert held.offer(world.signed(record)) is Verdict.REFUSED
+    assert held.counts["refused_malformed"] == 1
+
+
+def test_a_rotated_robot_writes_its_next_generation():
+    """And nobody writes under a generation that the certificate does not name."""
+    record = Record(UID, RecordKind.ROBOT, "r", 2, 1, {"dial_in": ""})
+    old = world.signer("robot", names.robot_certificate_name(UID, "r"))
+    new = world.signer("robot", names.robot_certificate_name(UID, "r", 2))
+    held = RecordSet(UID, verify)
+    assert held.offer(sign_record(record, old)) is Verdict.REFUSED
+    assert held.offer(sign_record(record, new)) is Verdict.ACCEPTED
 
 
 def test_there_is_a_limit_to_keys_but_not_to_news_of_known_ones():
