@@ -56,6 +56,8 @@ def headline(seen: Seen, *, colour: bool) -> str:
         Cell(f"{price(status.usd_per_hour)}/h on {status.cloud}"),
         Cell("not observed yet" if age_s is None else f"seen {age(age_s)} ago"),
     ]
+    if status.ended and not seen.manager_alive:
+        return GAP.join([Cell(status.pool, "bold").painted(colour=colour), f"ended {status.ended}"])
     alarms = {
         "NO MANAGER": not seen.manager_alive,
         "NO CLIENT PROXY": not status.proxy_alive,

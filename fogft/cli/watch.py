@@ -90,7 +90,9 @@ def _screen(seen: Seen) -> str:
 
 def _remark(seen: Seen) -> None:
     """Say on stderr what a reader of the table might overlook."""
-    if not seen.manager_alive:
+    if seen.status.ended and not seen.manager_alive:
+        output.hint(f"start it again with `fogft up {seen.status.file}`; `fogft down` removes it")
+    elif not seen.manager_alive:
         output.warn("no manager runs: requests go on, but nothing that is lost is replaced")
         output.hint(f"start it with `fogft up {seen.status.file}`, or end it with `fogft down`")
     elif seen.age_s is not None and seen.age_s > STALE_AFTER_S:

@@ -32,6 +32,8 @@ class Intent:
         drained: Slot -> the highest generation there that is to be replaced.
         excluded: Locations (``cloud``, ``cloud/region`` or all three) to keep out of.
         stopping: `down` was asked for: end everything.
+        began_at: When the hours of `max_hours` began anew, in seconds since the epoch; 0 as
+            long as they count from the pool's creation.
     """
 
     target: int | None = None
@@ -39,6 +41,7 @@ class Intent:
     drained: Mapping[int, int] = field(default_factory=dict)
     excluded: frozenset[str] = frozenset()
     stopping: bool = False
+    began_at: float = 0.0
 
     def wanted(self, spec: PoolSpec) -> int:
         """Return how many replicas should be ready."""
@@ -137,6 +140,7 @@ def to_json(intent: Intent) -> dict[str, Any]:
         "drained": {str(slot): generation for slot, generation in intent.drained.items()},
         "excluded": sorted(intent.excluded),
         "stopping": intent.stopping,
+        "began_at": intent.began_at,
     }
 
 
@@ -153,6 +157,7 @@ def from_json(value: Any) -> Intent:
             drained={int(k): int(v) for k, v in dict(value["drained"]).items()},
             excluded=frozenset(_texts(value["excluded"])),
             stopping=bool(value["stopping"]),
+            began_at=_moment(value.get("began_at", 0.0)),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise StateError(f"not an intent: {error!r}") from error
@@ -164,6 +169,13 @@ def _number(value: Any) -> int | None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ValueError(f"not a count: {value!r}")
     return value
+
+
+def _moment(value: Any) -> float:
+    moment = float(value)
+    if not 0 <= moment < float("inf"):  # false for NaN too
+        raise ValueError(f"not a time: {value!r}")
+    return moment
 
 
 def _texts(values: Iterable[Any]) -> list[str]:

@@ -229,7 +229,8 @@ class _Buyer:
     sacrificed: list[tuple[Standing, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._spent = sum(s.judged.machine.usd_per_hour for s in self.census.everyone())
+        self._offered = {o.placement: o.usd_per_hour for o in self.observed.offers}
+        self._spent = sum(self._price(s) for s in self.census.everyone())
         self._resting = resting(self.history, self.observed.now)
 
     def buy(self, need: Need, room: int) -> bool:
@@ -251,6 +252,11 @@ class _Buyer:
         self.launches.append(PlannedLaunch(need.slot, generation, choice.offer, need.reason))
         self._spent += choice.offer.usd_per_hour
         return True
+
+    def _price(self, standing: Standing) -> float:
+        """Return what a machine costs: as ordered, or more where its spot price has risen."""
+        machine = standing.judged.machine
+        return max(machine.usd_per_hour, self._offered.get(machine.placement, 0.0))
 
     def _choose(self, need: Need, budget: float | None) -> Choice:
         now = self.observed.now
@@ -276,7 +282,7 @@ class _Buyer:
         for standing in self.census.lost:
             if standing.verdict is not Verdict.UNRESPONSIVE:
                 continue
-            freed = standing.judged.machine.usd_per_hour
+            freed = self._price(standing)
             if self._choose(need, cap - self._spent + freed).offer is not None:
                 self.sacrificed.append((standing, f"{standing.why}, and the budget has no room"))
                 return

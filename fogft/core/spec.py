@@ -62,6 +62,7 @@ class PoolSpec:
         max_surge: How many more may exist while one replaces another.
         max_usd_per_hour: Cap on the price of all machines together, surge included;
             None for no cap.
+        max_hours: After so many hours the pool ends by itself; None for never.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -70,6 +71,7 @@ class PoolSpec:
     replicas: int = 2
     max_surge: int = 1
     max_usd_per_hour: float | None = None
+    max_hours: float | None = None
     health: HealthSpec = field(default_factory=HealthSpec)
     task: Mapping[str, Any] = field(default_factory=dict)
 

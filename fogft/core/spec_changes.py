@@ -19,7 +19,7 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
     found += _services(before, after)
     found += [
         _one(key, getattr(before, key), getattr(after, key))
-        for key in ("replicas", "max_surge", "max_usd_per_hour")
+        for key in ("replicas", "max_surge", "max_usd_per_hour", "max_hours")
         if getattr(before, key) != getattr(after, key)
     ]
     found += [

@@ -12,6 +12,7 @@ FOGFT_KEYS = (
     "replicas",
     "max_surge",
     "max_usd_per_hour",
+    "max_hours",
     "health",
     "orphan_after_s",
 )
@@ -47,7 +48,6 @@ LATER_KEYS = {
     "topology": "remove it; every replica is linked to the robot directly",
     "on_demand": "remove it, or set `resources.use_spot: false` for on-demand machines only",
     "schedule": "remove it, and use `fogft scale` or `fogft down` from a timer",
-    "max_hours": "remove it, and use `fogft down` from a timer",
     "hedging": "remove it; every request goes to all replicas at once",
     "state": "remove it; the services must be stateless",
     "quorum": "remove it; the first successful response is returned",

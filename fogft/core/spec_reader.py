@@ -29,6 +29,7 @@ FolderCheck = Callable[[str], str | None]  # of `workdir`
 
 MAX_REPLICAS = 16
 MAX_SURGE = 4
+MAX_HOURS = 8000  # the certificates last 365 days
 
 
 def pool_spec(
@@ -58,15 +59,18 @@ def pool_spec(
     ours = top.section("fogft", "write `fogft:` with `services:` below it")
     ours.only(FOGFT_KEYS, later=LATER_KEYS, elsewhere=places(FOGFT_KEYS))
     services = read_services(ours)
-    cap = None
+    cap = hours = None
     if "max_usd_per_hour" in ours.children:
         cap = ours.number("max_usd_per_hour", 1_000_000, "US dollars per hour")
+    if "max_hours" in ours.children:
+        hours = ours.number("max_hours", MAX_HOURS, "hours")
     spec = PoolSpec(
         name=_name(top),
         services=services,
         replicas=ours.whole("replicas", PoolSpec.replicas, 1, MAX_REPLICAS),
         max_surge=ours.whole("max_surge", PoolSpec.max_surge, 0, MAX_SURGE),
         max_usd_per_hour=cap,
+        max_hours=hours,
         health=_health(ours),
         task={key: plain(node) for key, node in top.children.items() if key != "fogft"},
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -90,6 +91,10 @@ def processes(situation: Situation) -> Iterator[Finding]:
     """Every pool has a manager and a client proxy."""
     for pool in situation.pools:
         paths = PoolPaths.of(pool, situation.home)
+        ended = _ended(paths)
+        if ended:
+            yield ok("manager", f"pool `{pool}`: ended {ended}")
+            continue
         if disk.is_locked(paths.manager_lock):
             yield ok("manager", f"pool `{pool}`: runs")
         else:
@@ -106,6 +111,16 @@ def processes(situation: Situation) -> Iterator[Finding]:
                 f"pool `{pool}` has none: no request is answered",
                 f"its manager starts it; see `{paths.proxy_log}`",
             )
+
+
+def _ended(paths: PoolPaths) -> str:
+    """Return how a pool has ended by itself; empty when it has not."""
+    if disk.is_locked(paths.manager_lock):
+        return ""
+    with contextlib.suppress(FogftError):
+        status = disk.read_json(paths.status)
+        return str(status.get("ended") or "") if isinstance(status, dict) else ""
+    return ""
 
 
 def links(situation: Situation) -> Iterator[Finding]:

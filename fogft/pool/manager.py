@@ -22,9 +22,10 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.cloud.port import Cloud
+from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
-from fogft.pool import configuration, proxy_report, status
+from fogft.pool import configuration, proxy_report, shutdown, status
 from fogft.pool.lease import Lease
 from fogft.pool.proxy_supervisor import ProxySupervisor
 from fogft.pool.reconciler import Reconciler, Tick
@@ -86,7 +87,8 @@ class Manager:
         try:
             while not stop.is_set():
                 self._lease.beat()
-                self._work()
+                if self._work():
+                    break
                 self._rest(stop)
         except PoolNotFound:
             log.info("manager_stopped pool=%s reason=ended", self._identity.name)
@@ -94,13 +96,33 @@ class Manager:
             self._lease.release()
         log.info("manager_stopped pool=%s", self._identity.name)
 
-    def _work(self) -> None:
-        """Do one round. What goes wrong is logged and tried again in the next one."""
+    def _work(self) -> bool:
+        """Do one round. What goes wrong is logged and tried again in the next one.
+
+        Returns:
+            Whether the pool has ended by itself: there is nothing left to manage.
+        """
         self._trouble = []
         self._attempt(self._keep_proxy)
         tick = self._attempt_tick()
-        if tick is not None:
-            self._attempt(lambda: self._write_status(tick))
+        if tick is None:
+            return False
+        if tick.over and tick.observed.machines == ():
+            self._attempt(self._leave)
+            if not self._trouble:
+                ended = f"by itself, after {tick.spec.max_hours:g} hours (`max_hours`)"
+                self._attempt(lambda: self._write_status(tick, ended))
+                return not self._trouble
+        self._attempt(lambda: self._write_status(tick))
+        return False
+
+    def _leave(self) -> None:
+        """See to it that nothing of a pool that ends by itself is left but its folder."""
+        shutdown.end_client_proxy(
+            self._paths,
+            self._identity.uid,
+            lambda what: log.info("process_ended pool=%s what=%r", self._identity.name, what),
+        )
 
     def _attempt(self, step: Callable[[], None]) -> None:
         try:
@@ -123,18 +145,20 @@ class Manager:
             configuration.certify_robot(self._paths, self._identity, utc)
             self._certified_at = now
         configuration.write_proxy_config(self._paths, self._identity, self._store.spec())
-        if not self._store.intent().stopping:
+        intent = self._store.intent()
+        over = lifetime.is_over(self._store.spec(), intent, self._identity.created_at, time.time())
+        if not intent.stopping and not over:
             self._proxy.look()
 
     def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...] | None:
         report = proxy_report.read(self._paths.proxy_status, pool_uid)
         return report.links if report is not None and report.fresh(now) else None
 
-    def _write_status(self, tick: Tick) -> None:
+    def _write_status(self, tick: Tick, ended: str = "") -> None:
         report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
         fresh = report is not None and report.fresh(time.time())
         notes = [*self._trouble, *([self._proxy.trouble] if self._proxy.trouble else [])]
-        if report is None or not fresh:
+        if (report is None or not fresh) and not tick.over:
             when = "lately" if report else "yet"
             notes.append(f"the client proxy has not reported {when}")
         seen = status.of_tick(
@@ -151,6 +175,9 @@ class Manager:
             self._replicas = seen.replicas
         else:  # show what was seen last; `cloud_reachable` says how it is meant
             seen = replace(seen, replicas=self._replicas)
+        if ended:
+            seen = replace(seen, ended=ended, proxy_alive=False, proxy_pid=None, notes=[])
+            log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
         disk.write_json(self._paths.status, seen.to_json(), durable=False)
 
     # -- waiting ----------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from fogft.cloud.port import Cloud, Launch
+from fogft.core import lifetime
 from fogft.core.errors import CloudError, FogftError, NoCapacity, QuotaExceeded
 from fogft.core.health import Health, Verdict, judge
 from fogft.core.history import Event, EventKind, History
@@ -45,7 +46,11 @@ BuildOrder = Callable[[Identity, PoolSpec, PlannedLaunch], Launch]
 
 @dataclass(frozen=True)
 class Tick:
-    """What one tick saw and decided."""
+    """What one tick saw and decided.
+
+    Attributes:
+        over: Its hours are used up: the pool ends by itself.
+    """
 
     identity: Identity
     spec: PoolSpec
@@ -53,6 +58,7 @@ class Tick:
     observed: Observed
     plan: Plan
     membership: Membership | None
+    over: bool = False
 
 
 def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
@@ -119,12 +125,20 @@ class Reconciler:
             self._remember_losses(observed)
             health = judge(identity.uid, spec, observed, history)
             self._remember_health(health, history)
+        hours = (spec, intent, identity.created_at, observed.now)
+        trouble += lifetime.notes(*hours)
+        over = lifetime.is_over(*hours)
+        if over:
+            intent = replace(intent, stopping=True)
         decided = plan(identity.uid, spec, intent, observed, history)
+        if over:
+            ends = tuple(replace(end, reason="`max_hours` is over") for end in decided.terminations)
+            decided = replace(decided, terminations=ends)
         if trouble:
             decided = replace(decided, notes=(*decided.notes, *trouble))
         if observed.machines is not None:
             self._apply(identity, spec, observed, decided, history)
-        return Tick(identity, spec, intent, observed, decided, self._membership)
+        return Tick(identity, spec, intent, observed, decided, self._membership, over)
 
     # -- observe ----------------------------------------------------------------------------
 

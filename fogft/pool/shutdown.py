@@ -23,6 +23,7 @@ from fogft.core.errors import CloudError, FogftError, StateError
 from fogft.core.intent import Intent
 from fogft.core.model import Machine
 from fogft.pool import lease, process_control, proxy_report
+from fogft.pool.paths import PoolPaths
 from fogft.pool.store import Identity, PoolStore
 
 LIMIT_S = 600.0
@@ -62,14 +63,23 @@ def end(
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             store.write_intent(replace(_intent(store), stopping=True))
-        report = proxy_report.read(paths.proxy_status, identity.uid)
-        proxy_pid = report.pid if report is not None else None
-        _end_process(done, "client proxy", paths.proxy_lock, proxy_pid)
+        end_client_proxy(paths, identity.uid, done)
         _end_machines(cloud_of(identity), identity.uid, done, limit_s)
         # The identity first: from here on there is no such pool.
         paths.identity.unlink(missing_ok=True)
         shutil.rmtree(paths.folder, ignore_errors=True)
     return ended
+
+
+def end_client_proxy(paths: PoolPaths, uid: str, done: Callable[[str], None]) -> None:
+    """End a pool's client proxy; tell it if there was one. Repeatable.
+
+    Raises:
+        FogftError: It does not end.
+    """
+    report = proxy_report.read(paths.proxy_status, uid)
+    pid = report.pid if report is not None else None
+    _end_process(done, "client proxy", paths.proxy_lock, pid)
 
 
 def _intent(store: PoolStore) -> Intent:

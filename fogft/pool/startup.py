@@ -19,6 +19,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.core import intent as intents
+from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound, SpecError
 from fogft.core.intent import Intent
 from fogft.core.spec import PoolSpec
@@ -72,7 +73,8 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
             before, old_source = store.spec(), paths.spec.read_text()
         except FogftError:  # written by a version that knew other keys
             before, old_source = spec, ""
-        store.write_intent(intents.file_changed(store.intent(), before, spec))
+        after = intents.file_changed(store.intent(), before, spec)
+        store.write_intent(lifetime.revived(before, after, identity.created_at, time.time()))
         if old_source != source:
             disk.write_whole(paths.spec, source)
         return Written(identity, created=False, changed=old_source != source)

@@ -84,6 +84,7 @@ class PoolStatus:
             what was seen last and `ready` is 0.
         target: Replicas wanted now.
         ready: Replicas whose services answer and that are to stay.
+        ended: Why the manager has ended the pool by itself; empty while it runs.
         notes: Why the pool is not yet as wanted, in sentences.
         events: The last things that happened: ``{at, event, replica, location, detail}``.
     """
@@ -103,6 +104,7 @@ class PoolStatus:
     usd_per_hour: float
     proxy_pid: int | None
     proxy_alive: bool
+    ended: str = ""
     excluded: Sequence[str] = ()
     notes: Sequence[str] = ()
     replicas: Sequence[ReplicaStatus] = ()

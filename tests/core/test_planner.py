@@ -52,6 +52,16 @@ def test_notice_is_replaced_at_once_elsewhere_and_kept_until_then() -> None:
     assert ends(world) == []
 
 
+def test_a_spot_price_that_has_risen_counts_against_the_budget() -> None:
+    """The machine at A was ordered for 0.1 and costs 0.3 now: no room for another one."""
+    dearer = (replace(OFFERS[0], usd_per_hour=0.3), *OFFERS[1:])
+    world = World(spec(2, max_usd_per_hour=0.35)).having(replica(0, at=A))
+    assert launches(world) == ["1.1"]
+    planned = replace(world, offers=dearer).plan()
+    assert planned.launches == ()
+    assert "leaves $0.050/h" in planned.notes[0]
+
+
 def test_a_rebalance_is_an_early_hint() -> None:
     """Its replica serves on, is replaced elsewhere, new before old, and one at a time."""
     world = World(spec(2)).having(
@@ -216,7 +226,7 @@ def test_no_surge_keeps_what_serves_and_says_so() -> None:
 
 def test_budget_holds_and_is_explained() -> None:
     """A launch beyond `max_usd_per_hour` waits, with the numbers in the note."""
-    world = World(spec(3, max_usd_per_hour=0.25)).having(replica(0), replica(1))
+    world = World(spec(3, max_usd_per_hour=0.26)).having(replica(0), replica(1, price=0.11))
     assert launches(world) == []
     [note] = world.plan().notes
     assert "$0.100/h" in note

@@ -74,6 +74,7 @@ specs = st.builds(
     replicas=st.integers(1, 16),
     max_surge=st.integers(0, 4),
     max_usd_per_hour=st.none() | st.floats(0.01, 1000),
+    max_hours=st.none() | st.floats(0.01, 8000),
     health=st.builds(
         HealthSpec,
         suspect_after_s=st.floats(0.1, 3600),
@@ -109,6 +110,8 @@ def test_what_was_written_is_what_is_read(spec, task):
     }
     if spec.max_usd_per_hour is not None:
         ours["max_usd_per_hour"] = spec.max_usd_per_hour
+    if spec.max_hours is not None:
+        ours["max_hours"] = spec.max_hours
     whole_task = {"name": spec.name, "run": "x", **task}
     read_back = read({**whole_task, "fogft": ours})
     assert read_back.task == whole_task

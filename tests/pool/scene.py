@@ -8,13 +8,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from fogft import disk
 from fogft.pool import pool_file, shutdown, startup
 from fogft.pool.paths import PoolPaths
-from fogft.pool.store import PoolStore
+from fogft.pool.store import PoolStore, write_identity
 from tests.pool.folder_cloud import FolderCloud
 
 FILE = """\
@@ -22,6 +23,7 @@ name: pool
 run: exec ./serve
 fogft:
   replicas: {replicas}
+  max_hours: {max_hours}
   services:
     - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: {timeout_s}}}
 """
@@ -48,15 +50,23 @@ class Scene:
         self.cloud = cloud_of(home)
         self._started: list[subprocess.Popen[bytes]] = []
 
-    def write(self, *, replicas: int = 2, timeout_s: float = 5.0) -> startup.Written:
+    def write(
+        self, *, replicas: int = 2, timeout_s: float = 5.0, max_hours: float = 100.0
+    ) -> startup.Written:
         """Do what `up` does with files."""
-        source = FILE.format(replicas=replicas, timeout_s=timeout_s)
+        source = FILE.format(replicas=replicas, timeout_s=timeout_s, max_hours=max_hours)
         self.file.write_text(source)
         spec = pool_file.read(self.file)
         return startup.write(self.store, spec, source=source, file=self.file, cloud="folder")
 
     def command(self, name: str = "pool") -> list[str]:
         return [sys.executable, "-m", "tests.pool.manager_process", str(self.home), name]
+
+    def let_hours_pass(self, hours: float) -> None:
+        """Make the pool older than it is."""
+        identity = self.store.identity()
+        older = replace(identity, created_at=identity.created_at - hours * 3600)
+        write_identity(self.paths, older)
 
     def start_manager(self) -> subprocess.Popen[bytes]:
         """Start a manager; it need not get into office."""

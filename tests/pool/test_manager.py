@@ -121,6 +121,57 @@ def test_a_notice_is_answered_with_a_replacement_while_the_old_one_lives(scene: 
     assert after != lost_in
 
 
+def test_a_pool_ends_by_itself_when_its_hours_are_over(scene: Scene) -> None:
+    """Machines, client proxy and manager go; the folder says why; `up` gives the hours again."""
+    scene.write(replicas=2, max_hours=2)
+    scene.let_hours_pass(2)
+    scene.write(replicas=2, max_hours=2)  # `up` on a pool whose hours are over
+    scene.let_hours_pass(1.9)
+    process = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    scene.write(replicas=2, max_hours=0.0001)  # the file takes them away
+    assert process.wait(30) == 0
+    assert scene.running() == []
+    assert not disk.is_locked(scene.paths.proxy_lock)
+    status = scene.status()
+    assert status["ended"] == "by itself, after 0.0001 hours (`max_hours`)"
+    assert (status["replicas"], status["proxy_alive"]) == ([], False)
+    assert "`max_hours` is over" in {e["detail"] for e in status["events"]}
+    scene.write(replicas=2, max_hours=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2) and not scene.status()["ended"])
+    assert scene.running() == ["0.2", "1.2"]
+
+
+def test_hours_that_are_over_end_a_pool_that_had_no_manager(scene: Scene) -> None:
+    """Killed before the end, and started again after it: it launches nothing, and cleans up."""
+    scene.write(replicas=1, max_hours=2)
+    first = scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    scene.let_hours_pass(2)
+    assert scene.start_manager().wait(30) == 0
+    assert scene.running() == []
+    assert scene.cloud.launched() == ["0.1"]
+    assert not disk.is_locked(scene.paths.proxy_lock)
+
+
+def test_a_cloud_that_does_not_answer_does_not_end_the_ending(scene: Scene) -> None:
+    """Over, and the cloud is silent: the manager stays until it is certain that nothing runs."""
+    scene.write(replicas=1, max_hours=2)
+    process = scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    (scene.cloud.folder / "outage").touch()
+    scene.wait(lambda: not scene.status()["cloud_reachable"])
+    scene.let_hours_pass(2)
+    scene.wait(lambda: any("are over" in note for note in scene.status()["notes"]))
+    assert process.poll() is None
+    (scene.cloud.folder / "outage").unlink()
+    assert process.wait(30) == 0
+    assert scene.running() == []
+
+
 def test_unreachable_cloud_changes_nothing(scene: Scene) -> None:
     """While the cloud does not answer, status says so and keeps what was seen last."""
     scene.write(replicas=1)

@@ -25,7 +25,7 @@ def load(name):
 
 
 scene = load("scene")
-metres = st.floats(-2, 12)
+metres = st.floats(-2, 12).map(lambda metre: round(metre, 6))
 points = st.tuples(metres, metres)
 boxes = st.tuples(points, st.floats(0.1, 3), st.floats(0.1, 3)).map(
     lambda b: scene.Box(b[0][0], b[0][1], b[0][0] + b[1], b[0][1] + b[2])

@@ -33,6 +33,7 @@ fogft:
   replicas: 3
   max_surge: 0
   max_usd_per_hour: 1.5
+  max_hours: 12
   health:
     suspect_after_s: 3
     replace_after_s: 20.5
@@ -66,6 +67,7 @@ def test_a_whole_file():
         replicas=3,
         max_surge=0,
         max_usd_per_hour=1.5,
+        max_hours=12.0,
         health=HealthSpec(3.0, 20.5, 600.0, 60.0),
         task=task,
     )
@@ -82,8 +84,8 @@ MISTAKES = {
     "unknown key in fogft, like nothing": (
         pool("zzz: 3"),
         "pool.yaml:4: fogft.zzz: unknown key",
-        "known here: `health`, `max_surge`, `max_usd_per_hour`, `orphan_after_s`, `replicas`, "
-        "`services`",
+        "known here: `health`, `max_hours`, `max_surge`, `max_usd_per_hour`, `orphan_after_s`, "
+        "`replicas`, `services`",
     ),
     "unknown key in a service": (
         pool(services="\n    - name: /a\n      typ: a/srv/A"),
