@@ -37,8 +37,8 @@ class Hedging(Protocol):
     ) -> Sequence[int]:
         """Return whom an open request goes to now, of those that may be asked and are not."""
 
-    def declined(self, replica: int) -> None:
-        """A replica that was returned did not take the attempt."""
+    def declined(self, replica: int, *, full: bool) -> None:
+        """A replica that was returned was not asked: its window was full, or no need was left."""
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, now: float
@@ -48,11 +48,14 @@ class Hedging(Protocol):
     def failed(self, request: bytes, replica: int, now: float) -> None:
         """An attempt ended without an answer that counts."""
 
-    def late(self, request: bytes, replica: int, now: float) -> None:
-        """An answer came for a request that has ended."""
+    def awaits(self, request: bytes, replica: int) -> bool:
+        """Whether an answer shall come, though another one was first."""
 
-    def expired(self, open: Mapping[int, float], now: float) -> None:
-        """A request's deadline came while these worked on it."""
+    def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
+        """An attempt ended after its request had: with an answer, or without one."""
+
+    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
+        """A request's deadline came while these worked on it; they stop."""
 
     def report(self) -> dict[str, Any]:
         """Return what the policy has learned, for people."""
@@ -74,7 +77,7 @@ class All:
         """Return all of them: whoever works on the request may be frozen."""
         return candidates
 
-    def declined(self, replica: int) -> None:
+    def declined(self, replica: int, *, full: bool) -> None:
         """Learn nothing."""
 
     def answered(
@@ -88,10 +91,14 @@ class All:
     def failed(self, request: bytes, replica: int, now: float) -> None:
         """Learn nothing."""
 
-    def late(self, request: bytes, replica: int, now: float) -> None:
+    def awaits(self, request: bytes, replica: int) -> bool:
+        """Await nothing."""
+        return False
+
+    def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
         """Learn nothing."""
 
-    def expired(self, open: Mapping[int, float], now: float) -> None:
+    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
         """Learn nothing."""
 
     def report(self) -> dict[str, Any]:
@@ -141,7 +148,7 @@ class Failover(All):
         if replica == self._current:
             self._failed = True
 
-    def expired(self, open: Mapping[int, float], now: float) -> None:
+    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
         """Move on from a replica that let a deadline pass: its service may hang."""
         if self._current in open:
             self._failed = True

@@ -128,8 +128,7 @@ class Dispatcher:
                 self._declined(request, replica)
         if len(chosen) > 1 and request not in self._requests:
             # Answered before the last link had it: `answered` could not reach that one.
-            for replica in chosen:
-                links[replica].forget(request)
+            self._forget(request, chosen)
         if soon < self._next_look:
             self._wake()
 
@@ -137,7 +136,7 @@ class Dispatcher:
         with self._lock:
             self._outcomes.count["sent"] -= 1
             self._requests.declined(request, replica)
-            self._hedging.declined(replica)
+            self._hedging.declined(replica, full=True)
 
     def answered(self, link: Link, answer: Answer) -> None:
         """Take the end of an attempt from a link's thread."""
@@ -160,7 +159,7 @@ class Dispatcher:
         with self._lock:
             _, pending = self._requests.succeeded(request, now)
             if pending is None:
-                self._hedging.late(request, replica, now)
+                self._hedging.late(request, replica, now, answered=True)
             else:
                 losers = self._hedging.answered(request, pending.open, replica, now)
                 self._close(pending)
@@ -178,7 +177,7 @@ class Dispatcher:
     def _forget(self, request: bytes, replicas: Iterable[int]) -> None:
         for replica in replicas:
             link = self._links.get(replica)
-            if link is not None:
+            if link is not None and not self._hedging.awaits(request, replica):
                 link.forget(request)
 
     def _refused(self, replica: int, answer: Answer) -> None:
@@ -192,7 +191,10 @@ class Dispatcher:
                 counts=answer.refusal not in _BLAMELESS_REFUSALS,
                 bar=answer.refusal in _FINAL_REFUSALS,
             )
-            self._hedging.failed(answer.request_id, replica, now)
+            if verdict is Verdict.LATE:
+                self._hedging.late(answer.request_id, replica, now, answered=False)
+            else:
+                self._hedging.failed(answer.request_id, replica, now)
         if verdict is Verdict.IDLE:
             self._idle(answer.request_id)
 
@@ -200,7 +202,8 @@ class Dispatcher:
         with self._lock:
             self._outcomes.count["rejected"] += 1
             verdict = self._requests.rejected(request, replica, payload)
-            self._hedging.failed(request, replica, self._clock())
+            if verdict is not Verdict.LATE:
+                self._hedging.failed(request, replica, self._clock())
         if verdict is Verdict.IDLE:
             self._idle(request)
 
@@ -262,8 +265,8 @@ class Dispatcher:
         now = self._clock()
         with self._lock:
             expired = self._requests.expire(now)
-            for _, pending in expired:
-                self._hedging.expired(pending.open, now)
+            for request, pending in expired:
+                self._hedging.expired(request, pending.open, now)
                 self._close(pending)
         for request, pending in expired:
             self._expired(request, pending)
@@ -298,15 +301,15 @@ class Dispatcher:
             wanted = replica not in full
             pending = self._requests.attempt(request, replica, now) if wanted else None
             if pending is None:
-                self._hedging.declined(replica)
+                self._hedging.declined(replica, full=not wanted)
                 return
             self._outcomes.count["sent"] += 1
         remaining_s = pending.deadline - now
         if not link.offer(self.spec.name, request, pending.item.payload, remaining_s):
             full.add(replica)
             self._declined(request, replica)
-        elif request not in self._requests:
-            link.forget(request)  # it was answered meanwhile
+        elif request not in self._requests:  # it was answered meanwhile
+            self._forget(request, (replica,))
 
     def _expired(self, request: bytes, pending: Pending[_Request]) -> None:
         response = pending.rejection

@@ -45,7 +45,7 @@ def test_failover_leaves_a_replica_that_lets_a_deadline_pass():
     """Its service may hang while its server proxy goes on answering probes."""
     policy = Failover()
     policy.first(A, (1, 2), 0.0)
-    policy.expired({1: 0.0}, 5.0)
+    policy.expired(A, {1: 0.0}, 5.0)
     assert policy.first(A, (1, 2), 5.0) == (2,)
 
 

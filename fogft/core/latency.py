@@ -1,0 +1,100 @@
+"""How long answers take, as far as lately seen: quantiles of a decayed histogram. Pure.
+
+Buckets grow by 10 % from 0.1 ms to over a day, so a quantile is right to about 5 %. A sample
+weighs less the more samples, or the more time, came after it.
+
+An attempt that was told to stop has taken *at least* the time until then. It is counted as
+that time: a quantile at or below the time after which attempts are stopped is not moved by
+it, whereas leaving it out would make a slow replica look as fast as its fast answers.
+"""
+
+from __future__ import annotations
+
+import math
+
+_FIRST_S = 1e-4
+_GROWTH = 1.1
+_LOG_GROWTH = math.log(_GROWTH)
+_MIDDLE = _GROWTH**-0.5
+_BUCKETS = 220
+_RESCALE_AT = 1e100
+
+
+class Latencies:
+    """Recent latencies of one replica's answers to one service.
+
+    Args:
+        half_life: After so many samples one weighs half.
+        half_life_s: After so much time one weighs half, in seconds.
+    """
+
+    def __init__(self, half_life: float = 200.0, half_life_s: float = 60.0) -> None:
+        self._per_sample = 2.0 ** (1.0 / half_life)
+        self._half_life_s = half_life_s
+        self._weights = [0.0] * _BUCKETS
+        self._weight = 1.0  # of the next sample: grows, instead of all others shrinking
+        self._total = 0.0
+        self._sum = 0.0
+        self._newest: float | None = None
+        self._cached: dict[float, tuple[float, float]] = {}
+        self.samples = 0
+
+    def add(self, took_s: float, now: float) -> None:
+        """Count a latency, in seconds."""
+        if self._newest is not None and now > self._newest:
+            self._weight *= 2.0 ** min((now - self._newest) / self._half_life_s, 60.0)
+        self._newest = now
+        self._weight *= self._per_sample
+        if self._weight > _RESCALE_AT:
+            self._rescale()
+        self._weights[_bucket(took_s)] += self._weight
+        self._total += self._weight
+        self._sum += self._weight * took_s
+        self.samples += 1
+        self._cached.clear()
+
+    def _rescale(self) -> None:
+        scale = 1.0 / self._weight
+        self._weights = [weight * scale for weight in self._weights]
+        self._total *= scale
+        self._sum *= scale
+        self._weight = 1.0
+
+    def quantile_s(self, share: float) -> float | None:
+        """Return the time within which this share of answers came; None before the first."""
+        return self._found(share)[0] if self.samples else None
+
+    def mean_below_s(self, share: float) -> float | None:
+        """Return the mean of this share of answers, the fastest; None before the first."""
+        return self._found(share)[1] if self.samples else None
+
+    def _found(self, share: float) -> tuple[float, float]:
+        found = self._cached.get(share)
+        if found is None:
+            found = self._cached[share] = self._scan(share)
+        return found
+
+    def _scan(self, share: float) -> tuple[float, float]:
+        """Return a quantile and the mean below it. From the top: interesting ones are high."""
+        above = (1.0 - share) * self._total
+        sum_below, quantile_s = self._sum, _FIRST_S
+        for bucket in range(_BUCKETS - 1, -1, -1):
+            weight = self._weights[bucket]
+            if not weight:
+                continue
+            upper_s = _FIRST_S * _GROWTH**bucket
+            if weight > above:
+                inside = above / weight  # as if its samples lay evenly in the bucket
+                quantile_s = upper_s * _GROWTH**-inside
+                sum_below -= above * upper_s
+                break
+            above -= weight
+            sum_below -= weight * upper_s * _MIDDLE
+        return quantile_s, max(_FIRST_S, sum_below / (share * self._total))
+
+
+def _bucket(took_s: float) -> int:
+    """Return the bucket whose upper end is the first that is not below a latency."""
+    if took_s <= _FIRST_S:
+        return 0
+    return min(_BUCKETS - 1, math.ceil(math.log(took_s / _FIRST_S) / _LOG_GROWTH))
