@@ -141,7 +141,11 @@ class Adaptive:
         known = self._of(replica)
         expected_s = known.expected_s()
         # An unknown one: the more it was given already, the less it is tried.
-        return known.doubted, float(known.open) * 1e-9 if expected_s is None else expected_s, replica
+        return (
+            known.doubted,
+            float(known.open) * 1e-9 if expected_s is None else expected_s,
+            replica,
+        )
 
     def _stale(self, able: Sequence[int], best: int, now: float) -> int | None:
         """Return the replica whose probing copy is longest due, if one is."""
@@ -174,8 +178,7 @@ class Adaptive:
         known.asked_at = now
 
     def _look(self, at: float) -> None:
-        if at < self.look_at:
-            self.look_at = at
+        self.look_at = min(self.look_at, at)
 
     # -- what became of them --------------------------------------------------------------
 

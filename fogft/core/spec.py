@@ -17,6 +17,14 @@ class OnTimeout(str, Enum):
     EMPTY = "empty"  # a default-constructed response, as in the paper
 
 
+class HedgingMode(str, Enum):
+    """How many replicas a request is sent to."""
+
+    ALL = "all"  # every one, at once
+    ADAPTIVE = "adaptive"  # the best; the next when that takes unusually long
+    FAILOVER = "failover"  # one; another when that fails
+
+
 @dataclass(frozen=True)
 class ServiceSpec:
     """One proxied service.
@@ -25,6 +33,7 @@ class ServiceSpec:
         timeout_s: From the request's arrival at the client proxy to its deadline.
         ok_field: Name of a boolean response field that must be true while another
             attempt is left; empty for none.
+        hedging_budget: Extra copies under `adaptive`, as a share of requests.
     """
 
     name: str
@@ -32,6 +41,8 @@ class ServiceSpec:
     timeout_s: float = 10.0
     on_timeout: OnTimeout = OnTimeout.SILENT
     ok_field: str = ""
+    hedging: HedgingMode = HedgingMode.ALL
+    hedging_budget: float = 0.1
 
 
 @dataclass(frozen=True)

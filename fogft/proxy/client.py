@@ -89,8 +89,8 @@ class ClientProxy:
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
         """Proxy these services and no others. Unchanged ones go on undisturbed.
 
-        A service whose policy changed keeps its ROS server; requests under way end under
-        the policy they began with.
+        A service whose policy changed keeps its ROS server and the requests under way, with
+        their deadlines.
         """
         with self._lock:
             wanted = {spec.name: spec for spec in specs}
@@ -102,7 +102,8 @@ class ClientProxy:
             for spec in wanted.values():
                 old = self._services.get(spec.name)
                 if old is not None and old.spec.type == spec.type:
-                    old.dispatcher.spec = old.spec = spec
+                    old.spec = spec
+                    old.dispatcher.adopt(spec)
                     continue
                 if old is not None and old.server is not None:
                     old.server.close()

@@ -21,12 +21,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from fogft.core.adaptive import Adaptive
 from fogft.core.errors import RosError
 from fogft.core.first_response import FirstResponse, Pending, Verdict
-from fogft.core.hedging import NEVER, All, Hedging
+from fogft.core.hedging import NEVER, All, Failover, Hedging
 from fogft.core.model import ReplicaId
 from fogft.core.names import REQUEST_ID_BYTES
-from fogft.core.spec import OnTimeout, ServiceSpec
+from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
 from fogft.proxy.outcomes import Outcomes
 from fogft.wire.port import Answer, Link, Refusal
 
@@ -86,7 +87,7 @@ class Dispatcher:
         self._pending_bytes = 0
         self._lock = threading.Lock()
         self._requests: FirstResponse[_Request] = FirstResponse()
-        self._hedging: Hedging = All()
+        self._hedging = _policy(spec)
         self._next_look = NEVER  # when the policy wants to be asked, as the last tick said
         self._links: dict[int, Link] = {}
         self._able: tuple[int, ...] = ()
@@ -202,7 +203,9 @@ class Dispatcher:
         with self._lock:
             self._outcomes.count["rejected"] += 1
             verdict = self._requests.rejected(request, replica, payload)
-            if verdict is not Verdict.LATE:
+            if verdict is Verdict.LATE:
+                self._hedging.late(request, replica, self._clock(), answered=True)
+            else:
                 self._hedging.failed(request, replica, self._clock())
         if verdict is Verdict.IDLE:
             self._idle(request)
@@ -243,7 +246,17 @@ class Dispatcher:
     def _close(self, pending: Pending[_Request]) -> None:
         self._pending_bytes -= len(pending.item.payload)
 
-    # -- links and time -------------------------------------------------------------------
+    # -- policy, links and time -------------------------------------------------------------------
+
+    def adopt(self, spec: ServiceSpec) -> None:
+        """Follow another policy from now on; requests under way keep their deadlines."""
+        with self._lock:
+            old, self.spec = self.spec, spec
+            if (old.hedging, old.hedging_budget) != (spec.hedging, spec.hedging_budget):
+                self._hedging = _policy(spec)
+                self._requests.reconsider()
+                log.info("hedging_changed service=%s to=%s", spec.name, spec.hedging.value)
+        self._wake()
 
     def route(self, links: Sequence[Link]) -> None:
         """Set the links that can answer this service now, and offer them what they lack."""
@@ -344,6 +357,12 @@ class Dispatcher:
                 "pending_bytes": self._pending_bytes,
                 "hedging": self._hedging.report(),
             }
+
+
+def _policy(spec: ServiceSpec) -> Hedging:
+    if spec.hedging is HedgingMode.ADAPTIVE:
+        return Adaptive(spec.hedging_budget)
+    return Failover() if spec.hedging is HedgingMode.FAILOVER else All()
 
 
 def key_of(link: Link) -> int:
