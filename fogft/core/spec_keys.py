@@ -16,7 +16,10 @@ FOGFT_KEYS = (
     "health",
     "orphan_after_s",
 )
-SERVICE_KEYS = ("name", "type", "timeout_s", "on_timeout", "ok_field")
+SERVICE_KEYS = (
+    *("name", "type", "timeout_s", "on_timeout", "ok_field"),
+    *("hedging", "hedging_budget"),
+)
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
 # The task schema of SkyPilot 0.14.1, without the keys that it keeps for itself.
 TASK_KEYS = (
@@ -48,7 +51,6 @@ LATER_KEYS = {
     "topology": "remove it; every replica is linked to the robot directly",
     "on_demand": "remove it, or set `resources.use_spot: false` for on-demand machines only",
     "schedule": "remove it, and use `fogft scale` or `fogft down` from a timer",
-    "hedging": "remove it; every request goes to all replicas at once",
     "state": "remove it; the services must be stateless",
     "quorum": "remove it; the first successful response is returned",
 }
@@ -58,7 +60,7 @@ def places(here: tuple[str, ...]) -> dict[str, str]:
     """Say of every key that is not at home here where it is."""
     homes = (
         (HEALTH_KEYS, "under `fogft.health`"),
-        (("timeout_s", "on_timeout", "ok_field"), "in a service, under `fogft.services`"),
+        (SERVICE_KEYS[2:], "in a service, under `fogft.services`"),
         (FOGFT_KEYS, "under `fogft`"),
         (("run", "setup", "resources", "workdir", "envs"), "at the top level of the file"),
     )

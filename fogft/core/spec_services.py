@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fogft.core import ros_names
-from fogft.core.spec import ServiceSpec
+from fogft.core.spec import HedgingMode, ServiceSpec
 from fogft.core.spec_keys import DAY_S, LATER_KEYS, SERVICE_KEYS, places
 from fogft.core.spec_tree import Section, shown
 
@@ -49,7 +49,23 @@ def _service(section: Section) -> ServiceSpec:
         timeout_s=section.number("timeout_s", DAY_S, "seconds", ServiceSpec.timeout_s),
         on_timeout=section.choice("on_timeout", ServiceSpec.on_timeout),
         ok_field=ok_field,
+        hedging=section.choice("hedging", ServiceSpec.hedging),
+        hedging_budget=_hedging_budget(section),
     )
+
+
+def _hedging_budget(section: Section) -> float:
+    budget = section.number(
+        "hedging_budget", 1, "extra copies for each request", ServiceSpec.hedging_budget
+    )
+    adaptive = section.choice("hedging", ServiceSpec.hedging) is HedgingMode.ADAPTIVE
+    if "hedging_budget" in section.children and not adaptive:
+        raise section.error(
+            "hedging_budget",
+            "has no meaning here: only `hedging: adaptive` sends extra copies by a budget",
+            "write `hedging: adaptive`, or remove it",
+        )
+    return budget
 
 
 def _type(section: Section) -> str:

@@ -20,6 +20,7 @@ from fogft.core import holders, names
 from fogft.core.errors import CredentialError
 from fogft.core.model import ReplicaId
 from fogft.core.planner import PlannedLaunch
+from fogft.core.service_form import REPLICA_KEYS, to_plain
 from fogft.core.spec import PoolSpec
 from fogft.pool import credentials, templates
 from fogft.pool.paths import PoolPaths
@@ -55,16 +56,7 @@ def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> 
             "ca": f"{paths.credentials.name}/ca.crt",
             "certificate": f"{paths.credentials.name}/robot.crt",
             "key": f"{paths.credentials.name}/robot.key",
-            "services": [
-                {
-                    "name": service.name,
-                    "type": service.type,
-                    "timeout_s": service.timeout_s,
-                    "on_timeout": service.on_timeout.value,
-                    "ok_field": service.ok_field,
-                }
-                for service in spec.services
-            ],
+            "services": [to_plain(service) for service in spec.services],
             "suspect_after_s": spec.health.suspect_after_s,
         },
     )
@@ -135,7 +127,7 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "pool_uid": identity.uid,
             "slot": id.slot,
             "generation": id.generation,
-            "services": [{"name": s.name, "type": s.type} for s in spec.services],
+            "services": [to_plain(service, REPLICA_KEYS) for service in spec.services],
             "run": str(spec.task.get("run") or ""),
             "envs": {str(k): "" if v is None else str(v) for k, v in envs.items()},
             "orphan_after_s": spec.health.orphan_after_s,

@@ -15,8 +15,9 @@ from fogft.cloud.notice import SOURCES as NOTICE_SOURCES
 from fogft.core import names
 from fogft.core.errors import StateError
 from fogft.core.model import ReplicaId
-from fogft.core.spec import OnTimeout, ServiceSpec
-from fogft.wire.frame import REMAINING_LIMIT_S, ROBOT_BYTES_LIMIT
+from fogft.core.service_form import from_plain, seconds
+from fogft.core.spec import ServiceSpec
+from fogft.wire.frame import ROBOT_BYTES_LIMIT
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,8 @@ def read_client(path: Path) -> ClientProxyConfig:
             lease=base / raw["lease"],
             lock=base / raw["lock"],
             credentials=_credentials(raw["credentials"], base),
-            services=tuple(_service(s) for s in raw["services"]),
-            suspect_after_s=_seconds((raw.get("health") or {}).get("suspect_after_s") or 2.0),
+            services=tuple(from_plain(s) for s in raw["services"]),
+            suspect_after_s=seconds((raw.get("health") or {}).get("suspect_after_s") or 2.0),
             domain_id=_optional_int(raw.get("domain_id")),
         )
     raise AssertionError("unreachable")
@@ -104,13 +105,13 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
             pool=str(raw["pool"]),
             id=ReplicaId(_uid(raw["pool_uid"]), int(raw["slot"]), int(raw["generation"])),
             listen=str(raw.get("listen") or "0.0.0.0:7447"),
-            services=tuple(_service(s) for s in raw["services"]),
+            services=tuple(from_plain(s) for s in raw["services"]),
             run=str(raw["run"]),
             workdir=base / (raw.get("workdir") or "."),
             credentials=_credentials(raw["credentials"], base),
             envs={str(k): str(v) for k, v in (raw.get("envs") or {}).items()},
             domain_id=_optional_int(raw.get("domain_id")),
-            orphan_after_s=_seconds(raw.get("orphan_after_s") or 3600.0),
+            orphan_after_s=seconds(raw.get("orphan_after_s") or 3600.0),
             notice=_notice(raw.get("notice"), base),
             max_in_flight=int(raw.get("max_in_flight") or 512),
             log_level=str(raw.get("log_level") or "info"),
@@ -145,23 +146,6 @@ class _Reading:
 
 def _credentials(raw: Mapping[str, str], base: Path) -> CredentialFiles:
     return CredentialFiles(base / raw["ca"], base / raw["certificate"], base / raw["key"])
-
-
-def _service(raw: Mapping[str, Any]) -> ServiceSpec:
-    return ServiceSpec(
-        name=str(raw["name"]),
-        type=str(raw["type"]),
-        timeout_s=_seconds(raw.get("timeout_s") or 10.0),
-        on_timeout=OnTimeout(raw.get("on_timeout") or "silent"),
-        ok_field=str(raw.get("ok_field") or ""),
-    )
-
-
-def _seconds(raw: Any) -> float:
-    seconds = float(raw)
-    if not 0 < seconds <= REMAINING_LIMIT_S:  # false for NaN too
-        raise ValueError(f"{raw!r:.40} is not a time in seconds")
-    return seconds
 
 
 def _uid(raw: Any) -> str:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fogft.core.names import REQUEST_ID_BYTES
+from fogft.core.service_form import LONGEST_S
 from fogft.wire.port import Probe, ProbeAnswer
 
 VERSION = 1
@@ -23,7 +24,7 @@ REASON_LIMIT = 64
 PROBE_LIMIT = 1024
 PROBE_ANSWER_LIMIT = 65536
 DETAIL_LIMIT = 500
-REMAINING_LIMIT_S = 1e7
+REMAINING_LIMIT_S = LONGEST_S
 
 _REQUEST = struct.Struct(f">B{REQUEST_ID_BYTES}sd")
 _ANSWER = struct.Struct(f">B{REQUEST_ID_BYTES}s")

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from fogft.core import ros_names
 from fogft.core.errors import SpecError
 from fogft.core.names import POOL_NAME_PATTERN
-from fogft.core.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
+from fogft.core.service_form import to_plain
+from fogft.core.spec import HealthSpec, HedgingMode, OnTimeout, PoolSpec, ServiceSpec
 from fogft.core.spec_keys import LATER_KEYS, TASK_KEYS
 from fogft.core.spec_reader import pool_spec
 from fogft.core.spec_tree import Node, plain, shown
@@ -62,6 +63,7 @@ services = st.lists(
         timeout_s=st.floats(0.001, 86_400),
         on_timeout=st.sampled_from(OnTimeout),
         ok_field=st.sampled_from(["", "success", "ok_2"]),
+        hedging=st.sampled_from(HedgingMode),
     ),
     min_size=1,
     max_size=4,
@@ -89,16 +91,7 @@ specs = st.builds(
 def test_what_was_written_is_what_is_read(spec, task):
     """Every spec can be written as a file, and reads back as itself; the task is untouched."""
     ours = {
-        "services": [
-            {
-                "name": s.name,
-                "type": s.type,
-                "timeout_s": s.timeout_s,
-                "on_timeout": s.on_timeout.value,
-                **({"ok_field": s.ok_field} if s.ok_field else {}),
-            }
-            for s in spec.services
-        ],
+        "services": [to_plain(s) for s in spec.services],
         "replicas": spec.replicas,
         "max_surge": spec.max_surge,
         "health": {

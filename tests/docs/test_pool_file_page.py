@@ -62,6 +62,8 @@ def test_defaults_are_the_codes():
         "`orphan_after_s`": f"{HealthSpec.orphan_after_s:g}",
         "`timeout_s`": f"{ServiceSpec.timeout_s:g}",
         "`on_timeout`": f"`{ServiceSpec.on_timeout.value}`",
+        "`hedging`": f"`{ServiceSpec.hedging.value}`",
+        "`hedging_budget`": f"{ServiceSpec.hedging_budget:g}",
         "`suspect_after_s`": f"{HealthSpec.suspect_after_s:g}",
         "`replace_after_s`": f"{HealthSpec.replace_after_s:g}",
         "`start_limit_s`": f"{HealthSpec.start_limit_s:g}",

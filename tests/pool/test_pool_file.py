@@ -361,6 +361,23 @@ MISTAKES = {
         "pool.yaml:3: fogft.services[0].on_timeout: must be `silent` or `empty`, not `emty`",
         "did you mean `empty`?",
     ),
+    "unknown hedging": (
+        pool(services="[{name: a, type: a/srv/A, hedging: adaptiv}]"),
+        "pool.yaml:3: fogft.services[0].hedging: must be `all` or `adaptive` or `failover`, "
+        "not `adaptiv`",
+        "did you mean `adaptive`?",
+    ),
+    "budget without hedging": (
+        pool(services="[{name: a, type: a/srv/A, hedging_budget: 0.2}]"),
+        "pool.yaml:3: fogft.services[0].hedging_budget: has no meaning here: only "
+        "`hedging: adaptive` sends extra copies by a budget",
+        "write `hedging: adaptive`, or remove it",
+    ),
+    "hedging for the whole pool": (
+        pool("hedging: adaptive"),
+        "pool.yaml:4: fogft.hedging: unknown key",
+        "`hedging` belongs in a service, under `fogft.services`",
+    ),
     "bad name of the pool": (
         pool(top="name: My Pool"),
         "pool.yaml:1: name: `My Pool` is not a pool name",

@@ -1,0 +1,68 @@
+"""A service's policy as plain values and back, for the proxies' configuration files. Pure.
+
+Only what differs from the default is written, so that a configuration stays short and one
+written by an older manager means what it meant.
+
+Owns: the keys of a service in `proxy.yaml` and `replica.yaml`, which are the pool file's.
+Not here: judging a pool file (`spec_services`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
+
+LONGEST_S = 1e7  # what a request's header can carry
+# What a replica must know; the rest is the robot's.
+REPLICA_KEYS = ("name", "type")
+_ALWAYS = ("name", "type", "timeout_s")
+
+
+def to_plain(service: ServiceSpec, keys: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return what a configuration file says of a service; only `keys`, where some are given."""
+    written = {}
+    for field in fields(ServiceSpec):
+        value = getattr(service, field.name)
+        if keys and field.name not in keys:
+            continue
+        if value != field.default or field.name in _ALWAYS:
+            written[field.name] = getattr(value, "value", value)
+    return written
+
+
+def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
+    """Return the service of a configuration file.
+
+    Raises:
+        KeyError: Name or type are missing.
+        ValueError: A value is out of range or unknown.
+        TypeError: A value is of the wrong type.
+    """
+    return ServiceSpec(
+        name=str(raw["name"]),
+        type=str(raw["type"]),
+        timeout_s=seconds(raw.get("timeout_s") or ServiceSpec.timeout_s),
+        on_timeout=OnTimeout(raw.get("on_timeout") or ServiceSpec.on_timeout),
+        ok_field=str(raw.get("ok_field") or ""),
+        hedging=HedgingMode(raw.get("hedging") or ServiceSpec.hedging),
+        hedging_budget=_share(raw.get("hedging_budget") or ServiceSpec.hedging_budget),
+    )
+
+
+def seconds(raw: Any) -> float:
+    """Return a duration above 0. Raises ValueError or TypeError."""
+    value = float(raw)
+    if not 0 < value <= LONGEST_S:  # false for NaN too
+        raise ValueError(f"{raw!r:.40} is not a time in seconds")
+    return value
+
+
+def _share(raw: Any) -> float:
+    value = float(raw)
+    if not (0 < value <= 1 and math.isfinite(value)):
+        raise ValueError(f"{raw!r:.40} is not a share above 0 and at most 1")
+    return value
