@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fogft import disk
+from fogft import disk, logfile
 from fogft.app.clouds import cloud_of, make_store, pools
 from fogft.pool.paths import PoolPaths, home
 
@@ -75,9 +75,7 @@ def logs(pool: str, slot: int | None = None) -> list[tuple[str, Path]]:
 
 def tail(path: Path, lines: int = 8) -> str:
     """Return the last lines of a log; empty where there is none."""
-    from fogft.pool import process_control
-
-    return process_control.log_tail(path, lines)
+    return logfile.tail(path, lines=lines)
 
 
 def doctor(file: Path | None = None) -> Iterator[Finding]:

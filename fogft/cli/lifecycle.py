@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 DEFAULT_FILE = Path("pool.yaml")
 LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
+HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
 
 
 def register(app: typer.Typer) -> None:
@@ -106,14 +107,18 @@ def up(
     name = order.spec.name
     wanted = {service.name for service in order.spec.services}
     try:
-        seen, answers = progress.wait(
-            lambda: managed(name), lambda seen: is_answering(seen, wanted, applied_at), limit_s
+        seen, _ = progress.wait(
+            lambda: managed(name),
+            lambda seen: is_answering(seen, wanted, applied_at) or keeps_ending(seen),
+            limit_s,
         )
     except KeyboardInterrupt:
         output.say(f"interrupted: `{name}` goes on starting; `fogft down {name}` ends it")
         raise typer.Exit(130) from None
-    if not answers:
-        raise not_answering(seen, limit_s)
+    if keeps_ending(seen):
+        raise not_answering(seen, "does not answer: `run` ends again and again")
+    if not is_answering(seen, wanted, applied_at):
+        raise not_answering(seen, f"does not answer after {limit_s:.0f} s")
     status = seen.status
     missing = max(0, status.target - status.ready)
     rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
@@ -160,14 +165,22 @@ def is_answering(seen: Seen, services: set[str], since: float) -> bool:
     )
 
 
-def not_answering(seen: Seen, timeout_s: float) -> FogftError:
-    """Return the error of a start that took too long, with all that is known of the reason."""
+def keeps_ending(seen: Seen) -> bool:
+    """Whether `run` has ended so often on every replica that waiting longer is no use."""
+    replicas = seen.status.replicas
+    return bool(replicas) and not any(
+        replica.phase == "ready" or replica.restarts < HOPELESS_RESTARTS for replica in replicas
+    )
+
+
+def not_answering(seen: Seen, what: str) -> FogftError:
+    """Return the error of a start that came to nothing, with all that is known of the reason."""
     from fogft import app
 
     status = seen.status
     silent = [service.name for service in status.services if not service.ready_replicas]
     listed = ", ".join(f"`{name}`" for name in silent) or "the client proxy"
-    lines = [f"{listed} of `{status.pool}` does not answer after {timeout_s:.0f} s"]
+    lines = [f"{listed} of `{status.pool}` {what}"]
     lines += [f"  {note}" for note in status.notes]
     lines += [f"  replica {r.slot}.{r.generation}: {r.detail}" for r in status.replicas if r.detail]
     logs = app.logs(status.pool)

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fogft import disk
+from fogft import disk, logfile
 from fogft.cloud.port import Cloud
 from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
@@ -103,6 +103,8 @@ class Manager:
             Whether the pool has ended by itself: there is nothing left to manage.
         """
         self._trouble = []
+        for path in (self._paths.manager_log, self._paths.proxy_log):
+            logfile.bound(path)
         self._attempt(self._keep_proxy)
         tick = self._attempt_tick()
         if tick is None:

@@ -73,11 +73,3 @@ def end_holder(lock: Path, *, suspected_pid: int | None, patience_s: float = 10.
         if not disk.is_locked(lock):
             break
     return pid
-
-
-def log_tail(log: Path, lines: int = 5) -> str:
-    """Return the last lines of a log, for an error message."""
-    try:
-        return "\n".join(log.read_text(errors="replace").splitlines()[-lines:])
-    except OSError:
-        return ""

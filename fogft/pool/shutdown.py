@@ -19,7 +19,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.cloud.port import Cloud
-from fogft.core.errors import CloudError, FogftError, StateError
+from fogft.core.errors import CloudError, FogftError, PoolNotFound, StateError
 from fogft.core.intent import Intent
 from fogft.core.model import Machine
 from fogft.pool import lease, process_control, proxy_report
@@ -58,7 +58,10 @@ def end(
         told(what)
 
     with disk.locked(paths.intent_lock):
-        identity = store.identity()  # another `down` may have been faster
+        try:
+            identity = store.identity()
+        except PoolNotFound:
+            return ended  # another `down` was faster
         _end_process(done, "manager", paths.manager_lock, lease.read_pid(paths))
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fogft import disk
+from fogft import disk, logfile
 from fogft.core import intent as intents
 from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound, SpecError
@@ -129,6 +129,6 @@ def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None =
             break
         time.sleep(process_control.POLL_S)
     raise FogftError(
-        f"the manager of `{name}` did not start:\n{process_control.log_tail(paths.manager_log)}",
+        f"the manager of `{name}` did not start:\n{logfile.tail(paths.manager_log)}",
         f"its log is `{paths.manager_log}`; `fogft doctor` may know more",
     )

@@ -108,6 +108,26 @@ def test_it_gives_up_with_the_reason_and_says_what_still_runs(home, file, looks,
     )
 
 
+def test_it_gives_up_at_once_when_run_keeps_ending(home, file, looks, capsys):
+    lay_down(home)
+    silent = replace(UP.services[0], ready_replicas=0)
+    detail = "`run` ended (exit status 1) and is started again"
+    hopeless = replace(STARTING, restarts=4, detail=detail)
+    looks(replace(UP, services=(silent,), replicas=(hopeless,)))
+    assert main.run(["up", str(file), "--timeout", "1000"]) == 1
+    said = capsys.readouterr().err
+    assert "error: `/plan` of `planner` does not answer: `run` ends again and again\n" in said
+    assert f"  replica 0.1: {detail}\n" in said
+
+
+def test_one_replica_that_still_starts_is_worth_waiting_for(file, looks, capsys):
+    silent = replace(UP.services[0], ready_replicas=0)
+    hopeless = replace(STARTING, restarts=9)
+    waiting = replace(STARTING, slot=1)
+    looks(replace(UP, services=(silent,), replicas=(hopeless, waiting)), UP)
+    assert main.run(["up", str(file)]) == 0
+
+
 def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, capsys):
     lay_down(home).manager_log.write_text("its last words\n")
     looks(Seen(STATUS, 0.1, False))

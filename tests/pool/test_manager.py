@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from fogft import disk
+from fogft import disk, logfile
 from fogft.core import intent as intents
 from fogft.core.errors import PoolBusy
 from fogft.pool import startup
@@ -214,3 +214,14 @@ def test_start_manager_starts_one_only_where_there_is_none(scene: Scene) -> None
     scene.wait(lambda: scene.whole(1))
     assert not startup.start_manager(scene.store, scene.command)
     assert [what.split(" ")[0] for what in scene.end()] == ["manager", "client", "replica"]
+
+
+def test_logs_of_the_pool_stay_bounded(scene: Scene) -> None:
+    """The manager shortens its own log and the client proxy's."""
+    scene.write(replicas=1)
+    logs = (scene.paths.manager_log, scene.paths.proxy_log)
+    for log in logs:
+        log.touch()
+        os.truncate(log, logfile.LIMIT_BYTES + 1)
+    scene.start_manager()
+    scene.wait(lambda: all(log.stat().st_size <= logfile.LIMIT_BYTES for log in logs))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -65,3 +67,23 @@ def test_down_can_be_repeated_after_an_outage(scene: Scene) -> None:
     assert not disk.is_locked(scene.paths.manager_lock)
     (scene.cloud.folder / "outage").unlink()
     assert scene.end() == ["replica 0.1 (folder/one/a)"]
+
+
+def test_of_two_at_once_one_ends_the_pool_and_neither_complains(scene: Scene) -> None:
+    """The slower one finds nothing left to do."""
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    inode = scene.paths.intent_lock.stat().st_ino
+
+    def waiting() -> int:
+        lines = Path("/proc/locks").read_text().splitlines()
+        return sum("->" in line and f":{inode} " in line for line in lines)
+
+    with ThreadPoolExecutor(2) as threads:
+        with disk.locked(scene.paths.intent_lock):
+            downs = [threads.submit(scene.end) for _ in range(2)]
+            scene.wait(lambda: waiting() == 2)
+        ended = sorted(len(down.result()) for down in downs)
+    assert ended[0] == 0
+    assert ended[1] >= 3

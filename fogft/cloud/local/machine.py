@@ -20,8 +20,8 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from fogft import child, disk
-from fogft.cloud.local import faults, guard, machine_log, processes, task_commands
+from fogft import child, disk, logfile
+from fogft.cloud.local import faults, guard, processes, task_commands
 from fogft.cloud.local import folder as folders
 from fogft.cloud.local.ending import sweep_shared_memory
 from fogft.cloud.local.folder import MachineFolder, Record, State
@@ -149,14 +149,14 @@ class Machine:
         self._wait(lambda: turn.acquire(wait=False))
         self._say(State(MachinePhase.PROVISIONING, progress="setup"))
         log.info("setup_started command=%r", command)
-        begin = machine_log.size(self._folder.log)
+        begin = logfile.size(self._folder.log)
         environ = task_commands.environment(self._record.task)
         pid = self._spawn(["bash", "-c", str(command)], workdir, environ)
         self._wait(lambda: pid in self._statuses)
         turn.release()
         code = self._statuses.pop(pid)
         if code:
-            tail = machine_log.tail(self._folder.log, begin)
+            tail = logfile.tail(self._folder.log, begin)
             raise _Failed(f"setup: {_in_words(code)}\n{tail}".rstrip())
         log.info("setup_done")
 
@@ -167,7 +167,7 @@ class Machine:
         port = reserve_port()
         if domain is None or port is None:
             raise _Failed(f"error: no {'ROS domain' if domain is None else 'port'} is free here")
-        begin = machine_log.size(self._folder.log)
+        begin = logfile.size(self._folder.log)
         pid = self._start_server(workdir, domain, port)
         endpoint = f"127.0.0.1:{port.number}"
         if self._record.relay:
@@ -184,7 +184,7 @@ class Machine:
         self._wait(lambda: pid in self._statuses)
         code = self._statuses.pop(pid)
         if code > 0 and self._relay is not None and not self._relay.reached:
-            tail = machine_log.tail(self._folder.log, begin)
+            tail = logfile.tail(self._folder.log, begin)
             raise _Failed(f"error: serve {_in_words(code)}\n{tail}".rstrip())
         raise _Ended(f"serve {_in_words(code)}")
 
@@ -249,7 +249,7 @@ class Machine:
         self._look_at_link()
         if now >= self._log_checked + 5:
             self._log_checked = now
-            machine_log.bound(self._folder.log)
+            logfile.bound(self._folder.log)
 
     def _reap(self) -> None:
         """Collect every child that ended, orphans that we inherited included."""

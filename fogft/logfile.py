@@ -1,4 +1,4 @@
-"""The log of a machine: all output of it and of what runs on it, in one file that is bounded."""
+"""Log files: all output of a process and its children, in one file that is bounded."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ def size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def tail(path: Path, begin: int = 0) -> str:
-    """Return the last lines that were written to a log since it had a size."""
+def tail(path: Path, begin: int = 0, lines: int = TAIL_LINES) -> str:
+    """Return the last lines that were written to a log since it had a size; empty without one."""
     try:
         with path.open("rb") as file:
             file.seek(max(begin, size(path) - _TAIL_BYTES))
-            lines = file.read().decode(errors="replace").splitlines()
+            found = file.read().decode(errors="replace").splitlines()
     except OSError:
         return ""
-    return "\n".join(lines[-TAIL_LINES:])
+    return "\n".join(found[-lines:])
 
 
 def bound(path: Path, limit_bytes: int = LIMIT_BYTES, kept_bytes: int = KEPT_BYTES) -> None:
