@@ -14,7 +14,7 @@ from fogft.cli import complete, output
 from fogft.cli.complete import PoolOption
 from fogft.cli.sections import Command
 
-Count = Annotated[int, typer.Argument(min=1, metavar="N", help="How many.")]
+Count = Annotated[int, typer.Argument(min=1, max=16, metavar="N", help="How many.")]
 
 
 def register(app: typer.Typer) -> None:

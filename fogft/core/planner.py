@@ -279,11 +279,13 @@ class _Buyer:
 
     def _make_room(self, need: Need, cap: float) -> None:
         """Under a cap, a silent machine that blocks its own replacement goes first."""
+        left = cap - self._spent + sum(self._price(s) for s in self.census.ending)
+        if self._choose(need, left).offer is not None:
+            return  # what is being ended already makes room enough
         for standing in self.census.lost:
             if standing.verdict is not Verdict.UNRESPONSIVE:
                 continue
-            freed = self._price(standing)
-            if self._choose(need, cap - self._spent + freed).offer is not None:
+            if self._choose(need, left + self._price(standing)).offer is not None:
                 self.sacrificed.append((standing, f"{standing.why}, and the budget has no room"))
                 return
 
