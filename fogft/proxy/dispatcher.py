@@ -39,7 +39,9 @@ Respond = Callable[[Any, bytes], None]
 # again would run it twice (FORGOTTEN) or cannot end otherwise.
 _FINAL_REFUSALS = frozenset({Refusal.FORGOTTEN, Refusal.MALFORMED, Refusal.EXPIRED})
 # The replica never began, or may never have seen it: no sign against the request itself.
-_BLAMELESS_REFUSALS = frozenset({Refusal.LOST, Refusal.NOT_READY, Refusal.OVERLOADED})
+_BLAMELESS_REFUSALS = frozenset(
+    {Refusal.LOST, Refusal.NOT_READY, Refusal.OVERLOADED, Refusal.NOT_ADMITTED, Refusal.REVOKED}
+)
 
 
 class _Request:

@@ -26,8 +26,12 @@ PROBE_ANSWER_LIMIT = 65536
 DETAIL_LIMIT = 500
 REMAINING_LIMIT_S = LONGEST_S
 
+GREETING_LIMIT = 4096
+
 _REQUEST = struct.Struct(f">B{REQUEST_ID_BYTES}sd")
 _ANSWER = struct.Struct(f">B{REQUEST_ID_BYTES}s")
+_TOKEN = struct.Struct(f">B{TOKEN_BYTES}s")
+_GREETING = struct.Struct(f">B{TOKEN_BYTES}sH")
 _ORIGIN_AT = _REQUEST.size
 _ROBOT_AT = _ORIGIN_AT + TOKEN_BYTES
 
@@ -51,6 +55,21 @@ class RequestHeader:
     remaining_s: float
     token: bytes
     robot: str
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """What accompanies a probe: whose connection this is.
+
+    Attributes:
+        token: Names the robot's connection; requests under it are the greeter's.
+        certificate: The robot's (DER), with the first probe; empty once it was answered.
+        signature: Over `greeted_bytes`, with that certificate's key (DER).
+    """
+
+    token: bytes
+    certificate: bytes = b""
+    signature: bytes = b""
 
 
 def origin(robot: str, token: bytes) -> bytes:
@@ -132,6 +151,54 @@ def decode_refusal(frame: bytes) -> tuple[bytes, str]:
     if not reason.isprintable():
         raise FrameError("a reason that is not printable")
     return request_id, reason
+
+
+def greeted_bytes(token: bytes, replica: str) -> bytes:
+    """Return what a greeting's signature covers: good for one connection to one replica.
+
+    Args:
+        token: The connection's.
+        replica: The replica's common name.
+    """
+    return b"fogft greeting 1\n" + token + replica.encode()
+
+
+def encode_greeting(greeting: Greeting) -> bytes:
+    """Return a greeting, or the bare token where it has no certificate.
+
+    Raises:
+        ValueError: It would be too long.
+    """
+    if not greeting.certificate:
+        return _TOKEN.pack(VERSION, greeting.token)
+    frame = (
+        _GREETING.pack(VERSION, greeting.token, len(greeting.certificate))
+        + greeting.certificate
+        + greeting.signature
+    )
+    if len(frame) > GREETING_LIMIT:
+        raise ValueError(f"a greeting of {len(frame)} bytes")
+    return frame
+
+
+def decode_greeting(frame: bytes) -> Greeting:
+    """Read a greeting; nothing in it is verified.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if len(frame) == _TOKEN.size:
+        version, token = _TOKEN.unpack(frame)
+        _check_version(version)
+        return Greeting(token)
+    if not _GREETING.size < len(frame) <= GREETING_LIMIT:
+        raise FrameError(f"a greeting of {len(frame)} bytes")
+    version, token, length = _GREETING.unpack_from(frame)
+    _check_version(version)
+    end = _GREETING.size + length
+    if not length or end >= len(frame):
+        raise FrameError("a greeting that is cut short")
+    return Greeting(token, frame[_GREETING.size : end], frame[end:])
 
 
 def encode_probe(probe: Probe) -> bytes:

@@ -10,7 +10,7 @@ Not here: certificates; a listener's name stands for its certificate.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from fogft.core import names
@@ -191,6 +191,9 @@ class MemoryListener:
         """Answer a probe that arrived; None where nobody serves."""
         self.count["probes"] += 1
         return self._on_probe(probe) if self._on_probe is not None else None
+
+    def revoke(self, names: Collection[str]) -> None:
+        """Do nothing: this wire has no certificates."""
 
     def counters(self) -> Mapping[str, int]:
         """Counts by event name."""

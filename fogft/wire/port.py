@@ -11,7 +11,7 @@ Implementations: `fogft.wire.zenoh_link` and `zenoh_listener`, `fogft.wire.memor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -66,6 +66,9 @@ class Refusal:
     EXPIRED = "expired"  # its deadline had passed on arrival
     FORGOTTEN = "forgotten"  # it was run, but the answer is no longer kept
     MALFORMED = "malformed"  # the request could not be read
+    NOT_ADMITTED = "not-admitted"  # who asks may not, or did not say who it is
+    REVOKED = "revoked"  # the certificate of who asks was taken back
+    EXPIRED_CERTIFICATE = "expired-certificate"  # by the replica's clock
     LOST = "lost"  # made locally: the link died before an answer came
 
 
@@ -223,6 +226,9 @@ class Listener(Protocol):
         on_probe: Callable[[Probe], ProbeAnswer],
     ) -> None:
         """Begin to listen. Callbacks come from the wire's threads and must not block."""
+
+    def revoke(self, names: Collection[str]) -> None:
+        """Let the holders of these certificates (common names) in no more. Repeatable."""
 
     def counters(self) -> Mapping[str, int]:
         """Counts by event name: ``malformed``, ``refused``, ``reply_dropped``, ..."""

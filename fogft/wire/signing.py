@@ -164,6 +164,27 @@ class Verifier:
             raise RecordError("expired", f"the certificate of `{name}` has expired")
 
 
+class LazyVerifier:
+    """A `Verifier` that reads the CA when it is first asked: who never is loads nothing."""
+
+    def __init__(self, ca: Path) -> None:
+        self._ca = ca
+        self._verifier: Verifier | None = None
+
+    def __call__(self, certificate: bytes, signature: bytes, message: bytes) -> Writer:
+        """Return who signed `message`; see `Verifier`.
+
+        Raises:
+            RecordError: The signature, the certificate or our own CA is no good.
+        """
+        if self._verifier is None:
+            try:
+                self._verifier = Verifier(self._ca)
+            except CredentialError as error:
+                raise RecordError("authority", error.message) from error
+        return self._verifier(certificate, signature, message)
+
+
 def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     from cryptography.exceptions import InvalidSignature
 

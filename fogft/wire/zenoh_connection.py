@@ -23,6 +23,7 @@ import zenoh
 from zenoh import handlers
 
 from fogft.core.errors import WireError
+from fogft.core.records import Sign
 from fogft.wire import frame
 from fogft.wire.credit import Credit
 from fogft.wire.diagnosis import wrong_name
@@ -43,6 +44,13 @@ _AT_ONCE = zenoh.ConsolidationMode.NONE
 _QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
 # A `get` that took this long was stuck behind a full queue: see whether the session survived.
 _STUCK_S = 0.1
+
+
+_REFUSED = {
+    Refusal.REVOKED: "our certificate is revoked",
+    Refusal.NOT_ADMITTED: "the replica does not let us in: our certificate is not good for asking",
+    Refusal.EXPIRED_CERTIFICATE: "our certificate is not valid now, by the replica's clock",
+}
 
 
 class OpenAttempt:
@@ -70,6 +78,7 @@ class Connection:
         peer: Whom it must reach.
         robot: Who we are.
         keys: Service name -> key.
+        sign: Signs our greeting.
         turns: Shared with the robot's other connections.
         answered: Called with each attempt's end, once. Must not block.
         late: Called with service and id when a forgotten request was answered. Must not block.
@@ -79,6 +88,7 @@ class Connection:
     Raises:
         zenoh.ZError: Nothing was reached.
         WireError: Somebody else was reached. Nothing was sent to them.
+        CredentialError: Our own certificate or key cannot be used.
     """
 
     def __init__(
@@ -88,6 +98,7 @@ class Connection:
         robot: str,
         keys: Mapping[str, str],
         *,
+        sign: Sign,
         turns: Turns,
         answered: Callable[[Answer], None],
         late: Callable[[str, bytes], None],
@@ -101,7 +112,11 @@ class Connection:
         self._room = room
         self._keys = {name: zenoh.KeyExpr(key) for name, key in keys.items()}
         self._timers = {name: TimerBudget() for name in keys}
-        self._origin = frame.origin(robot, secrets.token_bytes(frame.TOKEN_BYTES))
+        self._token = secrets.token_bytes(frame.TOKEN_BYTES)
+        self._origin = frame.origin(robot, self._token)
+        certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
+        greeting = frame.Greeting(self._token, certificate, signature)
+        self._greeting = frame.encode_greeting(greeting)
         self._queue: SimpleQueue[OpenAttempt | None] = SimpleQueue()
         self._credit = Credit()
         self.window: LinkWindow[OpenAttempt] = LinkWindow()
@@ -256,18 +271,32 @@ class Connection:
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
+                self._greeting = bare  # we are known from now on
                 heard(reply.ok.payload.to_bytes())
+            elif reply.err is not None:
+                self._probe_refused(reply.err.payload.to_bytes())
+
+        bare = frame.encode_greeting(frame.Greeting(self._token))
 
         self._session.get(
             key,
             handlers.Callback(on_reply, indirect=False),
             payload=payload,
+            attachment=self._greeting,
             timeout=timeout_s,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
             target=_ALL,
             consolidation=_AT_ONCE,
         )
+
+    def _probe_refused(self, content: bytes) -> None:
+        try:
+            _, reason = frame.decode_refusal(content)
+        except frame.FrameError:
+            return  # Zenoh's own: it timed out, and the keeper counts the silence
+        words = _REFUSED.get(reason, f"the replica refuses our probes: {reason}")
+        self._lose(words)
 
     def sweep(self) -> None:
         """End the attempts whose time is up and of which Zenoh told nothing."""

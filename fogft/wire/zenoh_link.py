@@ -20,12 +20,13 @@ from queue import Empty, SimpleQueue
 import zenoh
 
 from fogft.core import names
-from fogft.core.errors import WireError
+from fogft.core.errors import CredentialError, WireError
 from fogft.core.model import LinkState
 from fogft.wire import config, diagnosis, frame
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.wire.signing import Signer
 from fogft.wire.silence import Silence
 from fogft.wire.turns import Turns
 from fogft.wire.zenoh_connection import Connection
@@ -38,6 +39,7 @@ _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
 _EXPLAIN_EVERY_S = 5.0
 _EXPLAIN_TIMEOUT_S = 0.5
 _CLOSE_WAIT_S = 3.0
+_RENEW_AGAIN_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,9 @@ class ZenohLink:
         self._rtt_s: float | None = None
         self._detail = "not reached yet"
         self._opened = 0
+        self._renew = threading.Event()
+        self._renew_at: float | None = None
+        self._retiring: list[Connection] = []  # succeeded, with requests under way
         self._explained_at = float("-inf")
         self._thread = threading.Thread(
             target=self._keep, name=f"fogft-keep-{peer.id.short}", daemon=True
@@ -118,6 +123,8 @@ class ZenohLink:
         live = self._live
         if live is not None:
             live.forget(request_id)
+        for retiring in tuple(self._retiring):
+            retiring.forget(request_id)
 
     def status(self) -> LinkStatus:
         """Return a snapshot."""
@@ -146,6 +153,14 @@ class ZenohLink:
             live.close()
         self._dialer.closed(self)
 
+    def renew(self) -> None:
+        """Take new credentials into use: open a connection beside this one, then close this one.
+
+        Returns at once; no request is lost by it.
+        """
+        self._renew.set()
+        self._wake.set()
+
     def join(self, timeout_s: float) -> None:
         """Wait for the keeper thread of a closed link."""
         self._thread.join(timeout_s)
@@ -157,15 +172,51 @@ class ZenohLink:
         while not self._closed:
             self._silence.began(time.monotonic())
             connection = self._open()
-            if connection is not None:
-                was_up = self._attend(connection)
+            was_up = False
+            while connection is not None:
+                was_up = self._attend(connection) or was_up
+                if self._is_good(connection):  # it only makes way for one with new credentials
+                    connection = self._succeed(connection)
+                    continue
                 self._part(connection)
-                failures = 0 if was_up else failures + 1
-            else:
-                failures += 1
+                break
+            failures = 0 if was_up else failures + 1
             self._woke_at = time.monotonic()  # opening took time, and that is silence
+            self._let_go()
             if not self._closed:
                 self._pause(_BACKOFF_S[min(failures, len(_BACKOFF_S) - 1)])
+        self._let_go()
+
+    def _is_good(self, connection: Connection) -> bool:
+        return connection is self._live and not self._closed and not connection.lost_because
+
+    def _succeed(self, old: Connection) -> Connection:
+        """Open a connection beside one that is up, and return it once it is up too.
+
+        Whatever goes wrong with the new one, the old one stays, and it is tried again. Requests
+        go to the new one from the moment that it is up; what is under way on the old one ends
+        there.
+        """
+        self._renew.clear()
+        new = self._open()
+        if new is not None and self._attend(new, until_up=True) and new is self._live:
+            self._retiring.append(old)
+            log.info("link_renewed replica=%s", self._peer.id.short)
+            return new
+        if new is not None:
+            self._say(new.lost_because)
+            new.close()
+        self._renew_at = time.monotonic() + _RENEW_AGAIN_S
+        self._asked = Silence()
+        return old
+
+    def _let_go(self) -> None:
+        """Close connections that were succeeded, once nothing is under way on them."""
+        for connection in list(self._retiring):
+            connection.sweep()
+            if not len(connection.window) or connection.lost_because or self._closed:
+                self._retiring.remove(connection)
+                connection.close()
 
     def _open(self) -> Connection | None:
         began = time.monotonic()
@@ -175,13 +226,14 @@ class ZenohLink:
                 self._peer,
                 self._dialer.robot,
                 self._services,
+                sign=self._dialer.sign,
                 turns=self._dialer.turns,
                 answered=self._answered,
                 late=self._late,
                 lost=self._wake.set,
                 room=self._changed,
             )
-        except WireError as error:
+        except (WireError, CredentialError) as error:
             self._say(error.message)
             return None
         except zenoh.ZError as error:
@@ -200,13 +252,20 @@ class ZenohLink:
         self._explained_at = now
         return diagnosis.explain(self._peer, self._dialer.credentials, _EXPLAIN_TIMEOUT_S)
 
-    def _attend(self, connection: Connection) -> bool:
-        """Probe a connection until it is lost, suspect or not wanted; return whether it was up."""
+    def _attend(self, connection: Connection, *, until_up: bool = False) -> bool:
+        """Probe a connection until it is lost, suspect or not wanted; return whether it was up.
+
+        Also ends where another connection shall succeed it, or at once when it is up where
+        that is all that is asked.
+        """
         up = False
         self._woke_at = next_probe = time.monotonic()
         self._asked = Silence()
-        while not self._closed and not connection.lost_because:
+        while not self._closed and not connection.lost_because and not (up and until_up):
             now = time.monotonic()
+            if self._renewal_due(now) and connection is self._live:
+                break
+            self._let_go()
             if now >= next_probe:
                 connection.sweep()
                 self._probe(connection, now)
@@ -221,6 +280,12 @@ class ZenohLink:
             except WireError as error:
                 connection.lost_because = error.message
         return up
+
+    def _renewal_due(self, now: float) -> bool:
+        if self._renew_at is not None and now >= self._renew_at:
+            self._renew_at = None
+            self._renew.set()
+        return self._renew.is_set()
 
     def _probe(self, connection: Connection, now: float) -> None:
         self._asked.began(now)
@@ -272,10 +337,10 @@ class ZenohLink:
         self._silence.ended()
         self._heard_at = heard.at
         self._rtt_s = heard.at - heard.sent_at
-        news = self._live is None or answer != self._probe_answer
+        news = self._live is not connection or answer != self._probe_answer
         self._probe_answer = answer
         self._ready = answer.ready
-        if self._live is None:
+        if self._live is not connection:
             self._state = LinkState.UP
             self._detail = ""
             self._live = connection
@@ -290,6 +355,7 @@ class ZenohLink:
         was_up = self._live is not None
         self._live = None
         self._ready = frozenset()
+        self._renew.clear()  # the next one begins with what there is now
         if was_up:
             self._state = LinkState.SUSPECT
             log.warning("link_lost replica=%s reason=%r", self._peer.id.short,
@@ -365,6 +431,7 @@ class ZenohDialer:
         self.manager_age = manager_age
         self.settings = settings or LinkSettings()
         self.turns = Turns()
+        self._signer: Signer | None = None
         self._pool_uid = pool_uid
         self._lock = threading.Lock()
         self._links: list[ZenohLink] = []
@@ -381,6 +448,23 @@ class ZenohDialer:
         with self._lock:
             self._links.append(link)
         return link
+
+    def sign(self, message: bytes) -> tuple[bytes, bytes]:
+        """Sign with the robot's key; return its certificate and the signature (DER).
+
+        Raises:
+            CredentialError: They cannot be used.
+        """
+        if self._signer is None:
+            self._signer = Signer(self.credentials.certificate, self.credentials.key)
+        return self._signer(message)
+
+    def renew(self) -> None:
+        """Take the credentials that now stand in their files into use, link by link."""
+        with self._lock:
+            links = list(self._links)
+        for link in links:
+            link.renew()
 
     def closed(self, link: ZenohLink) -> None:
         """Forget a link that was closed."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from queue import SimpleQueue
 
@@ -25,13 +25,16 @@ from fogft.core.errors import WireError
 from fogft.core.model import ReplicaId
 from fogft.wire import config, frame
 from fogft.wire.config import CredentialPaths, LinkSettings
+from fogft.wire.guests import Guests, NotAdmittedError
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
 from fogft.wire.reply_queue import Counters, Reply, ReplyQueues
+from fogft.wire.signing import LazyVerifier
 
 log = logging.getLogger(__name__)
 
 _CLOSE_WAIT_S = 1.0
+_NO_REQUEST = bytes(names.REQUEST_ID_BYTES)
 
 
 class ZenohIncoming:
@@ -137,6 +140,9 @@ class ZenohListener:
         self._config = config.replica_settings(
             self._endpoint, id, credentials, settings or LinkSettings()
         )
+        self._guests = Guests(
+            id.pool_uid, names.replica_certificate_name(id), LazyVerifier(credentials.ca)
+        )
         self._counters = Counters()
         self._queues = ReplyQueues(self._counters)
         self._chores: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
@@ -198,6 +204,9 @@ class ZenohListener:
         except frame.FrameError as error:
             self._malformed(error, query)
             return
+        if not self._guests.admits(header.token):
+            self._turn_away(query, header.request_id, Refusal.NOT_ADMITTED, "it did not greet")
+            return
         payload = query.payload.to_bytes() if query.payload is not None else b""
         on_request(
             ZenohIncoming(
@@ -207,20 +216,46 @@ class ZenohListener:
 
     def _probe(self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query) -> None:
         self._counters.add("probes")
+        attachment = query.attachment
         try:
             probe = frame.decode_probe(query.payload.to_bytes() if query.payload else b"")
+            greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
         except frame.FrameError as error:
             self._malformed(error, query)
             return
-        self._chores.put(partial(_answer_probe, on_probe, probe, query))
+        self._chores.put(partial(self._answer_probe, on_probe, probe, greeting, query))
+
+    def _turn_away(self, query: zenoh.Query, request_id: bytes, refusal: str, why: str) -> None:
+        count = self._counters.add("not_admitted")
+        if count & (count - 1) == 0:
+            log.warning("robot_not_admitted reason=%r count=%d", why, count)
+        self._chores.put(Reply(query, request_id, b"", refusal).send)
 
     def _malformed(self, error: frame.FrameError, query: zenoh.Query) -> None:
         count = self._counters.add("malformed")
         if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
             log.warning("request_malformed reason=%r count=%d", str(error), count)
-        self._chores.put(Reply(query, bytes(names.REQUEST_ID_BYTES), b"", Refusal.MALFORMED).send)
+        self._chores.put(Reply(query, _NO_REQUEST, b"", Refusal.MALFORMED).send)
 
     # -- the probe thread -----------------------------------------------------------------
+
+    def _answer_probe(
+        self,
+        on_probe: Callable[[Probe], ProbeAnswer],
+        probe: Probe,
+        greeting: frame.Greeting,
+        query: zenoh.Query,
+    ) -> None:
+        try:
+            self._guests.greet(greeting)
+        except NotAdmittedError as error:
+            self._turn_away(query, _NO_REQUEST, error.refusal, str(error))
+            return
+        try:
+            content = frame.encode_probe_answer(on_probe(probe))
+            query.reply(query.key_expr, content, express=True)
+        finally:
+            query.drop()  # type: ignore[no-untyped-call]
 
     def _do_chores(self) -> None:
         while (chore := self._chores.get()) is not None:
@@ -232,9 +267,13 @@ class ZenohListener:
 
     # -- the owner ------------------------------------------------------------------------
 
+    def revoke(self, names: Collection[str]) -> None:
+        """Let these holders in no more; what they ask from now on is refused."""
+        self._guests.revoke(names)
+
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
-        ``malformed``, ``reply_dropped``, ``failed``.
+        ``malformed``, ``not_admitted``, ``reply_dropped``, ``failed``.
         """
         return self._counters.snapshot()
 
@@ -252,16 +291,6 @@ class ZenohListener:
         closer.start()
         see_off(closer)
         closer.join(_CLOSE_WAIT_S / 2)
-
-
-def _answer_probe(
-    on_probe: Callable[[Probe], ProbeAnswer], probe: Probe, query: zenoh.Query
-) -> None:
-    try:
-        content = frame.encode_probe_answer(on_probe(probe))
-        query.reply(query.key_expr, content, express=True)
-    finally:
-        query.drop()  # type: ignore[no-untyped-call]
 
 
 def _close(session: zenoh.Session) -> None:

@@ -84,6 +84,7 @@ def main() -> None:
     for line in sys.stdin:
         command = json.loads(line)
         service.delay_s = command.pop("delay_s", service.delay_s)
+        listener.revoke(command.pop("revoke", ()))
         state.update(command)
         last = {"manager_age_s": managers[-1]} if managers else {}
         print(json.dumps({**listener.counters(), **last}), flush=True)

@@ -47,6 +47,7 @@ DECODERS: list[Callable[[bytes], Any]] = [
     frame.decode_refusal,
     frame.decode_probe,
     frame.decode_probe_answer,
+    frame.decode_greeting,
 ]
 
 
@@ -69,6 +70,13 @@ def test_an_answer_header_comes_back(request_id: bytes) -> None:
 def test_a_refusal_comes_back(request_id: bytes, reason: str) -> None:
     """Decoding undoes encoding."""
     assert frame.decode_refusal(frame.encode_refusal(request_id, reason)) == (request_id, reason)
+
+
+@given(token=tokens, certificate=st.binary(max_size=1500), signature=st.binary(min_size=1))
+def test_a_greeting_comes_back(token: bytes, certificate: bytes, signature: bytes) -> None:
+    """Decoding undoes encoding; without a certificate the token alone travels."""
+    sent = frame.Greeting(token, certificate, signature if certificate else b"")
+    assert frame.decode_greeting(frame.encode_greeting(sent)) == sent
 
 
 @given(probe=probes)

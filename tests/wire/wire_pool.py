@@ -55,8 +55,9 @@ class Authority:
             self.folder / "ca.crt", self.folder / f"{stem}.crt", self.folder / f"{stem}.key"
         )
 
-    def robot(self, name: str = "robot") -> Files:
-        return self.issue(names.robot_certificate_name(POOL_UID, name), Role.ROBOT)
+    def robot(self, name: str = "robot", generation: int = 1) -> Files:
+        name = names.robot_certificate_name(POOL_UID, name, generation)
+        return self.issue(name, Role.ROBOT)
 
     def replica(self, slot: int = 0, generation: int = 1) -> Files:
         id = ReplicaId(POOL_UID, slot, generation)
@@ -150,7 +151,7 @@ class ReplicaProcess:
         return dict(json.loads(line))
 
     def ask(self, **command: object) -> dict[str, object]:
-        """Send a command: `ready`, `draining`, `delay_s`; none of them asks for its counters."""
+        """Send a command: `ready`, `draining`, `delay_s`, `revoke`; none asks for its counters."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(command) + "\n")
         self._process.stdin.flush()
