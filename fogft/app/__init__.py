@@ -23,15 +23,18 @@ from fogft.app.looking import (
     tail,
 )
 from fogft.app.parts import examples, init, run_manager, run_proxy, run_server
+from fogft.app.sweeping import clouds_to_sweep, end_unowned, sweep
 from fogft.app.wishes import drain, exclude, include, scale
 
 __all__ = [
     "CLOUDS",
     "chaos",
     "cloud_of",
+    "clouds_to_sweep",
     "doctor",
     "down",
     "drain",
+    "end_unowned",
     "examples",
     "exclude",
     "excluded",
@@ -55,5 +58,6 @@ __all__ = [
     "slots",
     "start",
     "status",
+    "sweep",
     "tail",
 ]

@@ -66,8 +66,15 @@ def start(order: Order) -> bool:
     return startup.start_manager(store)
 
 
-def down(pool: str, told: Callable[[str], None]) -> None:
+def down(
+    pool: str, told: Callable[[str], None], warned: Callable[[str], None] = lambda _: None
+) -> None:
     """End a pool and all that it started; tell each thing as it has been ended.
+
+    Args:
+        pool: Its name.
+        told: Called with each thing that has been ended.
+        warned: Called with what could not be made certain.
 
     Raises:
         PoolNotFound: There is no such pool.
@@ -76,7 +83,7 @@ def down(pool: str, told: Callable[[str], None]) -> None:
     from fogft.pool import shutdown
     from fogft.ros import shared_memory
 
-    shutdown.end(make_store(pool), cloud_of, told=told)
+    shutdown.end(make_store(pool), cloud_of, told=told, warned=warned)
     swept = shared_memory.sweep()  # what killed ROS processes cannot remove themselves
     if swept:
         told(f"{len(swept)} shared-memory files of dead processes")

@@ -214,5 +214,5 @@ def down(
         output.say("nothing to end: there is no pool here")
         return
     name = app.pool_name(pool)
-    app.down(name, lambda what: output.say(f"ended {what}"))
+    app.down(name, lambda what: output.say(f"ended {what}"), output.warn)
     output.done(f"nothing of `{name}` is left")

@@ -21,7 +21,7 @@ from typing import Annotated
 import typer
 
 from fogft import __version__
-from fogft.cli import change, chaos, doctor, lifecycle, output, parts, watch
+from fogft.cli import change, chaos, doctor, lifecycle, output, parts, sweep, watch
 from fogft.cli.sections import Commands
 from fogft.core.errors import FogftError
 
@@ -44,6 +44,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 lifecycle.register(app)
+sweep.register(app)
 watch.register(app)
 doctor.register(app)
 change.register(app)

@@ -7,7 +7,7 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 SECTIONS = {
-    "Begin and end": ("init", "up", "down"),
+    "Begin and end": ("init", "up", "down", "sweep"),
     "Look": ("status", "logs", "doctor"),
     "Change what runs": ("scale", "drain", "exclude", "include"),
     "Try what happens when": ("chaos",),

@@ -102,6 +102,32 @@ class Accounts(Protocol):
         """Return why what exists in a cloud cannot be checked there; empty when it can."""
 
 
+@dataclass(frozen=True)
+class Audit:
+    """What exists, asked past every memory.
+
+    Attributes:
+        machines: In any phase, ordered by id.
+        asked: Clouds (as in `Placement.cloud`) whose own list was read. Of all others it is
+            what was remembered, or what somebody else says.
+    """
+
+    machines: tuple[Machine, ...]
+    asked: frozenset[str]
+
+
+@runtime_checkable
+class Auditing(Protocol):
+    """A cloud that can be asked for all that exists, whoever knows of it."""
+
+    def audit(self, pool_uid: str = "") -> Audit:
+        """Look for what exists of a pool, or of all of this user's pools. Takes seconds.
+
+        Raises:
+            CloudUnreachable: It cannot tell; nothing may be concluded.
+        """
+
+
 @runtime_checkable
 class Refreshing(Protocol):
     """A cloud whose list is from memory, and may still show what is gone."""

@@ -182,6 +182,11 @@ class History:
         """Return the launches that have not ended, as far as was seen."""
         return list(self._open.values())
 
+    @property
+    def locations(self) -> frozenset[str]:
+        """Every location that anything was launched in."""
+        return frozenset(record.location for record in self._records.values())
+
     def generation(self, slot: int) -> int:
         """Return the highest generation ever used in a slot; 0 for none."""
         return self._generations.get(slot, 0)

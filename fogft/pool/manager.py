@@ -25,7 +25,7 @@ from fogft.cloud.port import Cloud
 from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
-from fogft.pool import configuration, proxy_report, shutdown, status
+from fogft.pool import configuration, farewell, proxy_report, shutdown, status
 from fogft.pool.lease import Lease
 from fogft.pool.proxy_supervisor import ProxySupervisor
 from fogft.pool.reconciler import Reconciler, Tick
@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 TICK_S = 1.0
 WATCH_S = 0.05
 CERTIFY_EVERY_S = 3600.0
+LEAVE_LIMIT_S = 60.0  # then it is tried again in the next round
 
 
 class Manager:
@@ -55,6 +56,7 @@ class Manager:
         self, store: PoolStore, cloud: Cloud, *, proxy_command: Sequence[str] | None = None
     ) -> None:
         self._store = store
+        self._cloud = cloud
         self._paths = store.paths
         self._identity = store.identity()
         published = store.membership()
@@ -120,10 +122,18 @@ class Manager:
 
     def _leave(self) -> None:
         """See to it that nothing of a pool that ends by itself is left but its folder."""
-        shutdown.end_client_proxy(
-            self._paths,
+
+        def done(what: str) -> None:
+            log.info("ended pool=%s what=%r", self._identity.name, what)
+
+        shutdown.end_client_proxy(self._paths, self._identity.uid, done)
+        farewell.end_machines(
+            self._cloud,
             self._identity.uid,
-            lambda what: log.info("process_ended pool=%s what=%r", self._identity.name, what),
+            known=farewell.known(self._store),
+            done=done,
+            warned=lambda what: log.warning("not_verified reason=%r", what),
+            limit_s=LEAVE_LIMIT_S,
         )
 
     def _attempt(self, step: Callable[[], None]) -> None:

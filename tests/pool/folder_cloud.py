@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fogft.cloud.port import Launch
+from fogft.cloud.port import Audit, Launch
 from fogft.core.errors import CloudUnreachable
 from fogft.core.model import Machine, MachinePhase, Offer, Placement, ReplicaId
 
@@ -45,11 +45,23 @@ class FolderCloud:
         partial.write_text(json.dumps(value))
         partial.rename(self.folder / f"{order.id}.json")
 
+    def audit(self, pool_uid: str = "") -> Audit:
+        """Find also what `forget` has taken out of the list."""
+        self._reach()
+        paths = [*self.folder.glob(f"{pool_uid}*.json"), *self.folder.glob(f"{pool_uid}*.lost")]
+        asked = frozenset() if (self.folder / "mute").exists() else frozenset({"folder"})
+        return Audit(tuple(sorted((self._read(p) for p in paths), key=lambda m: m.id)), asked)
+
+    def forget(self, id: ReplicaId) -> None:
+        """Lose a machine that runs on, as SkyPilot does with its database."""
+        (self.folder / f"{id}.json").rename(self.folder / f"{id}.lost")
+
     def terminate(self, id: ReplicaId) -> None:
         self._reach()
         if (self.folder / f"keep-{id.short}").exists():
             raise CloudUnreachable("told to keep it")
-        (self.folder / f"{id}.json").unlink(missing_ok=True)
+        for suffix in ("json", "lost"):
+            (self.folder / f"{id}.{suffix}").unlink(missing_ok=True)
 
     def log(self, id: ReplicaId) -> str | None:
         return None

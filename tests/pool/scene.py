@@ -98,9 +98,10 @@ class Scene:
         seen = self.status()
         return seen.get("ready") == count and len(seen["replicas"]) == count
 
-    def end(self) -> list[str]:
+    def end(self, warned: list[str] | None = None) -> list[str]:
         """Do what `down` does."""
-        return shutdown.end(self.store, lambda _: self.cloud, limit_s=5)
+        warnings = [] if warned is None else warned
+        return shutdown.end(self.store, lambda _: self.cloud, warned=warnings.append, limit_s=5)
 
     def _output(self) -> str:
         path = self.home / "manager-output"

@@ -10,8 +10,9 @@ import pytest
 
 from fogft import disk
 from fogft.cloud.port import Launch
-from fogft.core.errors import CloudUnreachable, PoolNotFound
+from fogft.core.errors import CloudUnreachable, FogftError, PoolNotFound
 from fogft.core.model import ReplicaId
+from fogft.pool import shutdown
 from tests.pool.folder_cloud import ZONES
 from tests.pool.scene import Scene
 
@@ -53,6 +54,72 @@ def test_down_without_manager_or_proxy(scene: Scene) -> None:
     scene.write()
     assert scene.end() == []
     assert not scene.paths.folder.exists()
+
+
+def test_down_ends_what_the_list_forgot(scene: Scene) -> None:
+    """The clouds are asked past every memory before "nothing is left" is said."""
+    scene.write(replicas=2)
+    manager = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    manager.terminate()
+    manager.wait(20)
+    uid = scene.store.identity().uid
+    scene.cloud.forget(ReplicaId(uid, 1, 1))
+    warned: list[str] = []
+    told = scene.end(warned)
+    assert [what for what in told if what.startswith("replica")] == [
+        "replica 0.1 (folder/one/a)",
+        "replica 1.1 (folder/three/a)",
+    ]
+    assert not scene.cloud.audit().machines
+    assert warned == []
+
+
+def test_down_says_which_cloud_could_not_be_asked(scene: Scene) -> None:
+    """Its own list could not be had: whose word it is then, and how to look for oneself."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    uid = scene.store.identity().uid
+    (scene.cloud.folder / "mute").touch()
+    warned: list[str] = []
+    scene.end(warned)
+    [warning] = warned
+    assert warning.startswith("`folder` could not be asked itself")
+    assert f"`fogft-pool={uid}`" in warning
+
+
+def test_down_that_gets_no_answer_lists_what_may_still_run(scene: Scene) -> None:
+    """Which replicas, where, how to look, and when they end by themselves."""
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    (scene.cloud.folder / "outage").touch()
+    with pytest.raises(CloudUnreachable) as caught:
+        scene.end()
+    lines = caught.value.message.splitlines()
+    assert lines[0] == "it cannot be told what of `pool` still runs: told to be"
+    assert [line.strip() for line in lines[1:]] == [
+        "may still run: replica 0.1 (folder/one/a)",
+        "may still run: replica 1.1 (folder/three/a)",
+    ]
+    assert caught.value.hint == (
+        "run `fogft down pool` again; what hears of no manager ends by itself after 3600 s"
+    )
+
+
+def test_down_that_is_refused_says_by_whom_and_why(scene: Scene) -> None:
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    keeping = scene.cloud.keep("0.1")
+    with pytest.raises(FogftError) as caught:
+        shutdown.end(scene.store, lambda _: scene.cloud, limit_s=0)
+    assert caught.value.message == (
+        "these replicas did not end: `0.1` (folder/one/a): told to keep it"
+    )
+    keeping.unlink()
+    assert scene.end() == ["replica 0.1 (folder/one/a)"]
 
 
 def test_down_can_be_repeated_after_an_outage(scene: Scene) -> None:

@@ -414,7 +414,7 @@ def test_without_our_notes_skypilots_labels_tell_the_same(scene: Scene):
     )
 
 
-def test_sweep_finds_machines_of_every_pool_of_this_user_and_of_nobody_else(scene: Scene):
+def test_an_audit_finds_machines_of_every_pool_of_this_user_and_of_nobody_else(scene: Scene):
     mine, lost = replica(uid="00000000000000bb"), replica(uid="00000000000000cc")
     for id in (mine, lost):
         scene.cloud.launch(scene.order(id))
@@ -430,7 +430,42 @@ def test_sweep_finds_machines_of_every_pool_of_this_user_and_of_nobody_else(scen
         if instance.id == theirs:
             labels = {**record.labels, naming.OWNER: "bob_laptop"}
             scene.provider.found[key] = type(instance)(theirs, key, instance.placement, labels)
-    assert [m.id for m in scene.cloud.sweep()] == [mine, lost]
+    audit = scene.cloud.audit()
+    assert [m.id for m in audit.machines] == [mine, lost]
+    assert audit.asked == {"aws"}
+
+
+def test_an_audit_of_a_pool_asks_the_provider_now_and_not_from_memory(scene: Scene):
+    """What SkyPilot and our notes have both lost is found, a second after it was lost."""
+    scene.launched()
+    scene.machines()
+    scene.sky.forget_everything()
+    scene.cloud._journal.close(ID)
+    scene.pass_s(10)
+    assert not scene.machines()
+    assert [m.id for m in scene.cloud.audit(ID.pool_uid).machines] == [ID]
+    assert scene.provider.asked_regions[-1] is None, "everywhere, not where it should be"
+    assert not scene.cloud.audit("00000000000000ff").machines
+
+
+def test_an_audit_says_which_clouds_it_could_ask(scene: Scene):
+    scene.provider.allowed = False
+    assert scene.cloud.audit(ID.pool_uid).asked == frozenset()
+    scene.provider.allowed = True
+    assert scene.cloud.audit(ID.pool_uid).asked == {"aws"}
+    scene.provider.reachable = False
+    with pytest.raises(CloudUnreachable):
+        scene.cloud.audit(ID.pool_uid)
+
+
+def test_whether_a_cloud_can_be_asked_is_found_out_by_asking(scene: Scene):
+    """`up` says so before anything was launched: nobody has refused us by then."""
+    assert scene.cloud.unverified("aws") == ""
+    scene.provider.allowed = False
+    assert "SkyPilot's word" in scene.cloud.unverified("aws")
+    scene.provider.allowed = True
+    scene.provider.reachable = False
+    assert "ExpiredToken" in scene.cloud.unverified("aws")
 
 
 # -- a manager that dies -----------------------------------------------------------------------

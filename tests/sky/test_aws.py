@@ -129,6 +129,18 @@ def test_not_allowed_is_not_the_same_as_cannot_tell(code: str, expected: type, h
         assert not aws._clients, "renewed credentials are read from the disk again"
 
 
+@needs_moto
+def test_a_region_that_may_not_be_asked_hides_no_other(account: None):
+    """An organisation keeps its accounts out of most regions."""
+    aws = Aws()
+    launch("us-west-2", labels(replica(0)))
+    aws._clients["us-east-1"] = Refusing(client_error("UnauthorizedOperation"))
+    aws._regions = lambda: ["us-east-1", "us-west-2"]  # type: ignore[method-assign]
+    assert [i.placement.region for i in aws.instances(None)] == ["us-west-2"]
+    with pytest.raises(NotAllowedError):
+        aws.instances(["us-east-1", "us-west-2"])
+
+
 def test_no_network_is_cannot_tell():
     aws = Aws()
     aws._clients["us-east-1"] = Refusing(ConnectionError("no route"))

@@ -20,10 +20,10 @@ from typing import Any
 
 from fogft.cloud.local import ending, faults, processes, regions_file
 from fogft.cloud.local import folder as folders
-from fogft.cloud.local.catalogue import Catalogue, Zone
+from fogft.cloud.local.catalogue import CLOUD, Catalogue, Zone
 from fogft.cloud.local.folder import Life, MachineFolder, Record, State
 from fogft.cloud.local.resources import offers as offers_for
-from fogft.cloud.port import Launch
+from fogft.cloud.port import Audit, Launch
 from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, StateError
 from fogft.core.model import Machine, MachinePhase, Offer, Placement, ReplicaId
 from fogft.core.spec_tree import nearest
@@ -111,6 +111,12 @@ class LocalCloud:
         self.folders()
         ending.end(self.root, MachineFolder.under(self.machines_folder, id))
         self._reap()
+
+    def audit(self, pool_uid: str = "") -> Audit:
+        """See `fogft.cloud.port.Auditing`: the machines' folders are all that there is."""
+        uids = {pool_uid} if pool_uid else {folder.id.pool_uid for folder in self.folders()}
+        found = (machine for uid in sorted(uids) for machine in self.machines(uid))
+        return Audit(tuple(found), frozenset({CLOUD}))
 
     def log(self, id: ReplicaId) -> str | None:
         """Return the log of a machine, also for a while after its end."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fogft.cloud.port import Launch
+from fogft.cloud.port import Audit, Launch
 from fogft.cloud.sky import listing, task, template, wheel
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
@@ -219,26 +219,39 @@ class SkyCloud:
         """Return why what exists in a cloud is SkyPilot's word alone; empty when it is not."""
         return self._census.unverified(cloud)
 
-    def sweep(self) -> Sequence[Machine]:
-        """List every machine of this user's pools, whatever became of the pool. Takes seconds.
+    def audit(self, pool_uid: str = "") -> Audit:
+        """See `fogft.cloud.port.Auditing`. SkyPilot is asked, and each provider that can be.
 
-        Raises:
-            CloudUnreachable: It cannot tell.
+        Of all pools only those are listed whose machines carry this user's label.
         """
+        self._presence.forget()
+        uids = {pool_uid} if pool_uid else self._pools()
+        listed = (
+            machine
+            for uid in sorted(uids)
+            for machine in self._presence.machines(
+                uid, self._journal.entries(uid), self._prices.regions
+            )
+        )
+        machines = {machine.id: machine for machine in listed}
+        instances, asked = self._census.everywhere(pool_uid)
+        for instance in instances:
+            if pool_uid or self._mine(instance.labels):
+                machines.setdefault(instance.id, listing.of_instance(instance))
+        return Audit(tuple(machines[id] for id in sorted(machines)), asked)
+
+    def close(self) -> None:
+        """Stop to follow launches; they go on. Repeatable."""
+        self._closed.set()
+
+    def _pools(self) -> set[str]:
+        """Return the uids of this user's pools, as the journal and SkyPilot know them."""
         uids = {entry.id.pool_uid for entry in self._journal.entries()}
         for cluster in self._presence.everywhere():
             id = replica_of(cluster.name)
             if id is not None and self._mine(cluster.labels):
                 uids.add(id.pool_uid)
-        machines = {m.id: m for uid in sorted(uids) for m in self.machines(uid)}
-        for instance in self._census.everything():
-            if self._mine(instance.labels):
-                machines.setdefault(instance.id, listing.of_instance(instance))
-        return [machines[id] for id in sorted(machines)]
-
-    def close(self) -> None:
-        """Stop to follow launches; they go on. Repeatable."""
-        self._closed.set()
+        return uids
 
     def _mine(self, labels: Mapping[str, str]) -> bool:
         return labels.get(OWNER, label_value(self._owner)) == label_value(self._owner)

@@ -38,13 +38,32 @@ class Aws:
         self._clients: dict[str, Any] = {}
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
-        """See `Provider`. Regions are asked side by side."""
+        """See `Provider`. Regions are asked side by side.
+
+        Where everything is asked, a region may refuse as long as another one answers: many
+        accounts are kept out of most regions, and nothing of theirs can run there.
+        """
         where = sorted(set(self._regions() if regions is None else regions))
         if not where:
             return []
+        found: list[Instance] = []
+        refused: list[NotAllowedError] = []
+
+        def ask(region: str) -> Sequence[Instance] | NotAllowedError:
+            try:
+                return self._instances_in(region, pool_uid)
+            except NotAllowedError as error:
+                return error
+
         with ThreadPoolExecutor(min(8, len(where)), "aws") as pool:
-            found = pool.map(lambda region: self._instances_in(region, pool_uid), where)
-            return sorted((i for part in found for i in part), key=lambda i: (i.id, i.key))
+            for answer in pool.map(ask, where):
+                if isinstance(answer, NotAllowedError):
+                    refused.append(answer)
+                else:
+                    found += answer
+        if refused and (regions is not None or len(refused) == len(where)):
+            raise refused[0]
+        return sorted(found, key=lambda i: (i.id, i.key))
 
     def terminate(self, instances: Iterable[Instance]) -> None:
         """See `Provider`."""

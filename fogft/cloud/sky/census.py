@@ -18,6 +18,7 @@ from fogft.core.model import ReplicaId
 log = logging.getLogger(__name__)
 
 EVERY_S = 60.0
+NOBODY = "0" * 16  # a pool that does not exist: may one ask at all?
 
 
 class Census:
@@ -80,13 +81,16 @@ class Census:
             self._submit(lambda: self._take(pool_uid, None if everywhere else where))
         return found
 
-    def everything(self) -> Sequence[Instance]:
-        """Return what carries our labels anywhere, of any pool. Takes seconds.
+    def everywhere(self, pool_uid: str) -> tuple[Sequence[Instance], frozenset[str]]:
+        """Return what carries a pool's labels now (any pool's: empty), and which clouds were asked.
+
+        Takes seconds.
 
         Raises:
             CloudUnreachable: A provider did not answer.
         """
-        return [i for provider in self._providers.values() for i in self._ask(provider, None, "")]
+        found = [i for p in self._providers.values() for i in self._ask(p, None, pool_uid)]
+        return found, frozenset(cloud for cloud in self._providers if self.vouches(cloud))
 
     def forget(self, id: ReplicaId) -> None:
         """Take a replica that is known to be gone out of the last census."""
@@ -95,10 +99,16 @@ class Census:
             self._found[id.pool_uid] = tuple(i for i in kept if i.id != id)
 
     def unverified(self, cloud: str) -> str:
-        """Return why a cloud is not asked directly; empty when it is."""
-        if cloud not in self._providers:
+        """Return why a cloud's own list cannot be had; empty when it can. Asks for it: seconds."""
+        provider = self._providers.get(cloud)
+        if provider is None:
             return f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word"
-        return self._refused.get(cloud, "")
+        try:
+            self._ask(provider, None, NOBODY)
+        except CloudUnreachable as error:
+            return f"`{cloud}` does not say what exists there: {error.message}"
+        reason = self._refused.get(cloud, "")
+        return f"{reason}; what exists in `{cloud}` is SkyPilot's word" if reason else ""
 
     def _take(self, pool_uid: str, regions: Mapping[str, Sequence[str]] | None) -> None:
         found: list[Instance] = []

@@ -233,7 +233,7 @@ class Proof:
         with step("terminate the last one"):
             self.cloud.terminate(b)
         with step("sweep: nothing of any pool is left"):
-            assert not self.cloud.sweep()
+            assert not self.cloud.audit().machines
         assert not running()
         assert not self.cloud.machines(UID)
 

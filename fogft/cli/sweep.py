@@ -1,0 +1,93 @@
+"""``fogft sweep``: machines that cost money and that no manager owns."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fogft.cli import output
+from fogft.cli.sections import Command
+from fogft.core.errors import FogftError
+
+if TYPE_CHECKING:
+    from fogft.app.sweeping import Swept
+
+
+def register(app: typer.Typer) -> None:
+    """Add this command to the application."""
+    app.command("sweep", cls=Command)(sweep)
+
+
+def sweep(
+    end: Annotated[
+        bool, typer.Option("--end", help="End what is found, once you said yes.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="With --end: do not ask.")] = False,
+    cloud: Annotated[
+        str | None,
+        typer.Option(
+            "--cloud",
+            metavar="NAME",
+            show_default=False,
+            help="Look in `local` or `sky` only; everywhere that was used from here unless told.",
+        ),
+    ] = None,
+) -> None:
+    """Find machines of your pools that no manager owns, and end them if you wish.
+
+    Asks the clouds themselves where that can be, so it finds what everybody else forgot. A
+    machine whose pool is managed from another state folder looks like nobody's.
+
+    \b
+    Example:
+      fogft sweep
+    """
+    from fogft import app
+
+    found = [app.sweep(name) for name in ([cloud] if cloud else app.clouds_to_sweep())]
+    for one in found:
+        _show(one)
+    unowned = [machine for one in found for machine in one.unowned]
+    if not unowned:
+        output.done("no machine is without a manager")
+        if cloud is None and not any(one.cloud == "sky" for one in found):
+            output.hint("real clouds were never used from here: `--cloud sky` asks them too")
+        return
+    if not end:
+        output.hint(
+            "`fogft sweep --end` ends them; `fogft up FILE` gives a pool that is still here its "
+            "manager back"
+        )
+        return
+    if not yes and not output.confirm(f"end {len(unowned)}?"):
+        output.say("nothing was done")
+        raise typer.Exit(1)
+    problems = [problem for one in found for problem in app.end_unowned(one, output.say)]
+    if problems:
+        hints = dict.fromkeys(problem.hint for problem in problems if problem.hint)
+        raise FogftError("\n".join(problem.message for problem in problems), "; ".join(hints))
+    output.done("they are gone")
+
+
+def _show(found: Swept) -> None:
+    """List the machines of one cloud on stdout, and say who was asked on stderr."""
+    from fogft.cli.status_text import age, price
+
+    if found.cloud == "sky":
+        asked = ", ".join(f"`{name}`" for name in sorted(found.asked)) or "no cloud"
+        output.say(f"asked SkyPilot for all its clouds, and {asked} directly")
+    now = time.time()
+    rows = [
+        (
+            str(one.machine.id),
+            one.machine.placement.location,
+            f"{price(one.machine.usd_per_hour)}/h",
+            age(max(0.0, now - one.machine.launched_at)),
+            one.why,
+        )
+        for one in found.unowned
+    ]
+    if rows:
+        output.data(output.aligned(rows))

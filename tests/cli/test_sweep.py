@@ -1,0 +1,164 @@
+"""``fogft sweep``: real machines of the local cloud whose managers live, died, or never were."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fogft import disk
+from fogft.cli import main
+from fogft.cloud import sky
+from fogft.cloud.local import processes
+from fogft.core.errors import CloudUnreachable
+from fogft.pool.paths import PoolPaths
+from tests.cli.pools import STATUS, lay_down
+from tests.cloud.conftest import Local
+from tests.sky.scene import Scene
+from tests.sky.scripted_sky import replica
+
+
+@pytest.fixture
+def machines(home: Path) -> Iterator[Local]:
+    """The local cloud of this state folder; all of its processes are ended at the end."""
+    made = Local(home / "local")
+    yield made
+    processes.end(processes.find(pool_uid=made.uid))
+
+
+def pool(home: Path, machines: Local, name: str = "planner") -> PoolPaths:
+    """Lay a pool down that the machines belong to."""
+    paths = lay_down(home, replace(STATUS, pool=name))
+    identity = disk.read_json(paths.identity)
+    disk.write_json(paths.identity, {**identity, "uid": machines.uid})
+    return paths
+
+
+def run(capsys, *words: str, status: int = 0) -> tuple[list[str], str]:
+    """Run ``fogft sweep``; return its lines on stdout, and stderr."""
+    capsys.readouterr()
+    assert main.run(["sweep", *words]) == status
+    out, err = capsys.readouterr()
+    return out.splitlines(), err
+
+
+def test_what_a_living_manager_owns_is_left_alone(home, machines, capsys):
+    """Even with `--end --yes`; once the manager is dead it is listed."""
+    paths = pool(home, machines)
+    id = machines.launch()
+    lock = disk.Lock(paths.manager_lock)
+    assert lock.acquire(wait=False)
+    assert run(capsys, "--end", "--yes") == (
+        [],
+        "done: no machine is without a manager\n"
+        "\nhint: real clouds were never used from here: `--cloud sky` asks them too\n",
+    )
+    assert machines.machine(id)
+    lock.release()
+    [line], err = run(capsys)
+    assert line.split()[:2] == [str(id), "local/us-west-1/a"]
+    assert line.endswith("pool `planner` has no manager")
+    assert "`fogft sweep --end` ends them" in err
+    assert machines.machine(id), "nothing is ended unasked"
+
+
+def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys):
+    """All of its processes go, and nothing of another pool's."""
+    id = machines.running(task={"run": "x"}).id
+    [line], _ = run(capsys)
+    assert line.endswith(f"no pool of this uid in `{home}`")
+    _, err = run(capsys, "--end", "--yes")
+    assert f"ended `{id}` (local/us-west-1/a)\ndone: they are gone\n" in err
+    assert processes.find(machine=str(id)) == []
+    assert run(capsys)[0] == []
+
+
+@pytest.mark.parametrize(("answer", "goes"), [("y\n", True), ("n\n", False), ("", False)])
+def test_a_person_is_asked_first(machines, capsys, monkeypatch, answer, goes):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    id = machines.launch()
+    monkeypatch.setattr("sys.stdin", Terminal(answer))
+    _, err = run(capsys, "--end", status=0 if goes else 1)
+    assert "end 1? [y/N]" in err
+    assert (machines.machine(id) is None) is goes
+
+
+def test_nobody_to_ask_is_a_no(machines, capsys, monkeypatch):
+    id = machines.launch()
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    _, err = run(capsys, "--end", status=1)
+    assert "add `--yes`" in err
+    assert machines.machine(id)
+
+
+def test_a_pool_that_cannot_be_read_ends_nothing(home, machines, capsys):
+    """Its machines would look like nobody's."""
+    pool(home, machines).identity.write_text("{torn")
+    id = machines.launch()
+    _, err = run(capsys, "--end", "--yes", status=1)
+    assert err.startswith("error: ")
+    assert machines.machine(id)
+
+
+def test_a_manager_that_comes_back_meanwhile_keeps_its_machines(
+    home, machines, capsys, monkeypatch
+):
+    """Between the list and the end somebody ran `fogft up`."""
+    paths = pool(home, machines)
+    id = machines.launch()
+    lock = disk.Lock(paths.manager_lock)
+
+    def yes(question: str) -> bool:
+        return lock.acquire(wait=False)
+
+    monkeypatch.setattr("fogft.cli.output.confirm", yes)
+    _, err = run(capsys, "--end")
+    assert f"`{id}` is left alone: its pool has a manager again" in err
+    assert machines.machine(id)
+    lock.release()
+
+
+# -- real clouds, on the scripted SkyPilot ----------------------------------------------------
+
+
+@pytest.fixture
+def scene(home: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """Real clouds were used from here."""
+    (home / "sky").mkdir()
+    scene = Scene(home / "sky")
+    monkeypatch.setattr(sky, "make", lambda folder, base: scene.cloud)
+    return scene
+
+
+def test_a_vm_that_only_its_cloud_still_knows_is_found_and_ended(scene, capsys):
+    """The pool's folder, our notes and SkyPilot's database are gone; the label is left."""
+    scene.launched()
+    scene.sky.forget_everything()
+    scene.cloud._journal.close(replica())
+    [line], err = run(capsys)
+    assert line.split()[:3] == [str(replica()), "aws/us-east-1/us-east-1a", "$0.021/h"]
+    assert "asked SkyPilot for all its clouds, and `aws` directly" in err
+    run(capsys, "--end", "--yes")
+    assert scene.provider.found == {}
+
+
+def test_a_cloud_that_does_not_answer_is_no_empty_list(scene, capsys):
+    scene.launched()
+    scene.sky.unreachable = True
+    out, err = run(capsys, status=1)
+    assert out == []
+    assert err.startswith("error: SkyPilot cannot tell")
+
+
+def test_what_does_not_end_is_an_error_with_what_to_do(scene, capsys):
+    name = scene.launched()
+    scene.sky.fail_next("down", CloudUnreachable("no answer"), times=20)
+    _, err = run(capsys, "--end", "--yes", status=1)
+    assert f"error: `{name}` may still run: no answer" in err
+    assert f"end it with `sky down {name}`" in err
