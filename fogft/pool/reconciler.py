@@ -9,21 +9,21 @@ Not here: the decisions (`fogft.core.planner`), the loop and the processes (`man
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from fogft.cloud.port import Cloud, Launch
+from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.core import lifetime
 from fogft.core.errors import CloudError, FogftError, NoCapacity, QuotaExceeded
-from fogft.core.health import Health, Verdict, judge
-from fogft.core.history import Event, EventKind, History
+from fogft.core.health import judge
+from fogft.core.history import EventKind, History
 from fogft.core.intent import Intent
 from fogft.core.membership import members_of, successor
 from fogft.core.model import (
     LinkReport,
-    LinkState,
     Machine,
     MachinePhase,
     Membership,
@@ -32,8 +32,10 @@ from fogft.core.model import (
     ReplicaId,
 )
 from fogft.core.planner import Plan, PlannedLaunch, plan
+from fogft.core.refreshing import Silent
 from fogft.core.spec import PoolSpec
 from fogft.pool.operations import Operations, Submit
+from fogft.pool.remembering import Remembering
 from fogft.pool.store import Identity, Store
 
 log = logging.getLogger(__name__)
@@ -107,8 +109,11 @@ class Reconciler:
         self._epoch = epoch
         # A planned launch is what a launch is about; None stands for a termination.
         self._operations: Operations[Machine | None] = Operations(submit, on_done)
+        self._refreshes: Operations[None] = Operations(submit, on_done)
+        self._silent = Silent()
         self._offers: tuple[Offer, ...] = ()
         self._offers_for: tuple[str, float] | None = None
+        self._remember = Remembering(store, clock)
         self._membership: Membership | None = store.membership()
 
     def tick(self) -> Tick:
@@ -122,9 +127,10 @@ class Reconciler:
         self._settle_outcomes()
         observed, trouble = self._observe(identity, spec)
         if observed.machines is not None:
-            self._remember_losses(observed)
+            self._remember.losses(observed)
+            self._ask_about_silent(observed, history)
             health = judge(identity.uid, spec, observed, history)
-            self._remember_health(health, history)
+            self._remember.health(health, history)
         hours = (spec, intent, identity.created_at, observed.now)
         trouble += lifetime.notes(*hours)
         over = lifetime.is_over(*hours)
@@ -158,7 +164,7 @@ class Reconciler:
                 )
                 cause = _refusal(error)
                 if cause:
-                    self._remember(EventKind.REFUSED, id, detail=f"{cause}: {error}")
+                    self._remember.add(EventKind.REFUSED, id, detail=f"{cause}: {error}")
 
     def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[str]]:
         trouble: list[str] = []
@@ -179,6 +185,18 @@ class Reconciler:
         links = self._links(identity.uid, now)
         return Observed(now, machines, links, offers, ending), trouble
 
+    def _ask_about_silent(self, observed: Observed, history: History) -> None:
+        """Have the cloud asked about replicas that fell silent, where its list is from memory."""
+        cloud = self._cloud
+        if not isinstance(cloud, Refreshing):
+            return
+        for outcome in self._refreshes.collect():
+            if outcome.error is not None:
+                log.warning("refresh_failed replica=%s reason=%r", outcome.id.short, outcome.error)
+        for id in self._silent.due(observed, history):
+            if self._refreshes.start(id, None, functools.partial(cloud.refresh, id)):
+                log.info("refresh_ordered replica=%s", id.short)
+
     def _current_offers(self, spec: PoolSpec, now: float, trouble: list[str]) -> tuple[Offer, ...]:
         resources = spec.task.get("resources") or {}
         key = json.dumps(resources, sort_keys=True, default=str)
@@ -192,43 +210,6 @@ class Reconciler:
                 if known is None or known[0] != key:
                     return ()
         return self._offers
-
-    # -- remember ---------------------------------------------------------------------------
-
-    def _remember(
-        self, kind: EventKind, id: ReplicaId, *, location: str = "", detail: str = ""
-    ) -> None:
-        self._store.append(Event(self._clock(), kind, id.slot, id.generation, location, detail))
-
-    def _remember_losses(self, observed: Observed) -> None:
-        uid = self._store.identity().uid
-        listed = {m.id for m in observed.machines or ()}
-        for record in self._store.history().open():
-            id = ReplicaId(uid, record.slot, record.generation)
-            if id not in listed:
-                kind = EventKind.ENDED if record.ending else EventKind.GONE
-                log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
-                self._remember(kind, id)
-
-    def _remember_health(self, health: Health, history: History) -> None:
-        for judged in health.replicas:
-            id, machine = judged.id, judged.machine
-            record = history.record(id.slot, id.generation)
-            if record is None or record.closed is not None:  # the cloud's list is the record
-                self._remember(EventKind.LAUNCH, id, location=machine.placement.location)
-                record = history.record(id.slot, id.generation)
-            if record is None:
-                continue
-            up = judged.link is not None and judged.link.state is LinkState.UP
-            if judged.serving and (record.first_ready_at is None or record.unready_since):
-                log.info("replica_ready replica=%s zone=%s", id.short, record.location)
-                self._remember(EventKind.READY, id)
-            elif up and not judged.serving and record.first_ready_at and not record.unready_since:
-                log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
-                self._remember(EventKind.UNREADY, id)
-            if judged.verdict is Verdict.FAILED and not record.failed:
-                log.warning("replica_failed replica=%s reason=%r", id.short, judged.why)
-                self._remember(EventKind.FAILED, id, detail=judged.why)
 
     # -- apply ------------------------------------------------------------------------------
 
@@ -250,9 +231,9 @@ class Reconciler:
                 continue
             if machine.id in plan.draining:
                 if record.draining_since is None:
-                    self._remember(EventKind.DRAINING, machine.id)
+                    self._remember.add(EventKind.DRAINING, machine.id)
             elif record.draining_since is not None and machine.id not in ends:
-                self._remember(EventKind.UNDRAINED, machine.id)
+                self._remember.add(EventKind.UNDRAINED, machine.id)
 
     def _publish(self, identity: Identity, observed: Observed, plan: Plan) -> None:
         members = members_of(
@@ -275,7 +256,7 @@ class Reconciler:
     def _launch(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> None:
         order = self._build_order(identity, spec, planned)
         location = order.placement.location
-        self._remember(EventKind.LAUNCH, order.id, location=location, detail=planned.reason)
+        self._remember.add(EventKind.LAUNCH, order.id, location=location, detail=planned.reason)
         log.info("launch_ordered replica=%s zone=%s %s", order.id.short, location, planned.reason)
         expected = Machine(
             id=order.id,
@@ -292,7 +273,7 @@ class Reconciler:
             return  # its launch is under way: a later tick ends it
         record = history.record(id.slot, id.generation)
         if record is None or not record.ending:
-            self._remember(EventKind.ENDING, id, detail=reason)
+            self._remember.add(EventKind.ENDING, id, detail=reason)
             log.info("terminate_ordered replica=%s reason=%r", id.short, reason)
         self._operations.start(id, None, lambda: self._cloud.terminate(id))
 

@@ -11,7 +11,7 @@ import pytest
 from fogft.core import intent as intents
 from fogft.core.errors import CloudUnreachable, NoCapacity, QuotaExceeded
 from fogft.core.spec import HealthSpec, PoolSpec
-from tests.simulation.world import SERVICE, UID, World
+from tests.simulation.world import SERVICE, UID, CheckedCloud, World
 
 PLACES = (
     "east/one/a",
@@ -24,7 +24,7 @@ FAULTY_STEPS = 80
 RECOVERY_STEPS = 600
 
 
-def make_world(seed: int) -> World:
+def make_world(seed: int, cloud: type[CheckedCloud] = CheckedCloud) -> World:
     chance = random.Random(f"spec {seed}")
     replicas = chance.randint(1, 4)
     spec = PoolSpec(
@@ -36,7 +36,7 @@ def make_world(seed: int) -> World:
         health=HealthSpec(start_limit_s=60.0),
         task={"run": "one"},
     )
-    return World(seed, spec, PLACES[: chance.randint(2, 5)])
+    return World(seed, spec, PLACES[: chance.randint(2, 5)], cloud)
 
 
 # -- faults: each breaks something, and some name what mends it later ------------------------

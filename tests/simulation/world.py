@@ -7,7 +7,8 @@ every write. Nothing here knows how the planner decides.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from fogft.cloud.mock import MockCloud, zones
 from fogft.cloud.port import Launch
@@ -45,16 +46,48 @@ class CheckedCloud(MockCloud):
         self.world.crash_point()
 
 
+class RememberingCloud(CheckedCloud):
+    """Lists from memory: what ran once is listed until somebody asks about it, or ends it."""
+
+    def __init__(self, *args: Any, **others: Any) -> None:
+        super().__init__(*args, **others)
+        self.remembered: dict[ReplicaId, Machine] = {}
+        self.refreshed: list[ReplicaId] = []
+
+    def machines(self, pool_uid: str) -> Sequence[Machine]:
+        found = {m.id: m for m in super().machines(pool_uid)}
+        running = {id: m for id, m in found.items() if m.phase is MachinePhase.RUNNING}
+        self.remembered |= running
+        of_pool = {id: m for id, m in self.remembered.items() if id.pool_uid == pool_uid}
+        listed = {**of_pool, **found}
+        return [listed[id] for id in sorted(listed)]
+
+    def terminate(self, id: ReplicaId) -> None:
+        super().terminate(id)
+        self.remembered.pop(id, None)
+
+    def refresh(self, id: ReplicaId) -> None:
+        self._meet("refresh")
+        self.refreshed.append(id)
+        self.remembered.pop(id, None)  # the next list has it again if it is there
+
+
 class World:
     """One pool by seed. `step` lets time pass; `tick` lets the manager work."""
 
-    def __init__(self, seed: int, spec: PoolSpec, places: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        seed: int,
+        spec: PoolSpec,
+        places: tuple[str, ...],
+        cloud: type[CheckedCloud] = CheckedCloud,
+    ) -> None:
         self.random = random.Random(seed)
         self.now = START
         self.spec = spec
         self.store = MemoryStore(Identity(spec.name, UID, "mock", "/pool.yaml", START), spec)
         self.store.crash_point = self.crash_point
-        self.cloud = CheckedCloud(lambda: self.now, zones(*places), seed=seed)
+        self.cloud = cloud(lambda: self.now, zones(*places), seed=seed)
         self.cloud.world = self
         self.frozen: set[ReplicaId] = set()
         self.crashing: set[ReplicaId] = set()  # their service is away

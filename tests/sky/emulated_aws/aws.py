@@ -86,6 +86,10 @@ class World:
             vm = self.vms.pop(id, None)
         if vm is None:
             return
+        # Its network first: a machine that is taken away says goodbye to nobody.
+        subprocess.run(
+            ["ip", "link", "set", f"vf{id[-8:]}", "down"], check=False, capture_output=True
+        )
         os.killpg(vm.pid, signal.SIGKILL)
         vm.wait()
         name = "f" + id[-8:]

@@ -1,0 +1,70 @@
+"""Write down what was seen to happen to each replica, once: it became ready, failed, went.
+
+Owns: which observation is an event.
+Not here: when to look (`reconciler`) and where it is stored (`store`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from fogft.core.health import Health, Verdict
+from fogft.core.history import Event, EventKind, History
+from fogft.core.model import LinkState, Observed, ReplicaId
+from fogft.pool.store import Store
+
+log = logging.getLogger(__name__)
+
+
+class Remembering:
+    """Adds to a pool's history. Events are on disk before a method returns.
+
+    Args:
+        store: Where the history is.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(self, store: Store, clock: Callable[[], float]) -> None:
+        self._store = store
+        self._clock = clock
+
+    def add(self, kind: EventKind, id: ReplicaId, *, location: str = "", detail: str = "") -> None:
+        """Add one event.
+
+        Raises:
+            StateError: It cannot be written; it did not happen.
+        """
+        self._store.append(Event(self._clock(), kind, id.slot, id.generation, location, detail))
+
+    def losses(self, observed: Observed) -> None:
+        """Note who is no longer listed. The cloud's list must be known."""
+        uid = self._store.identity().uid
+        listed = {m.id for m in observed.machines or ()}
+        for record in self._store.history().open():
+            id = ReplicaId(uid, record.slot, record.generation)
+            if id not in listed:
+                kind = EventKind.ENDED if record.ending else EventKind.GONE
+                log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
+                self.add(kind, id)
+
+    def health(self, health: Health, history: History) -> None:
+        """Note who became ready, stopped to be, or failed."""
+        for judged in health.replicas:
+            id, machine = judged.id, judged.machine
+            record = history.record(id.slot, id.generation)
+            if record is None or record.closed is not None:  # the cloud's list is the record
+                self.add(EventKind.LAUNCH, id, location=machine.placement.location)
+                record = history.record(id.slot, id.generation)
+            if record is None:
+                continue
+            up = judged.link is not None and judged.link.state is LinkState.UP
+            if judged.serving and (record.first_ready_at is None or record.unready_since):
+                log.info("replica_ready replica=%s zone=%s", id.short, record.location)
+                self.add(EventKind.READY, id)
+            elif up and not judged.serving and record.first_ready_at and not record.unready_since:
+                log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
+                self.add(EventKind.UNREADY, id)
+            if judged.verdict is Verdict.FAILED and not record.failed:
+                log.warning("replica_failed replica=%s reason=%r", id.short, judged.why)
+                self.add(EventKind.FAILED, id, detail=judged.why)

@@ -1,0 +1,258 @@
+"""Whole pools through `fogft` itself, with unmodified SkyPilot on the emulated AWS.
+
+Runs inside a world (`world.sh`). Replicas are real server proxies with a real service on VMs
+of their own; the robot has a real client proxy and an ordinary rclpy client that asks all the
+time. Machines are preempted with notice and without, a region runs out of capacity, the
+manager is killed in the middle of a launch: no request may fail. At the end the account is
+empty, and nothing of it runs here any more.
+
+Prints a table of steps and writes it to RESULTS; ends with status 1 at the first thing wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tests.e2e.pool import NODES, Client
+from tests.sky.emulated_aws import timetable
+from tests.sky.emulated_aws.emulation import Steps, control, disk_of, running, until
+
+ROBOT = Path("/robot")
+FOLDER = ROBOT / "pool"
+HOME = ROBOT / "fogft"
+RATE_HZ = 5.0
+REGIONS = ("us-east-1", "us-west-2", "eu-west-1")
+POOL_FILE = f"""\
+name: proof
+resources:
+  cpus: 2
+  use_spot: true
+  any_of: [{", ".join(f"{{infra: aws/{region}}}" for region in REGIONS)}]
+workdir: .
+envs: {{GREETING: hello}}
+secrets: {{TOKEN: t0p-secret}}
+setup: echo "setup of $GREETING with $TOKEN" >> ~/setup-ran
+run: |
+  echo "$GREETING $TOKEN" > ~/run-found
+  exec python3 plan_service.py
+fogft:
+  replicas: 2
+  services:
+    - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}}
+"""
+step = Steps()
+
+
+class Pool:
+    """One pool, as a user at the command line has it."""
+
+    def __init__(self) -> None:
+        FOLDER.mkdir(parents=True)
+        self.file = FOLDER / "pool.yaml"
+        self.file.write_text(POOL_FILE)
+        shutil.copy(NODES / "plan_service.py", FOLDER)
+        self.environ = {
+            **os.environ,
+            "FOGFT_HOME": str(HOME),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": str(ROBOT / "ros-log"),
+            "NO_COLOR": "1",
+        }
+
+    def fogft(self, *words: str, status: int = 0, limit_s: float = 400.0) -> str:
+        """Run a command; return all that it said."""
+        done = subprocess.run(
+            [sys.executable, "-m", "fogft", *words], env=self.environ, cwd=FOLDER, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            timeout=limit_s, check=False,
+        )  # fmt: skip
+        assert done.returncode == status, f"fogft {' '.join(words)}\n{done.stdout}"
+        return done.stdout
+
+    def status(self) -> dict[str, Any]:
+        """Return `status.json`, as the manager wrote it last."""
+        return json.loads((HOME / "pools" / "proof" / "status.json").read_text())
+
+    def replicas(self, phase: str = "ready") -> dict[str, dict[str, Any]]:
+        """Return the replicas in a phase, by ``slot.generation``."""
+        found = self.status()["replicas"]
+        return {f"{r['slot']}.{r['generation']}": r for r in found if r["phase"] == phase}
+
+    def others(self, name: str) -> set[str]:
+        """Return the replicas of any phase but the one named."""
+        return {f"{r['slot']}.{r['generation']}" for r in self.status()["replicas"]} - {name}
+
+    def whole(self, count: int) -> bool:
+        """Whether that many replicas are ready, and there is no other."""
+        status = self.status()
+        return status["ready"] == count == len(status["replicas"])
+
+    def pid(self, part: str) -> int:
+        return int(self.status()[f"{part}_pid"])
+
+
+def region_of(replica: dict[str, Any]) -> str:
+    return str(replica["location"].split("/")[1])
+
+
+def machine_of(name: str) -> dict[str, Any]:
+    """Return the instance of a replica, ``slot.generation``."""
+    slot, generation = name.split(".")
+    wanted = {"fogft-slot": slot, "fogft-generation": generation}
+    return next(i for i in running() if wanted.items() <= i["labels"].items())
+
+
+class Proof:
+    def __init__(self) -> None:
+        self.pool = Pool()
+        self.client: Client | None = None
+
+    def run(self) -> None:
+        self.nothing_without_a_yes()
+        self.up()
+        self.what_a_machine_has()
+        self.preempted_without_notice_and_a_region_is_full()
+        self.preempted_with_notice()
+        self.manager_dies_in_mid_launch()
+        self.scale_down()
+        self.requests()
+        self.down()
+
+    def nothing_without_a_yes(self) -> None:
+        with step("`up` asks, and nobody says yes (starts SkyPilot's server)"):
+            said = self.pool.fogft("up", str(self.pool.file), status=1)
+        print(said)
+        assert "`aws` can be used" in said
+        assert "live, " in said
+        assert "nobody is there to say yes" in said
+        assert not running()
+        assert not HOME.exists() or not list((HOME / "pools").glob("*"))
+
+    def up(self) -> None:
+        with step("`up --yes`, until the service answers"):
+            print(self.pool.fogft("up", str(self.pool.file), "--yes"))
+        self.client = Client(self.pool.environ, 3600.0, RATE_HZ, 15.0)
+        with step("... until both replicas are ready"):
+            until("the pool is whole", lambda: self.pool.whole(2))
+        assert {region_of(r) for r in self.pool.replicas().values()} == {"us-east-1", "us-west-2"}
+
+    def what_a_machine_has(self) -> None:
+        """The VM has what the pool file and the template promise, and nothing more."""
+        status = self.pool.status()
+        for name in self.pool.replicas():
+            instance = machine_of(name)
+            assert instance["spot"]
+            assert instance["labels"]["fogft-pool"] == status["uid"]
+            home = disk_of(instance) / "home/ubuntu"
+            assert (home / "setup-ran").read_text() == "setup of hello with t0p-secret\n"
+            assert (home / "run-found").read_text() == "hello t0p-secret\n"
+            ours = home / ".fogft/replica"
+            files = {"replica.yaml", "ca.crt", "replica.crt", "replica.key"}
+            assert {path.name for path in ours.iterdir()} == files
+            modes = {path.stat().st_mode & 0o777 for path in (ours, *ours.iterdir())}
+            assert modes == {0o700, 0o600}, modes
+            (carried,) = (home / ".fogft/wheel").glob("fogft-*.whl")
+            (made,) = (HOME / "sky/wheels").glob("*/fogft-*.whl")
+            assert carried.read_bytes() == made.read_bytes()
+
+    def preempted_without_notice_and_a_region_is_full(self) -> None:
+        control("/capacity?place=eu-west-1&has=0")
+        lost = next(n for n, r in self.pool.replicas().items() if region_of(r) == "us-east-1")
+        control(f"/preempt?id={machine_of(lost)['id']}")
+        with step("preempted without notice: until its replacement is launched"):
+            until("it is being replaced", lambda: len(self.pool.others(lost)) == 2)
+        with step("... one region has no capacity: until whole again, elsewhere"):
+            until("the pool is whole", lambda: self.pool.whole(2))
+        events = self.pool.status()["events"]
+        print(json.dumps(events[-12:], indent=1))
+        assert any(e["detail"].startswith("capacity") for e in events)
+        control("/capacity?place=eu-west-1&has=1")
+
+    def preempted_with_notice(self) -> None:
+        warned = next(n for n, r in self.pool.replicas().items() if r["generation"] == 1)
+        control(f"/notice?id={machine_of(warned)['id']}&in_s=90")
+        with step("preemption notice: until its replacement is launched"):
+            until("it is being replaced", lambda: len(self.pool.others(warned)) == 2)
+        with step("... until the replacement is ready"):
+            until("there are two others", lambda: len({*self.pool.replicas()} - {warned}) == 2)
+        with step("... until whole, without the one that was warned"):
+            until("the pool is whole", lambda: self.pool.whole(2) and warned not in
+                  self.pool.replicas())  # fmt: skip
+
+    def manager_dies_in_mid_launch(self) -> None:
+        before = {*self.pool.replicas()}
+        with step("`scale up 1`, until its machine exists"):
+            self.pool.fogft("scale", "up", "1")
+            until("it exists", lambda: len(running()) == 3)
+        os.kill(self.pool.pid("manager"), signal.SIGKILL)
+        with step("the manager is killed in mid launch; `up` starts another"):
+            said = self.pool.fogft("up", str(self.pool.file))
+        assert "it had no manager" in said, said
+        with step("... until whole again, with the same launch"):
+            until("the pool is whole", lambda: self.pool.whole(3))
+        assert before < {*self.pool.replicas()}
+        assert len(running()) == 3
+
+    def scale_down(self) -> None:
+        with step("`scale down 1`, until the account has two machines"):
+            self.pool.fogft("scale", "down", "1")
+            until("two are left", lambda: self.pool.whole(2) and len(running()) == 2)
+
+    def requests(self) -> None:
+        assert self.client is not None
+        result = self.client.finish()
+        print(json.dumps(result))
+        assert result["requests"] > 100
+        assert result["answered"] == result["requests"], result
+        assert result["failed"] == result["wrong"] == result["twice"] == 0, result
+        step.requests = result
+
+    def down(self) -> None:
+        with step("`down`, verified with the cloud"):
+            print(self.pool.fogft("down"))
+        assert not running()
+        assert not list((HOME / "pools").glob("*"))
+        left = [line for line in processes() if str(HOME) in line]
+        assert not left, left
+
+
+def processes() -> list[str]:
+    """Return the environment of every process of the pool that still runs here."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                environ = (entry / "environ").read_bytes().replace(b"\0", b" ").decode()
+                words = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except (OSError, UnicodeDecodeError):
+                continue
+            if "sky.server" not in words:
+                found.append(f"{entry.name}: {words} {environ}")
+    return found
+
+
+def main() -> int:
+    results = Path(sys.argv[1])
+    proof = Proof()
+    try:
+        proof.run()
+    finally:
+        log = HOME / "pools/proof/manager.log"
+        if log.exists():
+            shutil.copy(log, results / "manager.log")
+    table = timetable.table(step.done, results)
+    print(table)
+    (results / "pool.txt").write_text(table)
+    print("every step passed")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
