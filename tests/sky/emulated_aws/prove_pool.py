@@ -89,6 +89,11 @@ class Pool:
         """Return the replicas of any phase but the one named."""
         return {f"{r['slot']}.{r['generation']}" for r in self.status()["replicas"]} - {name}
 
+    def clusters(self) -> set[str]:
+        """Return the names of the replicas' clusters."""
+        status = self.status()
+        return {f"fogft-{status['uid']}-{r['slot']}-{r['generation']}" for r in status["replicas"]}
+
     def whole(self, count: int) -> bool:
         """Whether that many replicas are ready, and there is no other."""
         status = self.status()
@@ -113,6 +118,23 @@ class Proof:
     def __init__(self) -> None:
         self.pool = Pool()
         self.client: Client | None = None
+        self.machines = timetable.Machines()
+        self.reactions: list[str] = []
+        self.result: dict[str, Any] = {}
+
+    def whole(self, count: int) -> None:
+        """Wait until the pool is whole; note when its new machines were set up."""
+        until("the pool is whole", lambda: self.pool.whole(count))
+        self.machines.look()
+
+    def react(self, cause: str, words: str, *effects: tuple[str, str]) -> None:
+        """Note how long after the cloud's last deed of a kind the manager did what."""
+        at = [e["at"] for e in control("/log", post=False) if e["event"] == cause][-1]
+        log = timetable.events(HOME / "pools/proof/manager.log")
+        steps = [f"{seconds:.2f} s until {name}" for name, seconds in
+                 timetable.reaction(log, at, effects)]  # fmt: skip
+        self.reactions.append(f"{words}: {', then '.join(steps)}")
+        print(self.reactions[-1], flush=True)
 
     def run(self) -> None:
         self.nothing_without_a_yes()
@@ -140,7 +162,7 @@ class Proof:
             print(self.pool.fogft("up", str(self.pool.file), "--yes"))
         self.client = Client(self.pool.environ, 3600.0, RATE_HZ, 15.0)
         with step("... until both replicas are ready"):
-            until("the pool is whole", lambda: self.pool.whole(2))
+            self.whole(2)
         assert {region_of(r) for r in self.pool.replicas().values()} == {"us-east-1", "us-west-2"}
 
     def what_a_machine_has(self) -> None:
@@ -163,28 +185,34 @@ class Proof:
             assert carried.read_bytes() == made.read_bytes()
 
     def preempted_without_notice_and_a_region_is_full(self) -> None:
-        control("/capacity?place=eu-west-1&has=0")
         lost = next(n for n, r in self.pool.replicas().items() if region_of(r) == "us-east-1")
-        control(f"/preempt?id={machine_of(lost)['id']}")
+        control("/capacity?place=us-east-1&has=0")
         with step("preempted without notice: until its replacement is launched"):
+            control(f"/preempt?id={machine_of(lost)['id']}")
             until("it is being replaced", lambda: len(self.pool.others(lost)) == 2)
-        with step("... one region has no capacity: until whole again, elsewhere"):
-            until("the pool is whole", lambda: self.pool.whole(2))
-        events = self.pool.status()["events"]
-        print(json.dumps(events[-12:], indent=1))
-        assert any(e["detail"].startswith("capacity") for e in events)
-        control("/capacity?place=eu-west-1&has=1")
+        self.react("preempt", "preempted", ("refresh_ordered", lost), ("replica_gone", lost),
+                   ("launch_ordered", ""))  # fmt: skip
+        with step("... its region has no capacity left: until whole again, elsewhere"):
+            self.whole(2)
+        failed = [e for e in self.pool.status()["events"] if e["detail"].startswith("capacity")]
+        assert failed
+        regions = {region_of(r) for r in self.pool.replicas().values()}
+        assert regions == {"us-west-2", "eu-west-1"}
+        control("/capacity?place=us-east-1&has=1")
+        with step("... until SkyPilot's records are those of the pool"):
+            until("they are", lambda: clusters() == self.pool.clusters())
 
     def preempted_with_notice(self) -> None:
         warned = next(n for n, r in self.pool.replicas().items() if r["generation"] == 1)
-        control(f"/notice?id={machine_of(warned)['id']}&in_s=90")
         with step("preemption notice: until its replacement is launched"):
+            control(f"/notice?id={machine_of(warned)['id']}&in_s=120")
             until("it is being replaced", lambda: len(self.pool.others(warned)) == 2)
-        with step("... until the replacement is ready"):
-            until("there are two others", lambda: len({*self.pool.replicas()} - {warned}) == 2)
-        with step("... until whole, without the one that was warned"):
-            until("the pool is whole", lambda: self.pool.whole(2) and warned not in
-                  self.pool.replicas())  # fmt: skip
+        self.react("notice", "notice given", ("launch_ordered", warned))
+        with step("... until whole, the one that was warned ended"):
+            self.whole(2)
+        assert warned not in self.pool.replicas()
+        taken = [e for e in control("/log", post=False) if e["event"] == "preempt"]
+        assert len(taken) == 1, "the notice's time was over before the replacement served"
 
     def manager_dies_in_mid_launch(self) -> None:
         before = {*self.pool.replicas()}
@@ -196,7 +224,7 @@ class Proof:
             said = self.pool.fogft("up", str(self.pool.file))
         assert "it had no manager" in said, said
         with step("... until whole again, with the same launch"):
-            until("the pool is whole", lambda: self.pool.whole(3))
+            self.whole(3)
         assert before < {*self.pool.replicas()}
         assert len(running()) == 3
 
@@ -212,15 +240,23 @@ class Proof:
         assert result["requests"] > 100
         assert result["answered"] == result["requests"], result
         assert result["failed"] == result["wrong"] == result["twice"] == 0, result
-        step.requests = result
+        self.result = result
 
     def down(self) -> None:
         with step("`down`, verified with the cloud"):
             print(self.pool.fogft("down"))
         assert not running()
+        assert not clusters()
         assert not list((HOME / "pools").glob("*"))
         left = [line for line in processes() if str(HOME) in line]
         assert not left, left
+
+
+def clusters() -> set[str]:
+    """Return the clusters that SkyPilot has a record of."""
+    from sky.client import sdk
+
+    return {record["name"] for record in sdk.get(sdk.status(None, all_users=True))}
 
 
 def processes() -> list[str]:
@@ -247,9 +283,13 @@ def main() -> int:
         log = HOME / "pools/proof/manager.log"
         if log.exists():
             shutil.copy(log, results / "manager.log")
-    table = timetable.table(step.done, results)
-    print(table)
-    (results / "pool.txt").write_text(table)
+    told = [
+        timetable.table(step.done, timetable.skypilots(proof.machines)),
+        *(f"{line}\n" for line in proof.reactions),
+        f"requests: {json.dumps(proof.result)}\n",
+    ]
+    print("\n" + "".join(told))
+    (results / "pool.txt").write_text("".join(told))
     print("every step passed")
     return 0
 
