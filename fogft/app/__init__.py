@@ -22,7 +22,14 @@ from fogft.app.looking import (
     status,
     tail,
 )
-from fogft.app.parts import examples, init, run_manager, run_proxy, run_server
+from fogft.app.parts import (
+    examples,
+    init,
+    run_manager,
+    run_proxy,
+    run_rendezvous,
+    run_server,
+)
 from fogft.app.sweeping import clouds_to_sweep, end_unowned, sweep
 from fogft.app.wishes import drain, exclude, include, scale
 
@@ -53,6 +60,7 @@ __all__ = [
     "refresh",
     "run_manager",
     "run_proxy",
+    "run_rendezvous",
     "run_server",
     "scale",
     "slots",

@@ -60,3 +60,10 @@ def run_manager(pool: str) -> None:
     from fogft.pool import manager
 
     manager.run(make_store(pool), cloud_of)
+
+
+def run_rendezvous(config: Path, *, listen: str | None = None) -> None:
+    """Run a rendezvous until a signal ends it."""
+    from fogft.pool import rendezvous
+
+    rendezvous.run(rendezvous.read_config(config, listen))

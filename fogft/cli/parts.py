@@ -1,4 +1,4 @@
-"""``fogft proxy | serve | manager``: one part of a pool, by hand, in the foreground.
+"""``fogft proxy | serve | manager | rendezvous``: one part of a pool, by hand, in the foreground.
 
 `fogft up` starts them all. These are for a service manager, a container, a debugger.
 """
@@ -20,7 +20,7 @@ Config = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the application."""
-    for command in (proxy, serve, manager):
+    for command in (proxy, serve, manager, rendezvous):
         app.command(command.__name__, cls=Command)(command)
 
 
@@ -94,3 +94,25 @@ def manager(
     from fogft import app
 
     app.run_manager(pool)
+
+
+def rendezvous(
+    config: Config,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Run a rendezvous: it tells robots and replicas of a pool where the others are.
+
+    It needs a port that all can reach and carries no requests. Run two, on two machines.
+
+    \b
+    Example:
+      fogft rendezvous --config rendezvous.yaml --listen 0.0.0.0:7450
+    """
+    from fogft import app
+
+    app.run_rendezvous(config, listen=listen)

@@ -45,6 +45,12 @@ class Signer:
         self._key: ec.EllipticCurvePrivateKey | None = None
         self._load()
 
+    @property
+    def certificate(self) -> bytes:
+        """The present certificate (DER)."""
+        self._load()
+        return self._der
+
     def __call__(self, message: bytes) -> tuple[bytes, bytes]:
         """Return certificate and signature (both DER)."""
         from cryptography.hazmat.primitives import hashes
