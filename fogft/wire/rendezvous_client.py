@@ -44,7 +44,7 @@ class Known:
     Attributes:
         connected: How many rendezvous are connected.
         seen_host: Our own address, as a rendezvous saw it; empty if none did.
-        revoked: Serial numbers of certificates that are good no more.
+        revoked: Common names of certificates that are good no more.
     """
 
     records: tuple[Record, ...] = ()

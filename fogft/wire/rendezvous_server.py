@@ -172,7 +172,7 @@ class RendezvousServer:
             f".{self._exchange.records.pool_uid}"
         ):
             raise RecordError("role", f"`{caller.common_name}` may not call")
-        if caller.serial in self._exchange.records.revoked:
+        if caller.common_name in self._exchange.records.revoked:
             raise RecordError("revoked", f"the certificate of `{caller.common_name}` is revoked")
 
     def _renew_context(self) -> None:

@@ -221,7 +221,7 @@ def test_a_member_may_write_nothing_but_its_own(scene):
         Record(POOL_UID, RecordKind.SLOT, "1", 1, 9, slot),
         Record(POOL_UID, RecordKind.SLOT, "0", 2, 9, slot),
         Record(POOL_UID, RecordKind.ADMISSION, "", 9, 9, admission),
-        Record(POOL_UID, RecordKind.REVOCATION, "", 9, 9, {"serials": []}),
+        Record(POOL_UID, RecordKind.REVOCATION, "", 9, 9, {"names": []}),
         Record(POOL_UID, RecordKind.ROBOT, "r", 1, 9, {"dial_in": "6.6.6.6:6"}),
     ]
     with scene.greeted(thief) as link, scene.counts("offered", "refused_writer", len(forged)):
