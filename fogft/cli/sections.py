@@ -11,7 +11,7 @@ SECTIONS = {
     "Look": ("status", "logs", "doctor"),
     "Change what runs": ("scale", "drain", "exclude", "include"),
     "Try what happens when": ("chaos",),
-    "Run one part by hand": ("proxy", "serve", "manager"),
+    "Run one part by hand": ("proxy", "serve", "manager", "rendezvous"),
 }
 
 

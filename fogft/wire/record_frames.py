@@ -31,7 +31,7 @@ NONCE_BYTES = 32
 _LENGTH = struct.Struct(">I")
 _BATCH_BYTES = 64 << 10
 _DIGEST_LIMIT = 4096
-_GREETING_PREFIX = b"fogft greeting 1\n"  # so that no record's signature is a greeting's
+_GREETING_PREFIX = b"fogft caller 1\n"  # so that no other signature is good for this
 
 
 class Unframer:
