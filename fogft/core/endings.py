@@ -10,7 +10,7 @@ Not here: why a replica should go (`planner`, `health`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from fogft.core.health import Health, Judged, Verdict
@@ -49,6 +49,11 @@ class Standing:
     def location(self) -> str:
         """Where it is."""
         return self.judged.machine.placement.location
+
+    @property
+    def usd_per_hour(self) -> float:
+        """What it costs."""
+        return self.judged.machine.usd_per_hour
 
     @property
     def verdict(self) -> Verdict:
@@ -108,6 +113,22 @@ class Census:
         yield from self.aborted
         yield from self.ending
 
+    def of(self, is_member: Callable[[int], bool]) -> Census:
+        """Return the part of it whose slots are members."""
+        return Census(
+            *(
+                [s for s in part if is_member(s.slot)]
+                for part in (
+                    self.good,
+                    self.replaced,
+                    self.lost,
+                    self.failed,
+                    self.aborted,
+                    self.ending,
+                )
+            )
+        )
+
     @property
     def live(self) -> int:
         """Machines that count against `replicas + max_surge`."""
@@ -128,6 +149,11 @@ class Endings:
         """Those that end now."""
         return {s.id for s, _ in self.now}
 
+    def __add__(self, other: Endings) -> Endings:
+        return Endings(
+            self.now + other.now, self.draining + other.draining, self.notes + other.notes
+        )
+
 
 def choose_endings(
     wanted: int,
@@ -137,8 +163,13 @@ def choose_endings(
     *,
     now: float,
     drain_limit_s: float,
+    dear_first: bool = False,
 ) -> Endings:
-    """Choose who ends of those that are lost, replaced or too many."""
+    """Choose who ends of those that are lost, replaced or too many.
+
+    Args:
+        dear_first: The pool is over its cap: of those that are too many the dearest go first.
+    """
     chooser = _Chooser(wanted, census, now, drain_limit_s)
     surplus = len(census.good) + len(census.replaced) - wanted
     if health.uplink_suspected or not health.links_known:
@@ -147,7 +178,8 @@ def choose_endings(
         return chooser.out
     for standing in census.lost:
         chooser.end_lost(standing, history)
-    chooser.end_some(_by_expendability(census.good), len(census.good) - wanted, "not wanted")
+    expendable = _by_expendability(census.good, dear_first=dear_first)
+    chooser.end_some(expendable, len(census.good) - wanted, "not wanted")
     left = len(census.good) + len(census.replaced) - chooser.counted_out - wanted
     ready_slots = {s.slot for s in census.good if s.judged.serving}
     replaced = sorted(
@@ -163,17 +195,18 @@ def choose_endings(
     return chooser.out
 
 
-def _by_expendability(standings: Iterable[Standing]) -> list[Standing]:
+def _by_expendability(standings: Iterable[Standing], *, dear_first: bool) -> list[Standing]:
     """Not serving first, then already draining, then the most crowded domain, then the top slot."""
     standings = list(standings)
     count = crowding(s.judged.machine.placement for s in standings)
 
-    def rank(s: Standing) -> tuple[bool, bool, bool, int, int, int, int, int]:
+    def rank(s: Standing) -> tuple[bool, bool, bool, float, int, int, int, int, int]:
         cloud, region, zone = domains(s.judged.machine.placement)
         return (
             s.judged.may_serve,
             s.judged.serving,
             s.draining_since is None,
+            -s.usd_per_hour if dear_first else 0.0,
             -count[cloud],
             -count[region],
             -count[zone],

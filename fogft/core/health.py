@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from fogft.core.groups import replica_hash, services_at
 from fogft.core.history import History, Record
 from fogft.core.model import (
     LinkReport,
@@ -134,9 +135,9 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
     """
     if link is None or link.state is not LinkState.UP or machine.phase is not MachinePhase.RUNNING:
         return False
-    if machine.spec_hash != spec.replica_hash:
+    if machine.spec_hash != replica_hash(spec, machine.id.slot):
         return bool(link.ready)
-    return link.ready.issuperset(service.name for service in spec.services)
+    return link.ready.issuperset(service.name for service in services_at(spec, machine.id.slot))
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ class History:
         self._generations: dict[int, int] = {}
         self._failures: dict[str, list[Failure]] = {}
         self._proven_at: dict[str, float] = {}
-        self._lost_at: dict[str, float] = {}
+        self._losses: dict[str, list[float]] = {}
         for event in events:
             self.add(event)
 
@@ -166,7 +166,7 @@ class History:
             if kind is EventKind.REFUSED or (kind is EventKind.GONE and died_young(record, event)):
                 self._fail(record, event)
             if kind is EventKind.GONE:
-                self._lost_at[record.location] = event.at
+                self._losses.setdefault(record.location, []).append(event.at)
             record.closed = kind
             record.closed_at = event.at
 
@@ -205,9 +205,10 @@ class History:
         """Return when a replica last became ready there; minus infinity for never."""
         return self._proven_at.get(location, float("-inf"))
 
-    def lost_at(self, location: str) -> float:
-        """Return when a replica was last lost there unasked; minus infinity for never."""
-        return self._lost_at.get(location, float("-inf"))
+    @property
+    def losses(self) -> Mapping[str, list[float]]:
+        """Location -> when replicas were lost there unasked, oldest first."""
+        return self._losses
 
 
 YOUNG_S = 60.0

@@ -15,9 +15,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fogft.core.errors import FogftError, StateError
-from fogft.core.spec import PoolSpec
+from fogft.core.spec import MAX_REPLICAS, PoolSpec
 
-MAX_REPLICAS = 16
 LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
 
 
@@ -44,12 +43,16 @@ class Intent:
     began_at: float = 0.0
 
     def wanted(self, spec: PoolSpec) -> int:
-        """Return how many replicas should be ready."""
+        """Return how many replicas the user or the file names; see `sizing` for what follows."""
         if self.stopping:
             return 0
-        if self.target is not None and self.scaled_from == spec.replicas:
+        if self.target is not None and self.is_scaled(spec):
             return self.target
         return spec.replicas
+
+    def is_scaled(self, spec: PoolSpec) -> bool:
+        """Whether the user's own number holds, and not the file's."""
+        return self.target is not None and self.scaled_from == spec.replicas
 
     def is_drained(self, slot: int, generation: int) -> bool:
         """Whether the user asked to replace this launch."""
@@ -64,8 +67,14 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
     """Want `change` more replicas (fewer when negative).
 
     Raises:
-        FogftError: Fewer than one, or more than 16, would be wanted.
+        FogftError: Fewer than one, or more than 16, would be wanted, or the number follows
+            from an availability target.
     """
+    if spec.availability is not None:
+        raise FogftError(
+            f"`{spec.name}` has as many replicas as `availability` needs: it cannot be scaled",
+            "change `fogft.availability` or `fogft.replicas` in the pool file, and `fogft up` it",
+        )
     wanted = intent.wanted(spec) + change
     if wanted < 1:
         raise FogftError(

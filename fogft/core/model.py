@@ -8,6 +8,7 @@ Not here: decisions (`planner`, `placement`) and the pool file (`spec`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -62,12 +63,14 @@ class Offer:
     Attributes:
         source: Where the price comes from: ``live``, ``catalogue``; empty where it is made up.
         as_of: When it was true, in seconds since the epoch; 0 when that is not known.
+        group: The group of the pool file that it suits; empty where there are none.
     """
 
     placement: Placement
     usd_per_hour: float
     source: str = ""
     as_of: float = 0.0
+    group: str = ""
 
 
 class Phase(str, Enum):
@@ -162,6 +165,7 @@ class Observed:
         links: What the client proxy reports; None when there is no fresh report.
         offers: What can be bought now, in any order.
         ending: Machines that were already asked to end, and may still be listed.
+        rtt_s: ``cloud/region`` -> round trip from the robot in seconds, where it is known.
     """
 
     now: float
@@ -169,6 +173,7 @@ class Observed:
     links: tuple[LinkReport, ...] | None = None
     offers: tuple[Offer, ...] = ()
     ending: frozenset[ReplicaId] = frozenset()
+    rtt_s: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

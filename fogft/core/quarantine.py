@@ -9,6 +9,14 @@ seconds from the last one. A replica that becomes ready there, or FORGIVE_S with
 failure, wipes the slate clean. A failed `setup` is the pool file's fault, not the
 location's: it is counted against `EVERYWHERE`, so a broken file does not tour the world
 at the user's expense.
+
+A location where a replica was lost unasked is not at rest, but it is avoided: used only when
+no other is left, for
+
+    min(AVOID_S * 2 ** (n - 1), AVOID_LIMIT_S)
+
+seconds after the last of n losses within AVOID_MEMORY_S. Events from the future, which a clock
+that jumped back leaves behind, count for nothing.
 """
 
 from __future__ import annotations
@@ -22,6 +30,9 @@ BASE_S = 5.0
 LIMIT_S = 600.0
 FORGIVE_S = 3600.0
 EVERYWHERE = "*"
+AVOID_S = 300.0
+AVOID_LIMIT_S = 3600.0
+AVOID_MEMORY_S = 4 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +72,7 @@ def resting(history: History, now: float) -> Mapping[str, Backoff]:
 
 def backoff(failures: list[Failure], now: float) -> Backoff | None:
     """Return the rest that a run of failures earns, or None when it is over."""
-    recent = sorted((f for f in failures if now - f.at < FORGIVE_S), key=lambda f: f.at)
+    recent = sorted((f for f in failures if 0 <= now - f.at < FORGIVE_S), key=lambda f: f.at)
     if not recent:
         return None
     last = recent[-1]
@@ -71,3 +82,15 @@ def backoff(failures: list[Failure], now: float) -> Backoff | None:
     if now >= last.at + rest_s:
         return None
     return Backoff(until=last.at + rest_s, failures=len(recent), cause=last.cause)
+
+
+def avoided(history: History, now: float) -> Mapping[str, float]:
+    """Return the locations to use only when no other is left, and until when."""
+    out: dict[str, float] = {}
+    for location, losses in history.losses.items():
+        recent = [at for at in losses if 0 <= now - at < AVOID_MEMORY_S]
+        if recent:
+            until = max(recent) + min(AVOID_S * 2.0 ** min(len(recent) - 1, 16), AVOID_LIMIT_S)
+            if now < until:
+                out[location] = until
+    return out

@@ -9,6 +9,18 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from fogft.core.spec_choices import (
+    AvailabilitySpec,
+    GroupSpec,
+    MigrationSpec,
+    OnDemandSpec,
+    PlacementSpec,
+    ScheduleSpec,
+    TrafficSpec,
+)
+
+MAX_REPLICAS = 16
+
 
 class OnTimeout(str, Enum):
     """What the caller gets when no replica answered before the deadline."""
@@ -34,6 +46,8 @@ class ServiceSpec:
         ok_field: Name of a boolean response field that must be true while another
             attempt is left; empty for none.
         hedging_budget: Extra copies under `adaptive`, as a share of requests.
+        replicas: At least so many carry it; 0 for as many as the pool has.
+        traffic: What is asked of it, for costs.
     """
 
     name: str
@@ -43,6 +57,8 @@ class ServiceSpec:
     ok_field: str = ""
     hedging: HedgingMode = HedgingMode.ALL
     hedging_budget: float = 0.1
+    replicas: int = 0
+    traffic: TrafficSpec = field(default_factory=TrafficSpec)
 
 
 @dataclass(frozen=True)
@@ -69,11 +85,16 @@ class PoolSpec:
     Attributes:
         name: The pool's name: lower-case letters, digits and dashes, at most 40.
         services: At least one, names distinct.
-        replicas: How many should be ready.
+        replicas: How many should be ready. With groups: their sum. With an availability
+            target: the fewest.
         max_surge: How many more may exist while one replaces another.
         max_usd_per_hour: Cap on the price of all machines together, surge included;
             None for no cap.
         max_hours: After so many hours the pool ends by itself; None for never.
+        availability: A target from which the number follows; None for none.
+        groups: Kinds of machines; none for one kind, the task's `resources`.
+        on_demand: How spot and on-demand are mixed, where there are no groups.
+        migration: When a replica moves to a better location; None for never.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -84,6 +105,12 @@ class PoolSpec:
     max_usd_per_hour: float | None = None
     max_hours: float | None = None
     health: HealthSpec = field(default_factory=HealthSpec)
+    availability: AvailabilitySpec | None = None
+    placement: PlacementSpec = field(default_factory=PlacementSpec)
+    on_demand: OnDemandSpec = field(default_factory=OnDemandSpec)
+    groups: tuple[GroupSpec, ...] = ()
+    schedule: ScheduleSpec | None = None
+    migration: MigrationSpec | None = field(default_factory=MigrationSpec)
     task: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -93,8 +120,12 @@ class PoolSpec:
         Covers what a replica runs and serves, and the machine it needs; not how many
         there are, how long the robot waits, or in what order regions are listed.
         """
+        return self.hash_with(self.services)
+
+    def hash_with(self, services: tuple[ServiceSpec, ...]) -> str:
+        """Return the `replica_hash` of a replica that carries only these services."""
         asked = {
-            "services": sorted((s.name, s.type) for s in self.services),
+            "services": sorted((s.name, s.type) for s in services),
             "orphan_after_s": self.health.orphan_after_s,
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
         }

@@ -1,0 +1,167 @@
+"""Turn needs into launches, within surge, budget and what is offered. Pure.
+
+Where a group mixes spot and on-demand, its first `base` replicas are on demand and the rest
+spot; while no spot machine can be had, an on-demand one may stand in for it.
+
+Owns: which market a launch is bought on, and what is said when it cannot be.
+Not here: the order among offers (`placement`) and what is needed (`needs`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from fogft.core.endings import Census, Standing
+from fogft.core.groups import Group
+from fogft.core.health import Verdict
+from fogft.core.history import History
+from fogft.core.intent import Intent
+from fogft.core.model import Observed, Offer, Placement
+from fogft.core.needs import Need, home
+from fogft.core.placement import Choice, Market, is_possible
+from fogft.core.quarantine import avoided, resting
+from fogft.core.score import Scale
+from fogft.core.sizing import sold_to
+from fogft.core.spec import PoolSpec
+
+# Reasons that speak neither against the place nor for it: a replacement may go there again.
+_NOT_THE_PLACES_FAULT = ("outdated", "moves", "spot")
+
+
+@dataclass(frozen=True)
+class PlannedLaunch:
+    """Order a machine for a slot, under a generation never used before."""
+
+    slot: int
+    generation: int
+    offer: Offer
+    reason: str
+
+
+@dataclass
+class Buyer:
+    """Buys one launch after the other.
+
+    Args:
+        groups: The pool's, as they are sized.
+        cap: On the price of all machines together; None for none.
+    """
+
+    spec: PoolSpec
+    intent: Intent
+    observed: Observed
+    history: History
+    census: Census
+    groups: Sequence[Group]
+    cap: float | None
+    launches: list[PlannedLaunch] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    sacrificed: list[tuple[Standing, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._offered = {o.placement: o.usd_per_hour for o in self.observed.offers}
+        self._spent = sum(self._price(s) for s in self.census.everyone())
+        self._resting = resting(self.history, self.observed.now)
+        self._avoided = avoided(self.history, self.observed.now)
+        self._markets: dict[tuple[str, bool | None], Market] = {}
+        self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
+        wrong = [o.placement.location for o in self.observed.offers if not is_possible(o)]
+        if wrong:
+            self.notes.append(f"offers with impossible prices are ignored, such as `{wrong[0]}`")
+
+    @property
+    def budget(self) -> float | None:
+        """What one more machine may cost now; None for any price."""
+        return None if self.cap is None else self.cap - self._spent
+
+    def buy(self, need: Need, room: int) -> bool:
+        """Plan one launch; False (and a note) when nothing more can be launched now."""
+        if len(self.launches) >= room:
+            verb = "replace" if need.replaces else "launch"
+            self.notes.append(
+                f"waiting to {verb} slot {need.slot}: `max_surge` allows no more machines now"
+            )
+            return False
+        choice, reason = self._choose(need, self.budget)
+        if choice.offer is None:
+            self.notes.append(f"slot {need.slot} waits: {choice.why_not}")
+            if self.cap is not None:
+                self._make_room(need, self.cap)
+            return False
+        generation = self._next_generation(need.slot)
+        self.launches.append(PlannedLaunch(need.slot, generation, choice.offer, reason))
+        self._spent += choice.offer.usd_per_hour
+        return True
+
+    def market(self, group: Group, spot: bool | None) -> Market:
+        """Return what is sold to a group: of one kind only unless `spot` is None."""
+        key = (group.offers, spot)
+        if key not in self._markets:
+            self._markets[key] = Market(
+                sold_to(self.observed.offers, group.offers, spot),
+                excluded=self.intent.excluded,
+                resting=self._resting,
+                avoid=(*self._avoided, *(s.location for s in self.census.lost)),
+                scale=self.scale,
+            )
+        return self._markets[key]
+
+    def kind(self, group: Group, without: Standing | None) -> bool | None:
+        """Return whether a group's next machine is spot (True); None where it does not matter.
+
+        Args:
+            group: Whose.
+            without: One that is not counted, since it goes.
+        """
+        if not group.on_demand.base and not group.on_demand.fallback:
+            return None
+        stay = [s for s in (*self.census.good, *self.census.replaced) if s is not without]
+        placed = [
+            s.judged.machine.placement for s in stay if home(self.groups, s.slot) is group
+        ] + [x.offer.placement for x in self.launches if home(self.groups, x.slot) is group]
+        return sum(not place.spot for place in placed) >= group.on_demand.base
+
+    def places(self, without: Standing | None) -> list[Placement]:
+        """Return where our replicas are and will be."""
+        stay = [s for s in (*self.census.good, *self.census.replaced) if s is not without]
+        taken = [s.judged.machine.placement for s in stay]
+        return taken + [launch.offer.placement for launch in self.launches]
+
+    def _price(self, standing: Standing) -> float:
+        """Return what a machine costs: as ordered, or more where its spot price has risen."""
+        placement = standing.judged.machine.placement
+        return max(standing.usd_per_hour, self._offered.get(placement, 0.0))
+
+    def _choose(self, need: Need, budget: float | None) -> tuple[Choice, str]:
+        old = need.replaces
+        avoid = set()
+        if old is not None and not old.why.startswith(_NOT_THE_PLACES_FAULT):
+            avoid.add(old.location)
+        taken = self.places(old)
+        spot = self.kind(need.group, old)
+        found = self.market(need.group, spot).choose(taken, avoid=avoid, budget_usd_per_hour=budget)
+        if found.offer is None and spot and need.group.on_demand.fallback:
+            stand_in = self.market(need.group, False).choose(
+                taken, avoid=avoid, budget_usd_per_hour=budget
+            )
+            if stand_in.offer is not None:
+                return stand_in, f"{need.reason}; on demand, for no spot: {found.why_not}"
+        return found, need.reason
+
+    def _make_room(self, need: Need, cap: float) -> None:
+        """Under a cap, a silent machine that blocks its own replacement goes first."""
+        left = cap - self._spent + sum(self._price(s) for s in self.census.ending)
+        if self._choose(need, left)[0].offer is not None:
+            return  # what is being ended already makes room enough
+        for standing in self.census.lost:
+            if standing.verdict is not Verdict.UNRESPONSIVE:
+                continue
+            if self._choose(need, left + self._price(standing))[0].offer is not None:
+                self.sacrificed.append((standing, f"{standing.why}, and the budget has no room"))
+                return
+
+    def _next_generation(self, slot: int) -> int:
+        listed = [s.id.generation for s in self.census.everyone() if s.slot == slot]
+        known = [self.history.generation(slot), self.intent.drained.get(slot, 0)]
+        return max([*known, *listed]) + 1

@@ -1,0 +1,95 @@
+"""Sort every machine into what it is to the pool: kept, to be replaced, or lost. Pure.
+
+Owns: why a working replica is not wanted as it is.
+Not here: health (`health`), and moving those that could be better placed (`migration`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fogft.core.endings import Census, Standing
+from fogft.core.groups import replica_hash
+from fogft.core.health import Health, Judged, Verdict
+from fogft.core.history import History
+from fogft.core.intent import Intent
+from fogft.core.model import MachinePhase, Observed
+from fogft.core.needs import part
+from fogft.core.sizing import Size
+from fogft.core.spec import PoolSpec
+
+_ORDER = {"drained": 0, "excluded": 1, "outdated": 3}
+
+
+def take_census(
+    spec: PoolSpec,
+    intent: Intent,
+    observed: Observed,
+    history: History,
+    *,
+    health: Health,
+    size: Size,
+) -> Census:
+    """Sort every machine of the pool."""
+    census = Census()
+    for judged in health.replicas:
+        record = history.record(judged.id.slot, judged.id.generation)
+        standing = Standing(judged, record)
+        if judged.id in observed.ending:
+            census.ending.append(standing)
+        elif judged.verdict is Verdict.FAILED:
+            census.failed.append(standing)
+        elif judged.verdict in (Verdict.LEAVING, Verdict.UNRESPONSIVE):
+            census.lost.append(standing)
+        elif why := _unwanted(spec, intent, judged, size):
+            standing = Standing(judged, record, why)
+            if _is_young(standing, health):
+                census.aborted.append(standing)
+            else:
+                census.replaced.append(standing)
+        else:
+            census.good.append(standing)
+    _supersede(census, health, size)
+    census.replaced.sort(key=lambda s: (_ORDER.get(s.why.split(" ")[0], 2), s.id))
+    census.lost.sort(key=lambda s: (s.verdict is not Verdict.LEAVING, s.id))
+    return census
+
+
+def _supersede(census: Census, health: Health, size: Size) -> None:
+    """Of two good ones in one slot the older goes, where there is one too many.
+
+    So a replica that moves is ended when its successor serves, and not the other way round.
+    """
+    newest = {s.slot: s.id.generation for s in census.good}  # in the order of generations
+    for group, wanted in zip(size.groups, size.counts, strict=True):
+        here = part(census, size.groups, group)
+        surplus = len(here.good) + len(here.replaced) - wanted
+        old = [s for s in here.good if s.id.generation < newest[s.slot]]
+        for standing in old[: max(0, surplus)]:
+            census.good.remove(standing)
+            why = f"superseded by {standing.slot}.{newest[standing.slot]}"
+            young = _is_young(standing, health)
+            goes = replace(standing, reason=why)
+            (census.aborted if young else census.replaced).append(goes)
+
+
+def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged, size: Size) -> str:
+    """Return why a working replica is to be replaced; empty when it is not."""
+    machine, slot = judged.machine, judged.id.slot
+    location = machine.placement.location
+    reasons = {
+        "drained by the user": intent.is_drained(slot, judged.id.generation),
+        f"excluded location {location}": intent.is_excluded(location),
+        judged.why: judged.verdict in (Verdict.STUCK, Verdict.AT_RISK),
+        "its group is not in the pool file": not any(g.owns(slot) for g in size.groups),
+        "outdated by a change of the pool file": machine.spec_hash != replica_hash(spec, slot),
+    }
+    return next((why for why, holds in reasons.items() if holds), "")
+
+
+def _is_young(standing: Standing, health: Health) -> bool:
+    """Whether it certainly never served, so that it can be ended at once."""
+    if standing.judged.machine.phase is MachinePhase.PROVISIONING:
+        return True
+    known = health.links_known and not health.uplink_suspected
+    return known and not standing.ever_ready and not standing.answers

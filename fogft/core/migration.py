@@ -1,0 +1,121 @@
+"""Move a replica to where it would be launched today, if that is much better. Pure.
+
+Only a pool that is whole and quiet moves anything, one replica at a time, the new one first.
+A replica moves when
+
+* spot machines can be had again, and it is an on-demand one that stood in for one; or
+* its new place would leave the pool better spread over clouds, regions or zones; or
+* the spread stays as it is, and its score falls by `gain`.
+
+It has then been ready for `stay_s` (a stand-in: `RETURN_AFTER_S`), and the new place is
+neither at rest nor avoided. To move back, the scores must swing by twice the gain: so
+prices that waver within it move nothing, and with steady offers every move lowers the
+crowding or the sum of the scores, so that moves come to an end.
+
+Owns: who moves, and why.
+Not here: carrying it out, which is a replacement like any other (`needs`, `buying`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from fogft.core.buying import Buyer
+from fogft.core.endings import Census, Standing
+from fogft.core.health import Health
+from fogft.core.needs import home
+from fogft.core.placement import Choice, crowding, domains
+from fogft.core.score import gain
+
+RETURN_AFTER_S = 600.0
+
+
+def is_quiet(census: Census, health: Health) -> bool:
+    """Whether nothing else is to be done: all are good and serve, and can be heard."""
+    busy = census.replaced or census.lost or census.failed or census.aborted or census.ending
+    heard = health.links_known and not health.uplink_suspected
+    return not busy and heard and all(s.judged.serving for s in census.good)
+
+
+@dataclass(frozen=True)
+class Move:
+    """A replica that should be elsewhere, and why.
+
+    Attributes:
+        urgency: The lowest goes first.
+    """
+
+    standing: Standing
+    why: str
+    urgency: tuple[float, ...]
+
+
+def mover(buyer: Buyer, now: float) -> Move | None:
+    """Return the replica that should move; None when all are well where they are.
+
+    The pool is quiet. The one that gains most goes first.
+    """
+    found = [*_returns(buyer, now), *_moves(buyer, now)]
+    return min(found, key=lambda move: (move.urgency, move.standing.id), default=None)
+
+
+def _returns(buyer: Buyer, now: float) -> Iterator[Move]:
+    """Yield the stand-ins whose spot machines can be had again."""
+    for standing in buyer.census.good:
+        if standing.judged.machine.placement.spot or not _stayed(standing, RETURN_AFTER_S, now):
+            continue
+        group = home(buyer.groups, standing.slot)
+        if not buyer.kind(group, standing):  # on demand by right, or it does not matter
+            continue
+        choice = _best(buyer, standing)
+        if choice.offer is not None and not choice.rank[0]:
+            why = f"spot can be had again at {choice.offer.placement.location}"
+            yield Move(standing, why, (-1.0,))
+
+
+def _moves(buyer: Buyer, now: float) -> Iterator[Move]:
+    """Yield those that would be better off elsewhere, with how much."""
+    rules = buyer.spec.migration
+    if rules is None:
+        return
+    for standing in buyer.census.good:
+        if not _stayed(standing, rules.stay_s, now):
+            continue
+        placement = standing.judged.machine.placement
+        kind = buyer.kind(home(buyer.groups, standing.slot), standing)
+        if kind is not None and kind != placement.spot:  # `_returns` decides about those
+            continue
+        choice = _best(buyer, standing)
+        if choice.offer is None or choice.rank[0] or choice.offer.placement == placement:
+            continue
+        count = crowding(buyer.places(standing))
+        before = tuple(count[domain] for domain in domains(placement))
+        there = choice.offer.placement.location
+        if choice.rank[1:] < before:
+            yield Move(standing, f"moves to {there}: better spread", (0.0, *choice.rank[1:]))
+            continue
+        better = gain(_score(buyer, standing), buyer.scale.score(choice.offer))
+        if choice.rank[1:] == before and better >= rules.gain:
+            yield Move(standing, f"moves to {there}: {better:.0%} better", (1.0, -better))
+
+
+def _best(buyer: Buyer, standing: Standing) -> Choice:
+    group = home(buyer.groups, standing.slot)
+    market = buyer.market(group, buyer.kind(group, standing))
+    return market.choose(buyer.places(standing), budget_usd_per_hour=buyer.budget)
+
+
+def _score(buyer: Buyer, standing: Standing) -> float:
+    """Return the score of where it is, at today's price there if that is known."""
+    machine = standing.judged.machine
+    today = [o.usd_per_hour for o in buyer.observed.offers if o.placement == machine.placement]
+    price = min(today, default=machine.usd_per_hour)
+    return buyer.scale.score_of(price, buyer.scale.latency(machine.placement))
+
+
+def _stayed(standing: Standing, stay_s: float, now: float) -> bool:
+    record = standing.record
+    if record is None or record.first_ready_at is None:
+        return False
+    return now - record.first_ready_at >= stay_s
