@@ -60,7 +60,12 @@ class Buyer:
     sacrificed: list[tuple[Standing, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._offered = {o.placement: o.usd_per_hour for o in self.observed.offers}
+        ours = {s.judged.machine.placement.region for s in self.census.everyone()}
+        self._offered = {
+            o.placement: o.usd_per_hour
+            for o in self.observed.offers
+            if o.placement.region in ours  # to hash thousands of placements takes a while
+        }
         self._spent = sum(self._price(s) for s in self.census.everyone())
         self._resting = resting(self.history, self.observed.now)
         self._avoided = avoided(self.history, self.observed.now)
