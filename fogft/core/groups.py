@@ -116,6 +116,31 @@ def task_at(spec: PoolSpec, slot: int) -> dict[str, Any]:
     return {**spec.task, "resources": dict(group_at(spec, slot).resources)}
 
 
+def sales(spec: PoolSpec) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+    """Return what a cloud is to be asked prices for: a group's name, and resources.
+
+    A group that mixes spot and on-demand is asked for twice.
+    """
+    found: list[tuple[str, Mapping[str, Any]]] = []
+    for group in groups_of(spec):
+        if group.on_demand.base or group.on_demand.fallback:
+            found += [(group.offers, with_spot(group.resources, spot)) for spot in (True, False)]
+        else:
+            found.append((group.offers, group.resources))
+    return tuple(found)
+
+
+def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:
+    """Return a `resources` section that asks for spot machines only, or for none."""
+    out = {**resources, "use_spot": spot}
+    for key in ("any_of", "ordered"):
+        if isinstance(out.get(key), list):
+            out[key] = [
+                {**one, "use_spot": spot} if isinstance(one, Mapping) else one for one in out[key]
+            ]
+    return out
+
+
 def shares(groups: tuple[Group, ...], total: int) -> tuple[int, ...]:
     """Share a number of replicas among groups.
 

@@ -22,6 +22,8 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
         for key in ("replicas", "max_surge", "max_usd_per_hour", "max_hours")
         if getattr(before, key) != getattr(after, key)
     ]
+    for key in ("availability", "placement", "on_demand", "groups", "schedule", "migration"):
+        found += _section(key, getattr(before, key), getattr(after, key))
     found += [
         _one(f"health.{f.name}", getattr(before.health, f.name), getattr(after.health, f.name))
         for f in fields(HealthSpec)
@@ -64,6 +66,14 @@ def _services(before: PoolSpec, after: PoolSpec) -> list[str]:
                 if (was := getattr(old[name], f.name)) != (is_ := getattr(service, f.name))
             ]
     return found
+
+
+def _section(key: str, before: Any, after: Any) -> list[str]:
+    if before == after:
+        return []
+    if before and after:
+        return [f"`{key}` changed"]
+    return [f"`{key}` {'added' if after else 'removed'}"]
 
 
 def _one(what: str, before: Any, after: Any) -> str:

@@ -15,12 +15,34 @@ FOGFT_KEYS = (
     "max_hours",
     "health",
     "orphan_after_s",
+    "availability",
+    "placement",
+    "on_demand",
+    "groups",
+    "schedule",
+    "migration",
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
     *("hedging", "hedging_budget"),
+    *("replicas", "traffic"),
 )
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
+AVAILABILITY_KEYS = (
+    "target",
+    "spot_uptime_s",
+    "on_demand_uptime_s",
+    "recovery_s",
+    "correlation",
+)
+CORRELATION_KEYS = ("zone", "region", "cloud")
+PLACEMENT_KEYS = ("price_weight", "latency_weight", "robot_at", "rtt_s")
+ON_DEMAND_KEYS = ("base", "fallback")
+GROUP_KEYS = ("name", "replicas", "resources", "on_demand")
+SCHEDULE_KEYS = ("time_zone", "prelaunch_s", "windows")
+WINDOW_KEYS = ("days", "from", "to", "replicas", "max_usd_per_hour")
+MIGRATION_KEYS = ("gain", "stay_s")
+TRAFFIC_KEYS = ("requests_per_s", "request_bytes", "response_bytes")
 # The task schema of SkyPilot 0.14.1, without the keys that it keeps for itself.
 TASK_KEYS = (
     "name",
@@ -46,11 +68,7 @@ REFUSED_TASK_KEYS = {
 }
 # Designed, not built. Ignoring one would promise what nobody does.
 LATER_KEYS = {
-    "availability": "remove it and say how many: `replicas: 2`",
-    "groups": "remove it; each pool file describes one pool of equal replicas",
     "topology": "remove it; every replica is linked to the robot directly",
-    "on_demand": "remove it, or set `resources.use_spot: false` for on-demand machines only",
-    "schedule": "remove it, and use `fogft scale` or `fogft down` from a timer",
     "state": "remove it; the services must be stateless",
     "quorum": "remove it; the first successful response is returned",
 }

@@ -15,8 +15,16 @@ from collections.abc import Callable
 from pathlib import PurePath
 
 from fogft.core.names import POOL_NAME_PATTERN
-from fogft.core.spec import HealthSpec, PoolSpec
+from fogft.core.spec import MAX_REPLICAS, HealthSpec, PoolSpec
 from fogft.core.spec_keys import DAY_S, FOGFT_KEYS, HEALTH_KEYS, LATER_KEYS, places
+from fogft.core.spec_plan import (
+    read_availability,
+    read_groups,
+    read_migration,
+    read_on_demand,
+    read_placement,
+    read_schedule,
+)
 from fogft.core.spec_services import read_services
 from fogft.core.spec_task import check_task
 from fogft.core.spec_tree import Node, Section, plain, shown
@@ -27,7 +35,6 @@ TypeCheck = Callable[[str], str | None]  # of a service type
 FieldCheck = Callable[[str, str], str | None]  # of a service type and a boolean response field
 FolderCheck = Callable[[str], str | None]  # of `workdir`
 
-MAX_REPLICAS = 16
 MAX_SURGE = 4
 MAX_HOURS = 8000  # the certificates last 365 days
 
@@ -64,15 +71,28 @@ def pool_spec(
         cap = ours.number("max_usd_per_hour", 1_000_000, "US dollars per hour")
     if "max_hours" in ours.children:
         hours = ours.number("max_hours", MAX_HOURS, "hours")
+    task = {key: plain(node) for key, node in top.children.items() if key != "fogft"}
+    availability, groups = read_availability(ours), read_groups(ours, task)
+    # A target finds its own number; the file's is then the fewest.
+    usual = sum(g.replicas for g in groups) or (1 if availability else PoolSpec.replicas)
+    replicas = ours.whole("replicas", usual, 1, MAX_REPLICAS)
     spec = PoolSpec(
         name=_name(top),
         services=services,
-        replicas=ours.whole("replicas", PoolSpec.replicas, 1, MAX_REPLICAS),
+        replicas=replicas,
         max_surge=ours.whole("max_surge", PoolSpec.max_surge, 0, MAX_SURGE),
         max_usd_per_hour=cap,
         max_hours=hours,
         health=_health(ours),
-        task={key: plain(node) for key, node in top.children.items() if key != "fogft"},
+        availability=availability,
+        placement=read_placement(ours),
+        on_demand=read_on_demand(
+            ours.section("on_demand"), MAX_REPLICAS if availability else replicas
+        ),
+        groups=groups,
+        schedule=read_schedule(ours),
+        migration=read_migration(ours),
+        task=task,
     )
     workdir = spec.task.get("workdir")
     if isinstance(workdir, str) and check_workdir is not None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from fogft.core import ros_names
-from fogft.core.spec import HedgingMode, ServiceSpec
+from fogft.core.spec import MAX_REPLICAS, HedgingMode, ServiceSpec
 from fogft.core.spec_keys import DAY_S, LATER_KEYS, SERVICE_KEYS, places
+from fogft.core.spec_plan import read_traffic
 from fogft.core.spec_tree import Section, shown
 
 _SERVICES_HINT = "write a list, such as `services: [{name: /detect, type: my_msgs/srv/Detect}]`"
@@ -51,6 +52,8 @@ def _service(section: Section) -> ServiceSpec:
         ok_field=ok_field,
         hedging=section.choice("hedging", ServiceSpec.hedging),
         hedging_budget=_hedging_budget(section),
+        replicas=section.whole("replicas", 0, 1, MAX_REPLICAS),
+        traffic=read_traffic(section),
     )
 
 

@@ -150,20 +150,34 @@ class Section:
             raise self.error(key, f"must be from {low} to {high}, not {shown(node.value)}", hint)
         return node.value
 
-    def number(self, key: str, high: float, unit: str, default: float | None = None) -> float:
-        """Return a number above 0 and at most `high`; without a default it is required."""
+    def flag(self, key: str, default: bool) -> bool:
+        """Return a truth value."""
+        if key not in self.children:
+            return default
+        node = self.children[key]
+        if not isinstance(node.value, bool):
+            hint = f"write `{key}: true` or `{key}: false`"
+            raise self.error(key, f"must be true or false, not {_got(node)}", hint)
+        return node.value
+
+    def number(
+        self, key: str, high: float, unit: str, default: float | None = None, *, zero: bool = False
+    ) -> float:
+        """Return a number above 0 (with `zero`: or 0) and at most `high`.
+
+        Without a default it is required.
+        """
         if key not in self.children and default is not None:
             return default
         node = self.children[key]
-        hint = f"write a number of {unit} above 0 and at most {high:g}, such as `{key}: 2.5`"
+        limits = f"{'from' if zero else 'above'} 0 {'to' if zero else 'and at most'} {high:g}"
+        hint = f"write a number of {unit} {limits}, such as `{key}: {min(2.5, high):g}`"
         if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
             raise self.error(key, f"must be a number, not {_got(node)}", hint)
         if not math.isfinite(node.value):
             raise self.error(key, f"must be finite, not {shown(node.value)}", hint)
-        if not 0 < node.value <= high:
-            raise self.error(
-                key, f"must be above 0 and at most {high:g}, not {shown(node.value)}", hint
-            )
+        if not 0 <= node.value <= high or not (node.value or zero):
+            raise self.error(key, f"must be {limits}, not {shown(node.value)}", hint)
         return float(node.value)
 
     def choice(self, key: str, default: Choice) -> Choice:

@@ -18,6 +18,7 @@ from fogft import disk
 from fogft.cloud.port import Launch
 from fogft.core import holders, names
 from fogft.core.errors import CredentialError
+from fogft.core.groups import replica_hash, services_at, task_at
 from fogft.core.model import ReplicaId
 from fogft.core.planner import PlannedLaunch
 from fogft.core.service_form import REPLICA_KEYS, to_plain
@@ -106,8 +107,8 @@ def build_order(
         pool=identity.name,
         placement=planned.offer.placement,
         usd_per_hour=planned.offer.usd_per_hour,
-        spec_hash=spec.replica_hash,
-        task=absolute(spec.task, Path(identity.file).parent),
+        spec_hash=replica_hash(spec, id.slot),
+        task=absolute(task_at(spec, id.slot), Path(identity.file).parent),
         files={
             "replica.yaml": replica_config(identity, spec, id).encode(),
             "ca.crt": issued.authority_pem,
@@ -119,7 +120,9 @@ def build_order(
 
 def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
     """Return a replica's configuration. Address, domain and folder are the machine's to add."""
-    envs: Mapping[str, Any] = spec.task.get("envs") or {}
+    services = services_at(spec, id.slot)
+    names_told = {"FOGFT_SERVICES": ",".join(service.name for service in services)}
+    envs: Mapping[str, Any] = {**names_told, **(spec.task.get("envs") or {})}
     return templates.render(
         "replica.yaml",
         {
@@ -127,7 +130,7 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "pool_uid": identity.uid,
             "slot": id.slot,
             "generation": id.generation,
-            "services": [to_plain(service, REPLICA_KEYS) for service in spec.services],
+            "services": [to_plain(service, REPLICA_KEYS) for service in services],
             "run": str(spec.task.get("run") or ""),
             "envs": {str(k): "" if v is None else str(v) for k, v in envs.items()},
             "orphan_after_s": spec.health.orphan_after_s,

@@ -44,7 +44,7 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
     Raises:
         SpecError: They name a cloud that there is not, or clouds of two adapters.
     """
-    named = dict(_named(spec.task.get("resources") or {}, "resources"))
+    named = dict(_named_in(spec))
     for cloud, key in named.items():
         if cloud not in names:
             problem = SpecError(f"{key}: there is no cloud `{cloud}`", nearest(cloud, names))
@@ -62,8 +62,15 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
 
 def clouds_named(spec: PoolSpec) -> list[str]:
     """Return the clouds that a pool file's resources name, sorted; none where any will do."""
-    resources = spec.task.get("resources") or {}
-    return sorted({cloud for cloud, _ in _named(resources, "resources")})
+    return sorted({cloud for cloud, _ in _named_in(spec)})
+
+
+def _named_in(spec: PoolSpec) -> Iterator[tuple[str, str]]:
+    """Yield each cloud that the file names, or that one of its groups names."""
+    for index, group in enumerate(spec.groups):
+        yield from _named(group.resources, f"fogft.groups[{index}].resources")
+    if not spec.groups:
+        yield from _named(spec.task.get("resources") or {}, "resources")
 
 
 def _named(resources: Any, key: str) -> Iterator[tuple[str, str]]:

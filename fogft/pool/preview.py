@@ -18,6 +18,7 @@ from fogft.core.model import Observed, Offer
 from fogft.core.planner import plan
 from fogft.core.spec import PoolSpec
 from fogft.core.spec_changes import changes, replaces_replicas
+from fogft.pool import offers
 from fogft.pool.named_clouds import clouds_named, located
 from fogft.pool.store import PoolStore
 
@@ -91,6 +92,7 @@ def order(
     source: str,
     file: Path,
     now: float = 0.0,
+    rtt_s: Mapping[str, float] | None = None,
 ) -> Order:
     """Return what applying a pool file would do. Changes nothing.
 
@@ -102,6 +104,7 @@ def order(
         source: The file's text.
         file: Where it is.
         now: Seconds since the epoch.
+        rtt_s: ``cloud/region`` -> round trip in seconds, where it is known.
 
     Raises:
         SpecError: The cloud can never meet the file's resources.
@@ -121,14 +124,15 @@ def order(
             raise located(error, source, file) from None
         accounts, found = _tested(cloud, clouds_named(spec), may_fail=before is not None)
         notes += found
-    offers: tuple[Offer, ...] = ()
+    sold: tuple[Offer, ...] = ()
     try:
-        offers = tuple(cloud.offers(spec.task.get("resources") or {}))
+        sold = offers.ask(cloud, spec)
     except SpecError as error:
         raise located(error, source, file) from None
     except CloudError as error:
         notes.append(f"prices cannot be had now: {error.message}")
-    planned = plan("0" * 16, spec, Intent(), Observed(now, (), None, offers), History())
+    observed = Observed(now, (), None, sold, rtt_s=rtt_s or {})
+    planned = plan("0" * 16, spec, Intent(), observed, History())
     preview = Preview(
         spec,
         cloud_name,
@@ -136,7 +140,7 @@ def order(
         launches=tuple(_launch(launch.slot, launch.offer, now) for launch in planned.launches),
         changes=() if before is None else tuple(changes(before, spec)),
         replaces_replicas=before is not None and replaces_replicas(before, spec),
-        notes=(*notes, *(planned.notes if before is None and offers else ())),
+        notes=(*notes, *(planned.notes if before is None and sold else ())),
         costs_money=isinstance(cloud, Accounts),
         accounts=accounts,
     )

@@ -12,12 +12,13 @@ from __future__ import annotations
 import functools
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.core import lifetime
 from fogft.core.errors import CloudError, FogftError, NoCapacity, QuotaExceeded
+from fogft.core.groups import replica_hash, sales, task_at
 from fogft.core.health import judge
 from fogft.core.history import EventKind, History
 from fogft.core.intent import Intent
@@ -34,6 +35,7 @@ from fogft.core.model import (
 from fogft.core.planner import Plan, PlannedLaunch, plan
 from fogft.core.refreshing import Silent
 from fogft.core.spec import PoolSpec
+from fogft.pool import offers
 from fogft.pool.operations import Operations, Submit
 from fogft.pool.remembering import Remembering
 from fogft.pool.store import Identity, Store
@@ -43,6 +45,9 @@ log = logging.getLogger(__name__)
 OFFERS_EVERY_S = 30.0
 
 Links = Callable[[str, float], "tuple[LinkReport, ...] | None"]
+Distances = Callable[
+    [PoolSpec, Sequence[Offer], Sequence[Machine], Sequence[LinkReport]], Mapping[str, float]
+]
 BuildOrder = Callable[[Identity, PoolSpec, PlannedLaunch], Launch]
 
 
@@ -70,8 +75,8 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
         pool=identity.name,
         placement=planned.offer.placement,
         usd_per_hour=planned.offer.usd_per_hour,
-        spec_hash=spec.replica_hash,
-        task=spec.task,
+        spec_hash=replica_hash(spec, planned.slot),
+        task=task_at(spec, planned.slot),
     )
 
 
@@ -87,6 +92,7 @@ class Reconciler:
         submit: Runs a long cloud call, now or on another thread.
         epoch: Of the lease; goes into every membership.
         on_done: Called when a long cloud call has ended.
+        distances: Says how far regions are from the robot, of what is sold and what runs.
     """
 
     def __init__(
@@ -100,8 +106,10 @@ class Reconciler:
         submit: Submit = lambda run: run(),
         epoch: int = 1,
         on_done: Callable[[], None] = lambda: None,
+        distances: Distances = lambda spec, *_: spec.placement.rtt_s,
     ) -> None:
         self._cloud = cloud
+        self._distances = distances
         self._store = store
         self._clock = clock
         self._links = links
@@ -180,10 +188,11 @@ class Reconciler:
         except CloudError as error:
             log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
             trouble.append(f"the cloud did not answer: {error.message}")
-        offers = self._current_offers(spec, now, trouble) if machines is not None else ()
+        sold = self._current_offers(spec, now, trouble) if machines is not None else ()
         ending = frozenset(id for id, order in busy.items() if order is None)
         links = self._links(identity.uid, now)
-        return Observed(now, machines, links, offers, ending), trouble
+        rtt_s = self._distances(spec, sold, machines or (), links or ())
+        return Observed(now, machines, links, sold, ending, rtt_s), trouble
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:
         """Have the cloud asked about replicas that fell silent, where its list is from memory."""
@@ -198,12 +207,11 @@ class Reconciler:
                 log.info("refresh_ordered replica=%s", id.short)
 
     def _current_offers(self, spec: PoolSpec, now: float, trouble: list[str]) -> tuple[Offer, ...]:
-        resources = spec.task.get("resources") or {}
-        key = json.dumps(resources, sort_keys=True, default=str)
+        key = json.dumps(sales(spec), sort_keys=True, default=str)
         known = self._offers_for
         if known is None or known[0] != key or not 0 <= now - known[1] < OFFERS_EVERY_S:
             try:
-                self._offers = tuple(self._cloud.offers(resources))
+                self._offers = offers.ask(self._cloud, spec)
                 self._offers_for = (key, now)
             except FogftError as error:
                 trouble.append(f"no prices can be had: {error.message}")

@@ -1,0 +1,33 @@
+"""Ask a cloud what is sold for each group of a pool.
+
+Owns: telling whose offer is whose.
+Not here: what a cloud sells (`fogft.cloud`) and which is chosen (`fogft.core.placement`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fogft.cloud.port import Cloud
+from fogft.core.errors import SpecError
+from fogft.core.groups import sales
+from fogft.core.model import Offer
+from fogft.core.spec import PoolSpec
+
+
+def ask(cloud: Cloud, spec: PoolSpec) -> tuple[Offer, ...]:
+    """Return all offers for a pool, each with the name of the group that it is for.
+
+    Raises:
+        CloudUnreachable: Prices cannot be had now.
+        SpecError: The resources can never be met.
+    """
+    found: list[Offer] = []
+    places = {group.name: f"fogft.groups[{n}]." for n, group in enumerate(spec.groups)}
+    for name, resources in sales(spec):
+        try:
+            sold = cloud.offers(resources)
+        except SpecError as error:
+            raise SpecError(places.get(name, "") + error.message, error.hint) from error
+        found += [offer if offer.group == name else replace(offer, group=name) for offer in sold]
+    return tuple(found)
