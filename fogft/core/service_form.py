@@ -19,6 +19,7 @@ from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
 LONGEST_S = 1e7  # what a request's header can carry
 # What a replica must know; the rest is the robot's.
 REPLICA_KEYS = ("name", "type")
+_NOT_THE_PROXIES = ("replicas", "traffic")
 _ALWAYS = ("name", "type", "timeout_s")
 
 
@@ -27,7 +28,7 @@ def to_plain(service: ServiceSpec, keys: tuple[str, ...] = ()) -> dict[str, Any]
     written = {}
     for field in fields(ServiceSpec):
         value = getattr(service, field.name)
-        if keys and field.name not in keys:
+        if field.name in _NOT_THE_PROXIES or (keys and field.name not in keys):
             continue
         if value != field.default or field.name in _ALWAYS:
             written[field.name] = getattr(value, "value", value)

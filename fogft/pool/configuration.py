@@ -121,8 +121,9 @@ def build_order(
 def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
     """Return a replica's configuration. Address, domain and folder are the machine's to add."""
     services = services_at(spec, id.slot)
-    names_told = {"FOGFT_SERVICES": ",".join(service.name for service in services)}
-    envs: Mapping[str, Any] = {**names_told, **(spec.task.get("envs") or {})}
+    envs: dict[str, Any] = dict(spec.task.get("envs") or {})
+    if services != spec.services:  # `run` need not start the others
+        envs.setdefault("FOGFT_SERVICES", ",".join(service.name for service in services))
     return templates.render(
         "replica.yaml",
         {

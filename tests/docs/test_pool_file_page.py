@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from fogft.core import spec_keys
+from fogft.core.availability import Assumption, Correlation
 from fogft.core.errors import SpecError
+from fogft.core.score import Weights
 from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
+from fogft.core.spec_choices import MigrationSpec, OnDemandSpec, ScheduleSpec
 from fogft.core.spec_keys import (
     FOGFT_KEYS,
     HEALTH_KEYS,
@@ -20,7 +24,8 @@ from fogft.core.spec_keys import (
 from fogft.pool import pool_file
 
 PAGE = (Path(__file__).parents[2] / "docs" / "pool-file.md").read_text()
-EXAMPLE = PAGE.split("```yaml\n")[1].split("```")[0]
+EXAMPLES = [part.split("```")[0] for part in PAGE.split("```yaml\n")[1:3]]
+EXAMPLE = EXAMPLES[0]
 
 
 def section(title):
@@ -38,9 +43,22 @@ def rows(title):
 TABLES = {"Under `fogft`": FOGFT_KEYS, "Each of `services`": SERVICE_KEYS, "`health`": HEALTH_KEYS}
 
 
-@pytest.mark.parametrize("title", TABLES)
+MORE_TABLES = {
+    "`traffic`": spec_keys.TRAFFIC_KEYS,
+    "`availability`": spec_keys.AVAILABILITY_KEYS,
+    "`correlation`": spec_keys.CORRELATION_KEYS,
+    "`placement`": spec_keys.PLACEMENT_KEYS,
+    "`on_demand`": spec_keys.ON_DEMAND_KEYS,
+    "Each of `groups`": spec_keys.GROUP_KEYS,
+    "`schedule`": spec_keys.SCHEDULE_KEYS,
+    "Each of `windows`": spec_keys.WINDOW_KEYS,
+    "`migration`": spec_keys.MIGRATION_KEYS,
+}
+
+
+@pytest.mark.parametrize("title", [*TABLES, *MORE_TABLES])
 def test_every_key_has_its_row(title):
-    assert [key.strip("`") for key in rows(title)] == list(TABLES[title])
+    assert [key.strip("`") for key in rows(title)] == list({**TABLES, **MORE_TABLES}[title])
 
 
 def test_every_task_key_has_its_row():
@@ -49,13 +67,13 @@ def test_every_task_key_has_its_row():
 
 
 def test_planned_keys_are_listed():
-    listed = section("`health`").split("`availability`")[1].split("are planned")[0]
-    assert {"availability", *re.findall(r"`(\w+)`", listed)} == set(LATER_KEYS)
+    [listed] = re.findall(r"\n\n([^\n]*) are planned\.", section("`health`"))
+    assert set(re.findall(r"`(\w+)`", listed)) == set(LATER_KEYS)
 
 
 def test_defaults_are_the_codes():
     ours, services, health = (rows(title) for title in TABLES)
-    defaults = {key: cells[1] for key, cells in {**ours, **services, **health}.items()}
+    defaults = {key: cells[1] for key, cells in {**services, **health, **ours}.items()}
     assert {key: value for key, value in defaults.items() if re.match(r"[0-9`]", value)} == {
         "`replicas`": str(PoolSpec.replicas),
         "`max_surge`": str(PoolSpec.max_surge),
@@ -68,6 +86,48 @@ def test_defaults_are_the_codes():
         "`replace_after_s`": f"{HealthSpec.replace_after_s:g}",
         "`start_limit_s`": f"{HealthSpec.start_limit_s:g}",
     }
+
+
+def test_defaults_of_the_plan_are_the_codes():
+    usual = {
+        "`availability`": Assumption(),
+        "`correlation`": Correlation(),
+        "`placement`": Weights(),
+        "`on_demand`": OnDemandSpec(),
+        "`schedule`": ScheduleSpec("UTC", ()),
+        "`migration`": MigrationSpec(),
+    }
+    for title, values in usual.items():
+        for key, cells in rows(title).items():
+            name = key.strip("`").removesuffix("_weight")
+            if hasattr(values, name) and re.match(r"[\d.]+$", cells[1]):
+                assert float(cells[1]) == getattr(values, name), key
+
+
+def plan_limits():
+    for title in MORE_TABLES:
+        for key, cells in rows(title).items():
+            found = re.match(r"number (above|from) 0, at most ([\d.]+)", cells[0])
+            if found:
+                yield key.strip("`"), float(found[2]), found[1] == "above"
+
+
+@pytest.mark.parametrize(("key", "high", "above"), list(plan_limits()))
+def test_limits_of_the_plan_are_the_codes(key, high, above):
+    """At a limit a value is accepted, beyond it not."""
+    pattern = rf"\b{key}: [^,}}\n]+"
+    assert re.search(pattern, EXAMPLES[1])
+    level = re.search(r"\{zone: .*?\}", EXAMPLES[1])[0]
+    if key in spec_keys.CORRELATION_KEYS:  # none may be above the one before
+        top, low = "{zone: 1, region: 1, cloud: 1}", "{zone: 0, region: 0, cloud: 0}"
+    else:
+        top = low = level
+    for value, others in ((f"{high:.5f}", top), ("0.00001" if above else "0", low)):
+        changed = EXAMPLES[1].replace(level, others)
+        pool_file.parse(re.sub(pattern, f"{key}: {value}", changed), file="p.yaml")
+    for value in (high * 1.001 + 1e-6, 0 if above else -1):
+        with pytest.raises(SpecError, match=rf"{key}: must be"):
+            pool_file.parse(re.sub(pattern, f"{key}: {value:.8f}", EXAMPLES[1]), file="p.yaml")
 
 
 def limits():
@@ -94,12 +154,13 @@ def test_limits_are_the_codes(key, low, high, above):
             parse(value)
 
 
-def test_the_example_is_complete_and_right():
-    """It parses, and shows every key of ours."""
+def test_the_examples_are_complete_and_right():
+    """They parse, and show every key of ours."""
     spec = pool_file.parse(EXAMPLE, file="pool.yaml")
     assert spec.name == "perception"
-    for key in (*FOGFT_KEYS, *SERVICE_KEYS, *HEALTH_KEYS):
-        assert re.search(rf"\b{key}:", EXAMPLE), key
+    assert pool_file.parse(EXAMPLES[1], file="pool.yaml").name == "picking"
+    for key in (*FOGFT_KEYS, *SERVICE_KEYS, *HEALTH_KEYS, *sum(MORE_TABLES.values(), ())):
+        assert re.search(rf"\b{key}:", EXAMPLE + EXAMPLES[1]), key
 
 
 def test_the_mistake_is_told_as_printed():
