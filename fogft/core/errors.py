@@ -63,3 +63,8 @@ class NoCapacity(CloudError):
 
 class QuotaExceeded(CloudError):
     """The account may not have more here. Waiting does not help."""
+
+
+def told(error: FogftError) -> str:
+    """Return an error in one sentence, with what to do about it."""
+    return f"{error.message}; {error.hint}" if error.hint else error.message

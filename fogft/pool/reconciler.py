@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.core import lifetime
-from fogft.core.errors import CloudError, FogftError, NoCapacity, QuotaExceeded
+from fogft.core.errors import CloudError, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.core.groups import replica_hash, sales, task_at
 from fogft.core.health import judge
 from fogft.core.history import EventKind, History
@@ -187,7 +187,7 @@ class Reconciler:
             machines = tuple(listed[id] for id in sorted(listed))
         except CloudError as error:
             log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
-            trouble.append(f"the cloud did not answer: {error.message}")
+            trouble.append(f"the cloud did not answer: {told(error)}")
         sold = self._current_offers(spec, now, trouble) if machines is not None else ()
         ending = frozenset(id for id, order in busy.items() if order is None)
         links = self._links(identity.uid, now)
@@ -214,7 +214,7 @@ class Reconciler:
                 self._offers = offers.ask(self._cloud, spec)
                 self._offers_for = (key, now)
             except FogftError as error:
-                trouble.append(f"no prices can be had: {error.message}")
+                trouble.append(f"no prices can be had: {told(error)}")
                 if known is None or known[0] != key:
                     return ()
         return self._offers

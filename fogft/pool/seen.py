@@ -113,7 +113,7 @@ def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
         machines = tuple(cloud.machines(identity.uid))
     except CloudError as error:
         machines = None
-        trouble.append(f"the cloud did not answer: {error.message}")
+        trouble.append(f"the cloud did not answer: {told(error)}")
     links = report.links if report is not None and report.fresh(now) else None
     observed = Observed(now, machines, links)
     health = None if machines is None else judge(identity.uid, spec, observed, history)

@@ -254,12 +254,15 @@ def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: P
 
 
 @needs_skypilot
-def test_offers_come_from_the_catalogue(real: tuple[InstalledSky, Any, Any]):
+def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, Any, Any]):
     """With no network the catalogue's zones have ids, not names: then the region is the offer."""
     installed, _, _ = real
     offers = installed.offers({"infra": "aws/us-west-2", "cpus": "2", "use_spot": True})
     assert {o.placement for o in offers} == {Placement("aws", "us-west-2", "", "m6i.large")}
     assert offers[0].usd_per_hour == pytest.approx(0.026)
+    assert {offer.source for offer in offers} == {"catalogue"}
+    catalogue = home / ".sky/catalogs/v8/aws/vms.csv"
+    assert {offer.as_of for offer in offers} == {catalogue.stat().st_mtime}
     steady = installed.offers({"infra": "aws/us-west-2", "cpus": "4", "use_spot": False})
     assert {(o.placement.instance, o.placement.spot) for o in steady} == {("m6i.xlarge", False)}
     assert installed.offers({"infra": "aws", "cpus": "1000+"}) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -39,6 +40,15 @@ def test_live_prices_replace_the_catalogues_and_say_so(market: Market):
         WEST, 0.011, "live", 1000.0,
     )  # fmt: skip
     assert (east.placement, east.usd_per_hour, east.source) == (EAST, 0.02, "catalogue")
+
+
+def test_where_the_cloud_chooses_the_zone_the_dearest_one_counts(market: Market):
+    """A budget that holds for it holds for all."""
+    anywhere = replace(EAST, zone="")
+    market.sky.sold = [Offer(anywhere, 0.02, "catalogue")]
+    market.provider.prices = {("us-east-1a", "m6i.large"): 0.03, ("us-east-1b", "m6i.large"): 0.05}
+    [offer] = market.prices.offers({})
+    assert (offer.placement, offer.usd_per_hour, offer.source) == (anywhere, 0.05, "live")
 
 
 def test_on_demand_offers_keep_the_catalogues_price(market: Market):

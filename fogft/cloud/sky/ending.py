@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 _TRIES = 5
 _PAUSE_S = 3.0
 _LIMIT_S = 300.0  # no further try after that
+_HEARD_WITHIN_S = 180.0  # as `following.Limits.ask_s`
 
 
 class Ending:
@@ -64,7 +65,8 @@ class Ending:
         name = cluster_name(id)
         trouble: Exception | None = None
         begun_at = self._clock()
-        for attempt in range(_TRIES):
+        quiet, enough = 0, self._looks_needed(id)
+        for attempt in range(_TRIES + enough - 1):
             if attempt and self._clock() - begun_at > _LIMIT_S:
                 break
             if attempt:
@@ -77,7 +79,8 @@ class Ending:
                 trouble = error
                 log.warning("end_failed replica=%s reason=%r", id.short, str(error))
                 continue
-            if not left:
+            quiet = 0 if left else quiet + 1
+            if quiet >= enough:
                 return
             trouble = CloudError(f"still there: {', '.join(left)}")
         raise CloudUnreachable(
@@ -85,6 +88,17 @@ class Ending:
             f"look with `sky status --refresh {name}`, end it with `sky down {name}`, and check "
             f"the cloud's console for machines with the label `fogft-pool={id.pool_uid}`",
         ) from trouble
+
+    def _looks_needed(self, id: ReplicaId) -> int:
+        """Return how often nothing must be found: twice for an order that may be on its way.
+
+        Whoever ordered may have been killed before SkyPilot's answer came, and SkyPilot may
+        hear of the order only after our first look.
+        """
+        entry = self._journal.get(id)
+        on_its_way = entry is not None and not entry.request
+        young = entry is not None and self._clock() - entry.launched_at < _HEARD_WITHIN_S
+        return 2 if on_its_way and young else 1
 
     def _abort_launches(self, name: str) -> None:
         for request in self._sky.launches(name):

@@ -13,6 +13,7 @@ import io
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
@@ -166,7 +167,11 @@ class InstalledSky:
                     for offer in _offers_of(cloud, one.copy(cloud=cloud)):
                         price = found.get(offer.placement, offer.usd_per_hour)
                         found[offer.placement] = min(price, offer.usd_per_hour)
-            offers = [Offer(placement, price) for placement, price in found.items()]
+            fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in found}}
+            offers = [
+                Offer(placement, price, "catalogue", fetched[placement.cloud])
+                for placement, price in found.items()
+            ]
             return sorted(offers, key=lambda o: (o.usd_per_hour, o.placement))
 
         return self._within(REFRESH_LIMIT_S, "the catalogue of prices", run)
@@ -245,3 +250,15 @@ def _offers_of(cloud: Any, resources: Any) -> Iterator[Offer]:
                     str(cloud).lower(), region.name, named or "", instance, launchable.use_spot
                 )
                 yield Offer(placement, float(price))
+
+
+def _fetched_at(cloud: str) -> float:
+    """Return when SkyPilot last fetched a cloud's catalogue, in seconds since the epoch; 0: unknown.
+
+    The file itself is some hours older than that.
+    """
+    try:
+        common = importlib.import_module("sky.catalog.common")
+        return Path(common.get_catalog_path(f"{cloud}/vms.csv")).stat().st_mtime
+    except (ImportError, AttributeError, OSError):
+        return 0.0
