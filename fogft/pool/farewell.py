@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from fogft.cloud.port import Auditing, Cloud
 from fogft.core.errors import CloudError, CloudUnreachable, FogftError, StateError
-from fogft.core.model import Machine
+from fogft.core.model import Machine, ReplicaId
 from fogft.pool.store import PoolStore
 
 ASK_AGAIN_S = 1.0
@@ -69,6 +69,7 @@ def end_machines(
     """
     deadline = time.monotonic() + limit_s
     told: set[str] = set()
+    refusals: dict[ReplicaId, CloudError] | None = None
     while True:
         try:
             left = _left(cloud, uid, known, warned)
@@ -76,18 +77,17 @@ def end_machines(
             raise _unknown(error, known) from error
         if not left:
             return
+        if refusals is not None:
+            if time.monotonic() > deadline:
+                still = CloudError("it is still listed")
+                raise _stubborn({m: refusals.get(m.id, still) for m in left}, known)
+            time.sleep(ASK_AGAIN_S if refusals else 0.0)
         refusals = _end(cloud, left)
         for machine in left:
             short = machine.id.short
-            if machine not in refusals and short not in told:
+            if machine.id not in refusals and short not in told:
                 told.add(short)
                 done(f"replica {short} ({machine.placement.location})")
-        if refusals and time.monotonic() > deadline:
-            raise _stubborn(refusals, known)
-        if refusals:
-            time.sleep(ASK_AGAIN_S)
-        elif time.monotonic() > deadline:
-            raise _stubborn({m: CloudError("it is still listed") for m in left}, known)
 
 
 def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -> Sequence[Machine]:
@@ -106,7 +106,7 @@ def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -
     return left
 
 
-def _end(cloud: Cloud, machines: Iterable[Machine]) -> dict[Machine, CloudError]:
+def _end(cloud: Cloud, machines: Iterable[Machine]) -> dict[ReplicaId, CloudError]:
     """End machines side by side; return those that did not end, with why."""
 
     def terminate(machine: Machine) -> tuple[Machine, CloudError | StateError | None]:
@@ -119,7 +119,9 @@ def _end(cloud: Cloud, machines: Iterable[Machine]) -> dict[Machine, CloudError]
     with ThreadPoolExecutor(max_workers=8) as threads:
         outcomes = list(threads.map(terminate, machines))
     return {
-        machine: error if isinstance(error, CloudError) else CloudError(error.message, error.hint)
+        machine.id: error
+        if isinstance(error, CloudError)
+        else CloudError(error.message, error.hint)
         for machine, error in outcomes
         if error is not None
     }

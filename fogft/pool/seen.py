@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from fogft import disk
-from fogft.core.errors import CloudError, StateError
+from fogft.core.errors import CloudError, StateError, told
 from fogft.pool import status
 from fogft.pool.paths import PoolPaths
 from fogft.pool.status import PoolStatus

@@ -253,7 +253,7 @@ def _offers_of(cloud: Any, resources: Any) -> Iterator[Offer]:
 
 
 def _fetched_at(cloud: str) -> float:
-    """Return when SkyPilot last fetched a cloud's catalogue, in seconds since the epoch; 0: unknown.
+    """Return when SkyPilot last fetched a cloud's catalogue: seconds since the epoch, 0 unknown.
 
     The file itself is some hours older than that.
     """

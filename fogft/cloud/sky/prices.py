@@ -137,7 +137,9 @@ class Prices:
             live = answers.get((place.cloud, place.region), {}) if place.spot else {}
             price = live.get((place.zone, place.instance))
             if price is None and not place.zone:  # the cloud chooses: count with the dearest zone
-                price = max((p for (_, kind), p in live.items() if kind == place.instance), default=None)
+                price = max(
+                    (p for (_, kind), p in live.items() if kind == place.instance), default=None
+                )
             if price is None:
                 return offer
             return replace(offer, usd_per_hour=price, source="live", as_of=now)
