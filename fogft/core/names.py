@@ -44,6 +44,11 @@ def probe_key(pool_uid: str, slot: int) -> str:
     return f"{slot_prefix(pool_uid, slot)}/probe"
 
 
+def cancel_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot hears which requests are no longer wanted."""
+    return f"{slot_prefix(pool_uid, slot)}/cancel"
+
+
 def replica_certificate_name(id: ReplicaId) -> str:
     """Return the common name of a replica's certificate: pool, slot and generation."""
     return f"replica.{id.slot}.{id.generation}.{id.pool_uid}"

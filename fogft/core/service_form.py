@@ -18,7 +18,7 @@ from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
 
 LONGEST_S = 1e7  # what a request's header can carry
 # What a replica must know; the rest is the robot's.
-REPLICA_KEYS = ("name", "type")
+REPLICA_KEYS = ("name", "type", "concurrency", "cancel")
 _NOT_THE_PROXIES = ("replicas", "traffic")
 _ALWAYS = ("name", "type", "timeout_s")
 
@@ -51,6 +51,8 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         ok_field=str(raw.get("ok_field") or ""),
         hedging=HedgingMode(raw.get("hedging") or ServiceSpec.hedging),
         hedging_budget=_share(raw.get("hedging_budget") or ServiceSpec.hedging_budget),
+        concurrency=int(raw.get("concurrency") or 0),
+        cancel=str(raw.get("cancel") or ""),
     )
 
 

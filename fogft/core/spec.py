@@ -48,6 +48,8 @@ class ServiceSpec:
         hedging_budget: Extra copies under `adaptive`, as a share of requests.
         replicas: At least so many carry it; 0 for as many as the pool has.
         traffic: What is asked of it, for costs.
+        concurrency: Requests that a replica gives the service at once; 0 to learn it.
+        cancel: Name of the service's cancel service (`std_srvs/srv/Trigger`); empty for none.
     """
 
     name: str
@@ -59,6 +61,8 @@ class ServiceSpec:
     hedging_budget: float = 0.1
     replicas: int = 0
     traffic: TrafficSpec = field(default_factory=TrafficSpec)
+    concurrency: int = 0
+    cancel: str = ""
 
 
 @dataclass(frozen=True)
@@ -125,9 +129,15 @@ class PoolSpec:
     def hash_with(self, services: tuple[ServiceSpec, ...]) -> str:
         """Return the `replica_hash` of a replica that carries only these services."""
         asked = {
-            "services": sorted((s.name, s.type) for s in services),
+            "services": sorted(_run_by_replica(s) for s in services),
             "orphan_after_s": self.health.orphan_after_s,
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
         }
         canonical = json.dumps(asked, sort_keys=True, default=str)
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def _run_by_replica(service: ServiceSpec) -> tuple[str, ...]:
+    """Return what of a service concerns its replicas; no more than was always there if unset."""
+    policy = (str(service.concurrency), service.cancel)
+    return (service.name, service.type, *(policy if policy != ("0", "") else ()))

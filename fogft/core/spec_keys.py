@@ -6,6 +6,7 @@ Pure. The readers of each section (`spec_reader`, `spec_task`, `spec_services`) 
 from __future__ import annotations
 
 DAY_S = 86_400.0
+CONCURRENCY_LIMIT = 512  # a replica holds no more requests
 
 FOGFT_KEYS = (
     "services",
@@ -24,7 +25,7 @@ FOGFT_KEYS = (
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
-    *("hedging", "hedging_budget"),
+    *("hedging", "hedging_budget", "concurrency", "cancel"),
     *("replicas", "traffic"),
 )
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fogft.core import ros_names
 from fogft.core.spec import MAX_REPLICAS, HedgingMode, ServiceSpec
-from fogft.core.spec_keys import DAY_S, LATER_KEYS, SERVICE_KEYS, places
+from fogft.core.spec_keys import CONCURRENCY_LIMIT, DAY_S, LATER_KEYS, SERVICE_KEYS, places
 from fogft.core.spec_plan import read_traffic
 from fogft.core.spec_tree import Section, shown
 
@@ -54,7 +54,35 @@ def _service(section: Section) -> ServiceSpec:
         hedging_budget=_hedging_budget(section),
         replicas=section.whole("replicas", 0, 1, MAX_REPLICAS),
         traffic=read_traffic(section),
+        concurrency=_concurrency(section),
+        cancel=_other_service(section, "cancel", name, "the name of its cancel service"),
     )
+
+
+def _concurrency(section: Section) -> int:
+    limit = section.whole("concurrency", 0, 1, CONCURRENCY_LIMIT)
+    if limit > 1 and "cancel" in section.children:
+        raise section.error(
+            "concurrency",
+            "must be 1 where there is a `cancel` service: that names no request",
+            "remove one of the two",
+        )
+    return limit
+
+
+def _other_service(section: Section, key: str, of: str, what: str) -> str:
+    """Return the name of a service that belongs to this one; empty where there is none."""
+    hint = f"write {what}, such as `{key}: {of}_{key}`"
+    written = section.text(key, hint, default="")
+    if not written:
+        return ""
+    try:
+        name = ros_names.absolute_service_name(written)
+    except ValueError as error:
+        raise section.error(key, f"{shown(written)} is not a service name: {error}", hint) from None
+    if name == of:
+        raise section.error(key, "is the service itself", hint)
+    return name
 
 
 def _hedging_budget(section: Section) -> float:

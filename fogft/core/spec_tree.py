@@ -143,7 +143,8 @@ class Section:
         if key not in self.children:
             return default
         node = self.children[key]
-        hint = f"write a whole number from {low} to {high}; the default is {default}"
+        hint = f"write a whole number from {low} to {high}"
+        hint += f"; the default is {default}" if low <= default <= high else ""
         if isinstance(node.value, bool) or not isinstance(node.value, int):
             raise self.error(key, f"must be a whole number, not {_got(node)}", hint)
         if not low <= node.value <= high:

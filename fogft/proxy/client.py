@@ -208,6 +208,8 @@ class ClientProxy:
         with self._lock:
             if changed:
                 self._route()
+            for link in self._links.values():
+                link.flush()
             looks = [service.dispatcher.tick() for service in self._services.values()]
         self._next_look = min(looks, default=NEVER)
         return changed

@@ -7,10 +7,11 @@ the kept answer, and is never run again.
 At most `OUTSTANDING` requests a service are passed on at a time; the others wait here. An
 ordinary ROS service keeps the last ten requests that it has not yet begun and silently
 loses more, so what is passed on must never exceed that. What waits here past its deadline
-is never begun.
+is never begun, nor what its robot no longer wants.
 
 Owns: the requests that this replica holds, and what becomes of them.
-Not here: readiness and `run` (`supervisor`), the wire, ROS.
+Not here: in what order they run and how many (`line`), readiness and `run` (`supervisor`),
+the wire, ROS.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import logging
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from fogft.core.errors import RosError
+from fogft.proxy.interruption import Interruptions
+from fogft.proxy.line import Line, Work
 from fogft.ros.port import RosClient, Unreadable
 from fogft.wire.port import Incoming, Refusal
 
@@ -30,29 +33,6 @@ log = logging.getLogger(__name__)
 # The default depth of a service's queue (rmw_qos_profile_services_default). Kept true by
 # tests/proxy/test_processes.py, which sends a burst to an ordinary service.
 OUTSTANDING = 10
-# Work whose deadline has passed is still in the service's hands and takes its room. After so
-# long its response is taken for lost.
-_ABANDONED_AFTER_S = 60.0
-
-
-class _Work:
-    """A request that was accepted: who waits for it, and its answer once there is one."""
-
-    __slots__ = (
-        *("answer", "deadline", "id", "passed_on", "payload", "service", "size"),
-        *("ticket", "waiting"),
-    )
-
-    def __init__(self, id: bytes, service: str, deadline: float, first: Incoming) -> None:
-        self.id = id
-        self.service = service
-        self.deadline = deadline
-        self.payload = first.payload
-        self.size = len(first.payload)
-        self.passed_on = False
-        self.waiting: list[Incoming] | None = [first]  # None once it is done
-        self.answer: bytes | None = None
-        self.ticket: int | None = None
 
 
 class Responder:
@@ -60,13 +40,24 @@ class Responder:
 
     Args:
         is_ready: Whether a service can answer now.
-        max_in_flight: Requests held at once; more are refused as overloaded.
+        max_in_flight: Requests held at once; more are refused as overloaded, from whom has
+            most waiting.
         held_bytes: Their bytes together; more are refused as overloaded. The robots' windows
             do not bound them: a robot that has its answer from elsewhere frees its window.
-        outstanding: Requests passed on to one service at once.
+        outstanding: Requests passed on to one service at once, where no limit is given.
+        limits: How many may be at work, by service, where it is not to be learned.
         kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
         kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
         clock: Monotonic seconds.
+
+    Attributes:
+        ran: Requests passed on.
+        joined: Copies of requests that were known.
+        saved: Requests that were dropped unbegun because their robot had its answer.
+        interrupted: Requests at work that were told to stop for the same reason.
+        wasted: Requests that were run for nobody: too late, or no longer wanted.
+        wasted_s: The time that they took together, in seconds.
+        refused: Refusals by reason.
     """
 
     def __init__(
@@ -76,6 +67,7 @@ class Responder:
         max_in_flight: int = 512,
         held_bytes: int = 64 << 20,
         outstanding: int = OUTSTANDING,
+        limits: Mapping[str, int] | None = None,
         kept_bytes: int = 16 << 20,
         kept_ids: int = 32768,
         clock: Callable[[], float] = time.monotonic,
@@ -84,23 +76,27 @@ class Responder:
         self._max_in_flight = max_in_flight
         self._held_bytes_limit = held_bytes
         self._outstanding = outstanding
+        self._limits = dict(limits or {})
         self._kept_bytes_limit = kept_bytes
         self._kept_ids = kept_ids
         self._clock = clock
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
-        self._work: OrderedDict[bytes, _Work] = OrderedDict()
+        self._interruptions = Interruptions()
+        self._work: OrderedDict[bytes, Work] = OrderedDict()
         # One queue a service: its requests share a time-out, so the oldest expires first.
         self._deadlines: dict[str, deque[tuple[float, bytes]]] = {}
-        self._queues: dict[str, deque[_Work]] = {}
-        self._passed_on: dict[str, int] = {}
-        self._expired: deque[tuple[float, _Work]] = deque()  # passed on, and late
+        self._lines: dict[str, Line] = {}
         self._running = 0
         self._held_bytes = 0
         self._kept_bytes = 0
-        self._kept: OrderedDict[bytes, _Work] = OrderedDict()
+        self._kept: OrderedDict[bytes, Work] = OrderedDict()
         self.ran = 0
         self.joined = 0
+        self.saved = 0
+        self.interrupted = 0
+        self.wasted = 0
+        self.wasted_s = 0.0
         self.refused: dict[str, int] = {}
 
     @property
@@ -108,72 +104,136 @@ class Responder:
         """Requests that are held and not yet answered."""
         return self._running
 
-    def use(self, clients: Mapping[str, RosClient]) -> None:
-        """Set the clients of the local services, by service name."""
+    def report(self) -> dict[str, float]:
+        """Return what became of the work, as a probe's answer tells it."""
+        return {
+            "ran": self.ran,
+            "saved": self.saved,
+            "interrupted": self.interrupted,
+            "wasted": self.wasted,
+            "wasted_s": round(self.wasted_s, 3),
+            "expired": self.refused.get(Refusal.EXPIRED, 0),
+            "overloaded": self.refused.get(Refusal.OVERLOADED, 0),
+            **{f"limit {name}": line.limit.limit for name, line in self._lines.items()},
+        }
+
+    def use(
+        self,
+        clients: Mapping[str, RosClient],
+        cancel_clients: Mapping[str, RosClient] | None = None,
+    ) -> None:
+        """Set the clients of the local services, and of their cancel services, by service."""
         self._clients = clients
+        self._interruptions.use(cancel_clients or {})
+
+    # -- from the wire --------------------------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
         """Take a request from the wire. Never blocks."""
         now = self._clock()
         id = incoming.request_id
+        displaced = None
         with self._lock:
             known = self._work.get(id)
             if known is not None:
                 self.joined += 1
-                if known.waiting is not None:
+                if known.waiting is not None and not known.unwanted:
                     known.waiting.append(incoming)
                     return
                 answer = known.answer
+                reason = Refusal.CANCELLED if known.unwanted else Refusal.FORGOTTEN
             else:
-                reason = self._reason_to_refuse(incoming)
+                answer = None
+                reason, displaced = self._reason_to_refuse(incoming, now)
                 if not reason:
-                    work = _Work(id, incoming.service, now + incoming.remaining_s, incoming)
-                    self._work[id] = work
-                    self._deadlines.setdefault(work.service, deque()).append((work.deadline, id))
-                    self._running += 1
-                    self._held_bytes += work.size
-                    self._queues.setdefault(work.service, deque()).append(work)
-        if known is not None:
-            if answer is not None:
-                incoming.reply(answer)
-            else:
-                self._refuse(incoming, Refusal.FORGOTTEN)
+                    self._accept(Work(now + incoming.remaining_s, incoming))
+        if displaced is not None:
+            self._end(displaced.id, Refusal.OVERLOADED)
+        if answer is not None:
+            incoming.reply(answer)
         elif reason:
             self._refuse(incoming, reason)
         else:
             self._pass_on(incoming.service)
 
-    def _reason_to_refuse(self, incoming: Incoming) -> str:
+    def _accept(self, work: Work) -> None:
+        self._work[work.id] = work
+        self._deadlines.setdefault(work.service, deque()).append((work.deadline, work.id))
+        self._running += 1
+        self._held_bytes += work.size
+        self._line(work.service).put(work)
+
+    def _line(self, service: str) -> Line:
+        line = self._lines.get(service)
+        if line is None:
+            line = self._lines[service] = Line(self._outstanding, self._limits.get(service))
+        return line
+
+    def _reason_to_refuse(self, incoming: Incoming, now: float) -> tuple[str, Work | None]:
+        """Return why a request is not taken, empty if it is, and what gives way to it."""
         if incoming.remaining_s <= 0:
-            return Refusal.EXPIRED
+            return Refusal.EXPIRED, None
         if not self._is_ready(incoming.service) or incoming.service not in self._clients:
-            return Refusal.NOT_READY
+            return Refusal.NOT_READY, None
+        line = self._line(incoming.service)
+        deadline = now + incoming.remaining_s
+        if line.hopeless(incoming.robot, deadline, incoming.remaining_s):
+            return Refusal.OVERLOADED, None
         held_bytes = self._held_bytes + len(incoming.payload)
-        full = self._running >= self._max_in_flight or held_bytes > self._held_bytes_limit
-        if full and self._running:
-            return Refusal.OVERLOADED
-        return ""
+        if held_bytes > self._held_bytes_limit and self._running:
+            return Refusal.OVERLOADED, None
+        if self._running < self._max_in_flight:
+            return "", None
+        displaced = line.give_way(incoming.robot, deadline)
+        return ("", displaced) if displaced is not None else (Refusal.OVERLOADED, None)
+
+    def cancel(self, ids: Iterable[bytes]) -> None:
+        """Drop requests that are no longer wanted; those at work are told to stop, if they can.
+
+        Not for a thread that must not block: a cancel service is called.
+        """
+        dropped, at_work = [], []
+        with self._lock:
+            for id in ids:
+                work = self._work.get(id)
+                if work is None or work.waiting is None or work.unwanted:
+                    continue
+                work.unwanted = True
+                if self._line(work.service).remove(work):
+                    self.saved += 1
+                    dropped.append(id)
+                elif work.passed_on:
+                    at_work.append(work)
+        for id in dropped:
+            self._end(id, Refusal.CANCELLED)
+        for work in at_work:
+            line = self._lines[work.service]
+            with self._lock:
+                held = self._interruptions.begin(work, line, self._clock())
+            if held and self._interruptions.send(work.service, self._interrupted):
+                self.interrupted += 1
+
+    def _interrupted(self, service: str) -> None:
+        with self._lock:
+            self._interruptions.ended(service)
+        self._pass_on(service)
+
+    # -- to the service -------------------------------------------------------------------
 
     def _pass_on(self, service: str) -> None:
         """Give a service as much of what waits as it may have."""
+        line = self._lines[service]
         while True:
             with self._lock:
-                queue = self._queues.get(service)
-                if not queue or self._passed_on.get(service, 0) >= self._outstanding:
-                    return
-                work = queue.popleft()
-                if work.waiting is None:
-                    continue  # ended while it waited
-                late = work.deadline <= self._clock()
-                if not late:
-                    work.passed_on = True
-                    self._passed_on[service] = self._passed_on.get(service, 0) + 1
-            if late:
-                self._end(work.id, Refusal.EXPIRED)
-            else:
+                work = line.take(self._clock())
+            if work is None:
+                return
+            if work.passed_on:
                 self._call(work)
+            else:
+                self._end(work.id, Refusal.EXPIRED)
 
-    def _call(self, work: _Work) -> None:
+    def _call(self, work: Work) -> None:
         def on_response(payload: bytes) -> None:
             self._finished(work, payload)
 
@@ -189,27 +249,30 @@ class Responder:
         else:
             self.ran += 1
 
-    def _finished(self, work: _Work, payload: bytes) -> None:
+    def _finished(self, work: Work, payload: bytes) -> None:
+        now = self._clock()
+        line = self._lines[work.service]
         with self._lock:
-            self._free(work)
+            line.finished(work, now)
             waiting, work.waiting = work.waiting or [], None
             if waiting:
-                self._keep(work, payload)
+                self._running -= 1
+                self._held_bytes -= work.size
+                if not work.unwanted:
+                    self._keep(work, payload)
+            if not waiting or work.unwanted:
+                self.wasted += 1
+                self.wasted_s += now - work.begun
         for incoming in waiting:
-            incoming.reply(payload)
-        if self._queues[work.service]:
+            if work.unwanted:  # its bytes would be dropped at the other end
+                self._refuse(incoming, Refusal.LATE)
+            else:
+                incoming.reply(payload)
+        if line:
             self._pass_on(work.service)
 
-    def _free(self, work: _Work) -> None:
-        """The service has no more to do with this work. Under the lock."""
-        if work.passed_on:
-            work.passed_on = False
-            self._passed_on[work.service] -= 1
-
-    def _keep(self, work: _Work, answer: bytes) -> None:
+    def _keep(self, work: Work, answer: bytes) -> None:
         """Keep an answer for copies, within the bounds. Under the lock."""
-        self._running -= 1
-        self._held_bytes -= work.size
         work.answer = answer
         self._kept[work.id] = work
         self._kept_bytes += len(answer)
@@ -226,7 +289,7 @@ class Responder:
                 self._drop(id, work)
                 return
 
-    def _drop(self, id: bytes, work: _Work) -> None:
+    def _drop(self, id: bytes, work: Work) -> None:
         del self._work[id]
         if self._kept.pop(id, None) is not None:
             self._kept_bytes -= len(work.answer or b"")
@@ -241,10 +304,12 @@ class Responder:
             waiting, work.waiting = work.waiting, None
             self._running -= 1
             self._held_bytes -= work.size
+            line = self._lines[work.service]
+            line.remove(work)
             if reason != Refusal.EXPIRED:
-                self._free(work)
+                line.free(work)
             elif work.passed_on:
-                self._expired.append((self._clock() + _ABANDONED_AFTER_S, work))
+                line.overdue(work, self._clock())
         for incoming in waiting:
             self._refuse(incoming, reason)
 
@@ -265,11 +330,12 @@ class Responder:
             ]
             blamed = [work for work in dead if work.passed_on]
             spared = [work for work in dead if not work.passed_on]
-            abandoned = [entry for entry in self._expired if service in (None, entry[1].service)]
-            for entry in abandoned:
-                self._expired.remove(entry)
-                self._free(entry[1])
-        for work in (*blamed, *(work for _, work in abandoned)):
+            lost = []
+            for name, line in self._lines.items():
+                if service in (None, name):
+                    lost += line.abandoned(float("inf"))
+                    self._interruptions.ended(name)
+        for work in (*blamed, *lost):
             self._forget_ticket(work)
         for work in spared:  # first: room that the blamed leave is not for them
             self._end(work.id, Refusal.NOT_READY)
@@ -291,18 +357,16 @@ class Responder:
                         self._drop(id, work)
                     else:
                         late.append(id)
-            abandoned = []
-            while self._expired and self._expired[0][0] <= now:
-                abandoned.append(self._expired.popleft()[1])
-                self._free(abandoned[-1])
+            abandoned = [work for line in self._lines.values() for work in line.abandoned(now)]
+            self._interruptions.tick(now)
         for id in late:
             self._end(id, Refusal.EXPIRED)
         for work in abandoned:
             self._forget_ticket(work)
-        for service in list(self._queues):
+        for service in list(self._lines):
             self._pass_on(service)
 
-    def _forget_ticket(self, work: _Work | None) -> None:
-        client = self._clients.get(work.service) if work else None
-        if work is not None and client is not None and work.ticket is not None:
+    def _forget_ticket(self, work: Work) -> None:
+        client = self._clients.get(work.service)
+        if client is not None and work.ticket is not None:
             client.forget(work.ticket)

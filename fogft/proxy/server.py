@@ -23,6 +23,7 @@ from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.core import names
 from fogft.core.model import ReplicaId
 from fogft.core.spec import ServiceSpec
+from fogft.proxy.interruption import CANCEL_TYPE
 from fogft.proxy.responder import Responder
 from fogft.proxy.supervisor import Supervisor
 from fogft.ros.port import RosClient, RosNode
@@ -73,7 +74,10 @@ class ServerProxy:
         self._draining = False
         self._at_risk = False
         self.responder = Responder(
-            lambda name: name in self._ready, max_in_flight=max_in_flight, clock=clock
+            lambda name: name in self._ready,
+            max_in_flight=max_in_flight,
+            limits=_limits(services),
+            clock=clock,
         )
 
     def start(self) -> None:
@@ -83,7 +87,7 @@ class ServerProxy:
             for s in self._services
         }
         self._join_ros()
-        self._listener.serve(keys, self._request, self._probe)
+        self._listener.serve(keys, self._request, self._probe, self.responder.cancel)
         self._supervisor.poll()
         log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
 
@@ -140,7 +144,10 @@ class ServerProxy:
         self._node = self._make_node()
         self._clients = {s.name: self._node.client(s.name, s.type) for s in self._services}
         self._servers = {}
-        self.responder.use(self._clients)
+        cancels = {
+            s.name: self._node.client(s.cancel, CANCEL_TYPE) for s in self._services if s.cancel
+        }
+        self.responder.use(self._clients, cancels)
 
     def _leave_ros(self) -> None:
         node, self._node, self._clients = self._node, None, {}
@@ -165,6 +172,7 @@ class ServerProxy:
             restarts=max(self._supervisor.restarts, 0),
             in_flight=self.responder.in_flight,
             detail=self._detail(),
+            work=self.responder.report(),
         )
 
     def _detail(self) -> str:
@@ -184,3 +192,10 @@ class ServerProxy:
         self.responder.crashed()
         self._listener.close()
         self._leave_ros()
+
+
+def _limits(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
+    """Return how many requests a service may have at once, where that is not to be learned."""
+    # A cancel service names no request, so it must be clear which one is meant.
+    limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
+    return {name: limit for name, limit in limits.items() if limit}

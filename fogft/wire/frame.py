@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,8 @@ PROBE_LIMIT = 1024
 PROBE_ANSWER_LIMIT = 65536
 DETAIL_LIMIT = 500
 REMAINING_LIMIT_S = LONGEST_S
+CANCEL_LIMIT = 4096
+_CANCEL_BYTES_LIMIT = 1 + CANCEL_LIMIT * REQUEST_ID_BYTES
 
 GREETING_LIMIT = 4096
 
@@ -201,6 +204,23 @@ def decode_greeting(frame: bytes) -> Greeting:
     return Greeting(token, frame[_GREETING.size : end], frame[end:])
 
 
+def encode_cancel(ids: Sequence[bytes]) -> bytes:
+    """Return the ids of requests that are no longer wanted, at most `CANCEL_LIMIT`."""
+    return bytes((VERSION,)) + b"".join(ids[:CANCEL_LIMIT])
+
+
+def decode_cancel(frame: bytes) -> list[bytes]:
+    """Return the ids of requests that are no longer wanted.
+
+    Raises:
+        FrameError: It is not a list of ids.
+    """
+    if not frame or (len(frame) - 1) % REQUEST_ID_BYTES or len(frame) > _CANCEL_BYTES_LIMIT:
+        raise FrameError(f"a cancellation of {len(frame)} bytes")
+    _check_version(frame[0])
+    return [frame[at : at + REQUEST_ID_BYTES] for at in range(1, len(frame), REQUEST_ID_BYTES)]
+
+
 def encode_probe(probe: Probe) -> bytes:
     """Return a probe as compact JSON."""
     return _to_json({"v": VERSION, "robot": probe.robot, "manager_age_s": probe.manager_age_s})
@@ -234,6 +254,7 @@ def encode_probe_answer(answer: ProbeAnswer) -> bytes:
             "at_risk": answer.at_risk,
             "restarts": answer.restarts,
             "in_flight": answer.in_flight,
+            "work": dict(answer.work),
             "detail": answer.detail[:DETAIL_LIMIT].encode(errors="replace").decode(),
         }
     )
@@ -267,6 +288,7 @@ def decode_probe_answer(frame: bytes) -> ProbeAnswer:
         at_risk=at_risk,
         restarts=_count(raw, "restarts"),
         in_flight=_count(raw, "in_flight"),
+        work=_numbers(raw, "work"),
         detail=_text(raw, "detail"),
     )
 
@@ -318,6 +340,13 @@ def _count(raw: dict[str, Any], key: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**53:
         raise FrameError(f"`{key}` is not a count")
     return value
+
+
+def _numbers(raw: dict[str, Any], key: str) -> dict[str, float]:
+    found = raw.get(key, {})  # an older replica tells none
+    if not isinstance(found, dict):
+        raise FrameError(f"`{key}` is not a map of numbers")
+    return {_check_text(name, key): _seconds(found, name) for name in found}
 
 
 def _seconds(raw: dict[str, Any], key: str) -> float:

@@ -10,7 +10,7 @@ Not here: certificates; a listener's name stands for its certificate.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from fogft.core import names
@@ -153,6 +153,7 @@ class MemoryListener:
         self._services: dict[str, str] = {}  # key -> name
         self._on_request: Callable[[Incoming], None] | None = None
         self._on_probe: Callable[[Probe], ProbeAnswer] | None = None
+        self._on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None
         self.certificate_name = names.replica_certificate_name(id)
         self.frozen = False
         self.count: Counter[str] = Counter()
@@ -167,6 +168,7 @@ class MemoryListener:
         services: Mapping[str, str],
         on_request: Callable[[Incoming], None],
         on_probe: Callable[[Probe], ProbeAnswer],
+        on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
     ) -> None:
         """Begin to listen.
 
@@ -175,7 +177,7 @@ class MemoryListener:
         """
         self._wire.bind(self)
         self._services = {key: name for name, key in services.items()}
-        self._on_request, self._on_probe = on_request, on_probe
+        self._on_request, self._on_probe, self._on_cancel = on_request, on_probe, on_cancel
 
     def request(self, key: str, incoming: MemoryIncoming) -> None:
         """Take a request that arrived."""
@@ -194,6 +196,11 @@ class MemoryListener:
 
     def revoke(self, names: Collection[str]) -> None:
         """Do nothing: this wire has no certificates."""
+
+    def cancel(self, ids: Sequence[bytes]) -> None:
+        """Take a cancellation that arrived."""
+        self.count["cancellations"] += 1
+        self._on_cancel(ids)
 
     def counters(self) -> Mapping[str, int]:
         """Counts by event name."""

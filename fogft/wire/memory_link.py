@@ -65,6 +65,7 @@ class MemoryLink:
             LinkState.CONNECTING, None, None, 0.0, None, 0, 0, 0, "not reached yet"
         )
         self._heard_at: float | None = None
+        self._forgotten: dict[bytes, None] = {}
 
     @property
     def peer(self) -> Peer:
@@ -121,16 +122,26 @@ class MemoryLink:
             self._events.answered(self, replace(answer, service=attempt.service))
             if session.window.regained_room():
                 self._events.changed(self)
-        elif answer.payload is not None:
+            return
+        self._forgotten.pop(attempt.request_id, None)
+        if answer.payload is not None or answer.refusal == Refusal.LATE:
             self._events.late(self, attempt.service, attempt.request_id)
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request."""
         session = self._session
         if session is not None and session.window.forget(request_id):
+            self._forgotten[request_id] = None
             session.attempts = [a for a in session.attempts if a.request_id != request_id]
             if session.window.regained_room():
                 self._events.changed(self)
+
+    def flush(self) -> None:
+        """Tell the replica of all that was forgotten and not answered."""
+        session, ids = self._session, list(self._forgotten)
+        self._forgotten.clear()
+        if session is not None and ids:
+            self._wire.post(session, lambda: session.listener.cancel(ids))
 
     def status(self) -> LinkStatus:
         """Return a snapshot."""

@@ -11,8 +11,8 @@ Implementations: `fogft.wire.zenoh_link` and `zenoh_listener`, `fogft.wire.memor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from fogft.core.model import LinkState, ReplicaId
@@ -43,6 +43,7 @@ class ProbeAnswer:
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
         restarts: How often it restarted the user's `run` command.
         in_flight: Requests that it holds.
+        work: What became of requests since its start, by name (`Responder.report`).
         detail: Why it is not ready, in words; empty when it is.
     """
 
@@ -55,6 +56,7 @@ class ProbeAnswer:
     restarts: int = 0
     in_flight: int = 0
     detail: str = ""
+    work: Mapping[str, float] = field(default_factory=dict)
 
 
 class Refusal:
@@ -69,6 +71,8 @@ class Refusal:
     NOT_ADMITTED = "not-admitted"  # who asks may not, or did not say who it is
     REVOKED = "revoked"  # the certificate of who asks was taken back
     EXPIRED_CERTIFICATE = "expired-certificate"  # by the replica's clock
+    CANCELLED = "cancelled"  # dropped, because the robot had its answer from elsewhere
+    LATE = "late"  # it was run, but the robot had its answer from elsewhere
     LOST = "lost"  # made locally: the link died before an answer came
 
 
@@ -157,7 +161,13 @@ class Link(Protocol):
         """
 
     def forget(self, request_id: bytes) -> None:
-        """Free the window of a request whose answer is no longer wanted. Unknown ids are fine."""
+        """Free the window of a request whose answer is no longer wanted. Unknown ids are fine.
+
+        The replica is told: at once if the request has been out for a while, else by `flush`.
+        """
+
+    def flush(self) -> None:
+        """Tell the replica of all that was forgotten and not answered. Cheap; never blocks."""
 
     def status(self) -> LinkStatus:
         """Return a snapshot, for people and for the manager."""
@@ -224,8 +234,17 @@ class Listener(Protocol):
         services: Mapping[str, str],
         on_request: Callable[[Incoming], None],
         on_probe: Callable[[Probe], ProbeAnswer],
+        on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
     ) -> None:
-        """Begin to listen. Callbacks come from the wire's threads and must not block."""
+        """Begin to listen. Callbacks come from the wire's threads and must not block.
+
+        Args:
+            services: Service name -> key.
+            on_request: Takes a request.
+            on_probe: Answers a probe.
+            on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
+                block for a moment, which holds up nothing but probes.
+        """
 
     def revoke(self, names: Collection[str]) -> None:
         """Let the holders of these certificates (common names) in no more. Repeatable."""

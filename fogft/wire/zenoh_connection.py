@@ -22,6 +22,7 @@ from typing import Any
 import zenoh
 from zenoh import handlers
 
+from fogft.core import names
 from fogft.core.errors import WireError
 from fogft.core.records import Sign
 from fogft.wire import frame
@@ -30,6 +31,7 @@ from fogft.wire.diagnosis import wrong_name
 from fogft.wire.leaving import see_off
 from fogft.wire.link_window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.wire.port import Answer, Peer, Refusal
+from fogft.wire.recalls import WORTH_S, Recalls
 from fogft.wire.timer_budget import TimerBudget
 from fogft.wire.turns import LARGE_BYTES, Turns
 
@@ -44,6 +46,9 @@ _AT_ONCE = zenoh.ConsolidationMode.NONE
 _QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
 # A `get` that took this long was stuck behind a full queue: see whether the session survived.
 _STUCK_S = 0.1
+# How long Zenoh keeps a cancellation; nobody answers it.
+_TELL_TIMEOUT_S = 1.0
+_NOBODY = handlers.Callback(lambda _: None, indirect=False)
 
 
 _REFUSED = {
@@ -56,18 +61,32 @@ _REFUSED = {
 class OpenAttempt:
     """A request on its way through one connection."""
 
-    __slots__ = ("deadline", "key", "mark", "payload", "request_id", "service", "size")
+    __slots__ = (
+        *("deadline", "key", "mark", "offered", "payload", "request_id", "service", "size"),
+    )
 
     def __init__(
-        self, service: str, key: zenoh.KeyExpr, request_id: bytes, payload: bytes, deadline: float
+        self,
+        service: str,
+        key: zenoh.KeyExpr,
+        request_id: bytes,
+        payload: bytes,
+        *,
+        offered: float,
+        remaining_s: float,
     ) -> None:
         self.service = service
         self.key = key
         self.request_id = request_id
         self.payload: bytes | None = payload  # None once it was sent, or is not wanted
         self.size = len(payload)
-        self.deadline = deadline
+        self.offered = offered
+        self.deadline = offered + remaining_s
         self.mark = 0  # what the connection had sent once this was sent (`credit`)
+
+
+# In the queue, in place of an attempt: tell the replica of what was forgotten.
+_TELL = OpenAttempt("", zenoh.KeyExpr("tell"), b"", b"", offered=0.0, remaining_s=0.0)
 
 
 class Connection:
@@ -119,6 +138,9 @@ class Connection:
         self._greeting = frame.encode_greeting(greeting)
         self._queue: SimpleQueue[OpenAttempt | None] = SimpleQueue()
         self._credit = Credit()
+        self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
+        self._recalls = Recalls()
+        self._telling = False
         self.window: LinkWindow[OpenAttempt] = LinkWindow()
         self.lost_because = ""
         self._session = zenoh.open(config)
@@ -136,10 +158,10 @@ class Connection:
         self._thread.start()
 
     def _check_peer(self, peer: Peer) -> None:
-        names = {link.auth_identifier for link in self._session.info.links()}
-        if not names:
+        found = {link.auth_identifier for link in self._session.info.links()}
+        if not found:
             raise WireError(f"`{peer.endpoint}` was lost as soon as it was reached")
-        for name in names - {peer.certificate_name}:
+        for name in found - {peer.certificate_name}:
             raise WireError(wrong_name(name, peer), "another machine has this address now")
 
     # -- requests (any thread) ------------------------------------------------------------
@@ -149,7 +171,10 @@ class Connection:
         key = self._keys.get(service)
         if key is None or self._queue.qsize() >= _QUEUE_LIMIT:
             return False
-        attempt = OpenAttempt(service, key, request_id, payload, time.monotonic() + remaining_s)
+        now = time.monotonic()
+        attempt = OpenAttempt(
+            service, key, request_id, payload, offered=now, remaining_s=remaining_s
+        )
         if not self.window.admit(attempt):
             return False
         mark = self._credit.take(attempt.size)
@@ -166,9 +191,19 @@ class Connection:
         attempt = self.window.forget(request_id)
         if attempt is None:
             return
+        if attempt.payload is None:  # it was sent
+            self._recalls.add(request_id)
+            if time.monotonic() - attempt.offered >= WORTH_S:
+                self.flush()
         attempt.payload = None
         if self.window.regained_room():
             self._room()
+
+    def flush(self) -> None:
+        """Have the replica told of what was forgotten and not answered."""
+        if self._recalls and not self._telling:
+            self._telling = True
+            self._queue.put(_TELL)
 
     def _end(self, attempt: OpenAttempt, payload: bytes | None, refusal: str = "") -> None:
         if self.window.remove(attempt):
@@ -184,9 +219,29 @@ class Connection:
             attempt = self._queue.get()
             if attempt is None:
                 break
+            if attempt is _TELL:
+                self._tell()
+                continue
             self._send_or_lose(attempt)
             self._credit.dequeued()
         _close(self._session)
+
+    def _tell(self) -> None:
+        self._telling = False
+        ids = self._recalls.take()
+        if not ids:
+            return
+        try:
+            self._session.get(
+                self._cancel_key,
+                _NOBODY,
+                payload=frame.encode_cancel(ids),
+                timeout=_TELL_TIMEOUT_S,
+                target=_ALL,
+                consolidation=_AT_ONCE,
+            )
+        except zenoh.ZError as error:
+            self._lose(f"sending failed: {error}")
 
     def _send_or_lose(self, attempt: OpenAttempt) -> None:
         try:
@@ -233,7 +288,8 @@ class Connection:
         if reply.ok is not None:
             self._credit.heard(attempt.mark)  # requests of one connection arrive in order
         if not self.window.holds(attempt):
-            if reply.ok is not None:  # it was forgotten, or has ended
+            self._recalls.answered(attempt.request_id)  # it was forgotten, or has ended
+            if reply.ok is not None or _ran_in_vain(reply):
                 self._late(attempt.service, attempt.request_id)
             return
         try:
@@ -317,6 +373,16 @@ class Connection:
     def join(self, timeout_s: float) -> None:
         """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
         self._thread.join(timeout_s)
+
+
+def _ran_in_vain(reply: zenoh.Reply) -> bool:
+    """Whether the replica says that it ran a request whose answer was not wanted any more."""
+    if reply.err is None:
+        return False
+    try:
+        return frame.decode_refusal(reply.err.payload.to_bytes())[1] == Refusal.LATE
+    except frame.FrameError:
+        return False
 
 
 def _read_reply(reply: zenoh.Reply, request_id: bytes) -> tuple[bytes | None, str]:

@@ -126,6 +126,12 @@ class ZenohLink:
         for retiring in tuple(self._retiring):
             retiring.forget(request_id)
 
+    def flush(self) -> None:
+        """Tell the replica of all that was forgotten and not answered."""
+        live = self._live
+        if live is not None:
+            live.flush()
+
     def status(self) -> LinkStatus:
         """Return a snapshot."""
         now = time.monotonic()

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from queue import SimpleQueue
 
@@ -159,6 +159,7 @@ class ZenohListener:
         services: Mapping[str, str],
         on_request: Callable[[Incoming], None],
         on_probe: Callable[[Probe], ProbeAnswer],
+        on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
     ) -> None:
         """Begin to listen.
 
@@ -175,6 +176,8 @@ class ZenohListener:
         threading.Thread(target=self._do_chores, name="fogft-probes", daemon=True).start()
         for name, key in services.items():
             self._declare(session, key, partial(self._request, name, on_request))
+        cancel_key = names.cancel_key(self._id.pool_uid, self._id.slot)
+        self._declare(session, cancel_key, partial(self._cancel, on_cancel))
         # Last: who is told that this replica is ready finds every service.
         probe_key = names.probe_key(self._id.pool_uid, self._id.slot)
         self._declare(session, probe_key, partial(self._probe, on_probe))
@@ -231,6 +234,16 @@ class ZenohListener:
             log.warning("robot_not_admitted reason=%r count=%d", why, count)
         self._chores.put(Reply(query, request_id, b"", refusal).send)
 
+    def _cancel(self, on_cancel: Callable[[Sequence[bytes]], None], query: zenoh.Query) -> None:
+        self._counters.add("cancellations")
+        try:
+            ids = frame.decode_cancel(query.payload.to_bytes() if query.payload else b"")
+        except frame.FrameError as error:
+            self._malformed(error, query)
+            return
+        self._chores.put(partial(_end_query, query))  # nobody awaits an answer
+        self._chores.put(partial(on_cancel, ids))
+
     def _malformed(self, error: frame.FrameError, query: zenoh.Query) -> None:
         count = self._counters.add("malformed")
         if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
@@ -273,7 +286,7 @@ class ZenohListener:
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
-        ``malformed``, ``not_admitted``, ``reply_dropped``, ``failed``.
+        ``malformed``, ``not_admitted``, ``reply_dropped``, ``failed``, ``cancellations``.
         """
         return self._counters.snapshot()
 
@@ -291,6 +304,10 @@ class ZenohListener:
         closer.start()
         see_off(closer)
         closer.join(_CLOSE_WAIT_S / 2)
+
+
+def _end_query(query: zenoh.Query) -> None:
+    query.drop()  # type: ignore[no-untyped-call]
 
 
 def _close(session: zenoh.Session) -> None:

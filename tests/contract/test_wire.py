@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -109,7 +109,11 @@ class Replica:
         self.probes: list[Probe] = []
         self.echo = False
         self.answer = ProbeAnswer(slot, generation, "first", frozenset({SERVICE}))
-        listener.serve(keys(slot), self._request, self._probe)
+        self.cancelled: list[bytes] = []
+        listener.serve(keys(slot), self._request, self._probe, self._cancel)
+
+    def _cancel(self, ids: Sequence[bytes]) -> None:
+        self.cancelled += ids
 
     def _request(self, incoming: Incoming) -> None:
         self.requests.append(incoming)
@@ -249,6 +253,37 @@ def test_a_forgotten_request_frees_its_room_and_its_answer_is_late(
     world.wait_for(lambda: owner.too_late)
     assert owner.of(1) == []
     assert owner.too_late == [(SERVICE, request_id(1))]
+
+
+def test_the_replica_is_told_what_was_forgotten(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    for number in range(3):
+        link.offer(SERVICE, request_id(number), b"", 5.0)
+    world.wait_for(lambda: len(replica.requests) == 3)
+    for number in (0, 2):
+        link.forget(request_id(number))
+    link.flush()
+    world.wait_for(lambda: len(replica.cancelled) == 2)
+    assert replica.cancelled == [request_id(0), request_id(2)]
+    replica.requests[0].refuse(Refusal.CANCELLED)
+    replica.requests[2].refuse(Refusal.LATE)  # it had been run, which is told of
+    world.wait_for(lambda: owner.too_late)
+    assert owner.too_late == [(SERVICE, request_id(2))]
+    assert owner.answers == []
+
+
+def test_the_replica_is_not_told_what_it_has_answered(
+    world: World, replica: Replica, link: Link, owner: Owner
+) -> None:
+    """A quick service's losers answer before a message could reach them: none is sent."""
+    replica.echo = True
+    link.offer(SERVICE, request_id(1), b"", 5.0)
+    world.wait_for(lambda: owner.answers)
+    link.forget(request_id(1))
+    link.flush()
+    world.settle()
+    assert replica.cancelled == []
 
 
 def test_an_attempt_whose_time_is_up_is_lost(

@@ -64,6 +64,7 @@ services = st.lists(
         on_timeout=st.sampled_from(OnTimeout),
         ok_field=st.sampled_from(["", "success", "ok_2"]),
         hedging=st.sampled_from(HedgingMode),
+        concurrency=st.integers(0, 512),
     ),
     min_size=1,
     max_size=4,

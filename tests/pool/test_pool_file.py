@@ -373,6 +373,22 @@ MISTAKES = {
         "`hedging: adaptive` sends extra copies by a budget",
         "write `hedging: adaptive`, or remove it",
     ),
+    "cancel service and concurrency": (
+        pool(services="[{name: a, type: a/srv/A, cancel: stop, concurrency: 4}]"),
+        "pool.yaml:3: fogft.services[0].concurrency: must be 1 where there is a `cancel` "
+        "service: that names no request",
+        "remove one of the two",
+    ),
+    "cancel service that is the service": (
+        pool(services="[{name: a, type: a/srv/A, cancel: /a}]"),
+        "pool.yaml:3: fogft.services[0].cancel: is the service itself",
+        "write the name of its cancel service, such as `cancel: /a_cancel`",
+    ),
+    "concurrency of nothing": (
+        pool(services="[{name: a, type: a/srv/A, concurrency: 0}]"),
+        "pool.yaml:3: fogft.services[0].concurrency: must be from 1 to 512, not `0`",
+        "write a whole number from 1 to 512",
+    ),
     "hedging for the whole pool": (
         pool("hedging: adaptive"),
         "pool.yaml:4: fogft.hedging: unknown key",

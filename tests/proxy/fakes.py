@@ -47,6 +47,9 @@ class FakeLink:
     def forget(self, request_id: bytes) -> None:
         self.forgotten.append(request_id)
 
+    def flush(self) -> None:
+        pass
+
     def status(self) -> LinkStatus:
         state = LinkState.UP if self.ready else LinkState.SUSPECT
         return LinkStatus(state, None, 0.0, 0.0, 0.001, 0, 0, 0, "")
@@ -86,12 +89,18 @@ class FakeIncoming:
     """A request at the replica; keeps what it was answered."""
 
     def __init__(
-        self, request_id: bytes, payload: bytes = b"q", *, service: str = "/s", remaining_s=10.0
+        self,
+        request_id: bytes,
+        payload: bytes = b"q",
+        *,
+        service: str = "/s",
+        remaining_s=10.0,
+        robot: str = "r",
     ) -> None:
         self.request_id = request_id
         self.payload = payload
         self.service = service
-        self.robot = "r"
+        self.robot = robot
         self.remaining_s = remaining_s
         self.outcome: list[Any] = []
 
@@ -180,7 +189,8 @@ class FakeListener:
         self.closed = False
         self.services: dict[str, str] = {}
 
-    def serve(self, services, on_request, on_probe) -> None:
+    def serve(self, services, on_request, on_probe, on_cancel) -> None:
+        self.on_cancel = on_cancel
         self.services = dict(services)
         self.on_request = on_request
         self.on_probe: Callable[[Probe], ProbeAnswer] = on_probe

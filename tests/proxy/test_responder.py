@@ -252,9 +252,150 @@ def test_the_number_of_ids_is_bounded():
     assert len(scene.responder._work) <= 10
 
 
+def test_what_waits_and_is_no_longer_wanted_is_dropped_and_counted():
+    scene = Scene(outstanding=1)
+    scene.ask(A)
+    unwanted = scene.ask(B)
+    scene.responder.cancel([B, b"unknown id 12345"])
+    assert unwanted.outcome == ["refused cancelled"]
+    scene.answer(0)
+    assert len(scene.client.calls) == 1
+    assert (scene.responder.saved, scene.responder.in_flight) == (1, 0)
+
+
+def test_what_is_at_work_and_no_longer_wanted_is_counted_as_wasted_and_its_bytes_stay_here():
+    scene = Scene()
+    unwanted = scene.ask(A)
+    scene.responder.cancel([A])
+    scene.clock.now += 2.0
+    scene.answer(0, b"a large answer")
+    assert unwanted.outcome == ["refused late"]
+    assert (scene.responder.wasted, scene.responder.wasted_s) == (1, 2.0)
+
+
+def test_an_answer_after_the_deadline_is_counted_as_wasted():
+    scene = Scene()
+    scene.ask(A, remaining_s=1.0)
+    scene.clock.now += 1.5
+    scene.responder.tick()
+    scene.answer(0)
+    assert scene.responder.wasted == 1
+
+
+def test_what_is_answered_cannot_be_cancelled():
+    scene = Scene()
+    scene.ask(A)
+    scene.answer(0, b"r")
+    scene.responder.cancel([A])
+    assert scene.ask(A).outcome == [b"r"]
+    assert scene.responder.saved == 0
+
+
+def interruptible() -> tuple[Scene, FakeClient]:
+    scene = Scene(limits={"/s": 1})
+    stop = FakeClient()
+    scene.responder.use({"/s": scene.client}, {"/s": stop})
+    return scene, stop
+
+
+def test_a_cancel_service_is_called_for_what_is_at_work():
+    scene, stop = interruptible()
+    scene.ask(A)
+    scene.responder.cancel([A])
+    assert [payload for payload, _ in stop.calls] == [bytes((0, 1, 0, 0, 0))]
+    assert scene.responder.interrupted == 1
+
+
+def test_nothing_is_begun_before_the_cancel_service_has_answered():
+    """It names no request: what it stopped might be the next one."""
+    scene, stop = interruptible()
+    scene.ask(A)
+    wanted = scene.ask(B)
+    scene.responder.cancel([A])
+    scene.answer(0, b"stopped")
+    assert len(scene.client.calls) == 1
+    stop.calls[0][1](b"ok")
+    scene.answer(1, b"b")
+    assert wanted.outcome == [b"b"]
+
+
+def test_a_cancel_service_that_is_dead_holds_nothing_up_for_long():
+    scene, stop = interruptible()
+    scene.ask(A)
+    scene.ask(B)
+    scene.responder.cancel([A])
+    scene.answer(0)
+    scene.clock.now += 3.0
+    scene.responder.tick()
+    assert len(scene.client.calls) == 2
+    scene.responder.cancel([B])
+    stop.broken = RosError("closed")
+    scene.answer(1)
+    scene.ask(b"c" * 16)
+    scene.clock.now += 3.0
+    scene.responder.tick()
+    assert len(scene.client.calls) == 3
+
+
+def test_a_service_without_a_cancel_service_works_on():
+    scene = Scene()
+    scene.ask(A)
+    scene.responder.cancel([A])
+    assert scene.responder.interrupted == 0
+
+
+def test_the_earliest_deadline_is_begun_first():
+    scene = Scene(outstanding=1)
+    scene.ask(A)
+    scene.ask(B, payload=b"later", remaining_s=9.0)
+    scene.ask(b"c" * 16, payload=b"sooner", remaining_s=2.0)
+    scene.answer(0)
+    assert scene.client.calls[1][0] == b"sooner"
+
+
+def test_a_chatty_robot_does_not_starve_another():
+    scene = Scene(outstanding=1)
+    for n in range(50):
+        scene.ask(n.to_bytes(16, "big"), payload=b"chatty", robot="chatty")
+    scene.ask(A, payload=b"quiet", robot="quiet")
+    for n in range(2):
+        scene.answer(n)
+    assert b"quiet" in [payload for payload, _ in scene.client.calls[:3]]
+
+
+def test_when_full_the_chatty_robot_gives_way_to_another():
+    scene = Scene(max_in_flight=4, outstanding=1)
+    chatty = [scene.ask(bytes([n]) * 16, robot="chatty", remaining_s=5.0 + n) for n in range(4)]
+    quiet = scene.ask(A, robot="quiet")
+    assert chatty[3].outcome == ["refused overloaded"]
+    assert quiet.outcome == []
+    assert scene.ask(B, robot="chatty").outcome == ["refused overloaded"]
+    assert scene.responder.in_flight == 4
+
+
+def test_a_request_that_would_wait_past_its_deadline_is_refused_at_once():
+    """The robot asks another replica while there is time."""
+    scene = Scene(limits={"/s": 1})
+    scene.ask(A)
+    scene.clock.now += 1.0
+    scene.answer(0)  # it takes a second
+    for n in range(3):
+        scene.ask(bytes([n]) * 16)
+    assert scene.ask(b"h" * 16, remaining_s=1.5).outcome == []  # the earliest deadline is next
+    assert scene.ask(b"i" * 16, remaining_s=1.6).outcome == ["refused overloaded"]
+    assert scene.ask(b"j" * 16, remaining_s=9.0).outcome == []
+
+
+def test_a_given_limit_is_kept():
+    scene = Scene(limits={"/s": 3})
+    for n in range(9):
+        scene.ask(bytes([n]) * 16)
+    assert len(scene.client.calls) == 3
+
+
 @given(
     st.lists(
-        st.tuples(st.sampled_from(["ask", "answer", "crash", "wait"]), st.integers(0, 3)),
+        st.tuples(st.sampled_from(["ask", "answer", "crash", "wait", "cancel"]), st.integers(0, 3)),
         max_size=50,
     )
 )
@@ -272,6 +413,8 @@ def test_every_copy_gets_exactly_one_outcome_and_runs_never_overlap(steps):
             finished.add(n)
         elif step == "crash":
             scene.responder.crashed()
+        elif step == "cancel":
+            scene.responder.cancel([bytes([n]) * 16])
         else:
             scene.clock.now += n
             scene.responder.tick()

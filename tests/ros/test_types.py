@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fogft.core.errors import RosError
+from fogft.proxy.interruption import CANCEL_TYPE, EMPTY_REQUEST
 from fogft.ros import types
 
 from .conftest import SET_BOOL
@@ -148,3 +149,11 @@ def test_offsets_follow_cdr_alignment() -> None:
 def test_reading_a_field_of_noise_is_an_error(payload: bytes) -> None:
     with pytest.raises(RosError, match="not a response of `std_srvs/srv/SetBool`"):
         types.bool_field(SET_BOOL, "success")(payload)
+
+
+def test_the_request_of_a_cancel_service_is_what_ros_would_serialise():
+    from rclpy.serialization import serialize_message
+
+    expected = serialize_message(types.load_service_type(CANCEL_TYPE).Request())
+    assert bytes(expected)[:4] == EMPTY_REQUEST[:4]
+    assert len(expected) == len(EMPTY_REQUEST)

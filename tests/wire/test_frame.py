@@ -34,6 +34,7 @@ answers = st.builds(
     restarts=counts,
     in_flight=counts,
     detail=texts,
+    work=st.dictionaries(texts, st.floats(0, 1e9, allow_nan=False), max_size=4),
 )
 probes = st.builds(
     Probe,
@@ -48,6 +49,7 @@ DECODERS: list[Callable[[bytes], Any]] = [
     frame.decode_probe,
     frame.decode_probe_answer,
     frame.decode_greeting,
+    frame.decode_cancel,
 ]
 
 
@@ -77,6 +79,12 @@ def test_a_greeting_comes_back(token: bytes, certificate: bytes, signature: byte
     """Decoding undoes encoding; without a certificate the token alone travels."""
     sent = frame.Greeting(token, certificate, signature if certificate else b"")
     assert frame.decode_greeting(frame.encode_greeting(sent)) == sent
+
+
+@given(cancelled=st.lists(ids, max_size=20))
+def test_a_cancellation_comes_back(cancelled: list[bytes]) -> None:
+    """Decoding undoes encoding."""
+    assert frame.decode_cancel(frame.encode_cancel(cancelled)) == cancelled
 
 
 @given(probe=probes)

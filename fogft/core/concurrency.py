@@ -1,0 +1,109 @@
+"""How many requests a service may have at once, given or learned from its latency. Pure.
+
+A service that works on one request after the other answers no more in an hour when it has ten
+of them instead of one: the others only wait inside it, where nobody can take them back or put
+a more urgent one before them. One that works on ten at a time needs ten.
+
+Which it is shows in its throughput, limit / latency, while as many are at work as the limit
+allows. So, under demand, half the limit is tried for some answers; it is kept if throughput
+stays near what it was. Once in a while the double is tried, and kept if it gains.
+
+Without demand nothing is learned and nothing limited. A service that answers every 3 ms or
+more often is not limited: what waits in it is over before it matters.
+
+Owns: the limit of one service. Not here: who waits (`admission`).
+"""
+
+from __future__ import annotations
+
+QUICK_S = 0.003
+SOLO_S = 0.01  # below this, one at a time would leave the service idle between two
+_NEAR = 0.85
+_SAMPLES = 10
+_TRY_AGAIN_S = 60.0
+_WEIGHT = 0.1  # of a sample in the mean
+
+
+class ConcurrencyLimit:
+    """The limit of one service.
+
+    Args:
+        most: The highest limit that may be learned; what the service's own queue holds.
+        given: The limit, where it is not to be learned.
+
+    Attributes:
+        limit: How many may be at work.
+    """
+
+    def __init__(self, most: int, given: int | None = None) -> None:
+        self._most = most
+        self._given = given
+        self.limit = most if given is None else given
+        self._mean_s: float | None = None
+        # Of the limit in force, while as many as it allows were at work:
+        self._samples = 0
+        self._sum_s = 0.0
+        self._kept: tuple[int, float] | None = None  # during a trial: the limit to compare with
+        self._tried: dict[int, float] = {}  # when each limit was last found not to be better
+
+    def finished(self, level: int, took_s: float, now: float) -> None:
+        """Learn from an answer.
+
+        Args:
+            level: How many were at work when it began, itself included.
+            took_s: How long it took, in seconds.
+            now: Seconds.
+        """
+        weight = 1.0 if self._mean_s is None else _WEIGHT
+        self._mean_s = (self._mean_s or 0.0) * (1 - weight) + weight * took_s
+        if self._given is not None or level != self.limit:
+            return
+        self._samples += 1
+        self._sum_s += took_s
+        if self._samples >= _SAMPLES:
+            self._judge(now)
+
+    def _judge(self, now: float) -> None:
+        """Enough was seen of this limit: end a trial, or begin one."""
+        each_s = self._sum_s / self._samples / self.limit  # per answer
+        rate = 1.0 / max(each_s, 1e-9)
+        tried, kept = self.limit, self._kept
+        self._kept = None
+        if kept is not None:
+            limit_before, rate_before = kept
+            better = rate >= _NEAR * rate_before if tried < limit_before else (
+                rate * _NEAR >= rate_before
+            )  # fmt: skip
+            if not better:
+                self._tried[tried] = now
+                self._set(limit_before)
+                return
+        self._set(tried)
+        for candidate in (self._half(each_s), min(2 * tried, self._most)):
+            last = self._tried.get(candidate)
+            if candidate != tried and (last is None or now - last >= _TRY_AGAIN_S):
+                self._kept = (tried, rate)
+                self._tried[tried] = now  # so that it does not swing between the two
+                self._set(candidate)
+                return
+
+    def _half(self, each_s: float) -> int:
+        if each_s < QUICK_S:
+            return self.limit
+        return min(self.limit, max(self.limit // 2, 1 if each_s >= SOLO_S else 2))
+
+    def _set(self, limit: int) -> None:
+        self.limit = limit
+        self._samples = 0
+        self._sum_s = 0.0
+
+    def wait_s(self, ahead: int, at_work: int) -> float:
+        """Return how long a request waits for its turn, in seconds, as far as is known.
+
+        Args:
+            ahead: How many are served before it.
+            at_work: How many are at work now.
+        """
+        if self._mean_s is None:
+            return 0.0
+        return max(0, ahead + at_work + 1 - self.limit) * self._mean_s / self.limit

@@ -1,0 +1,37 @@
+"""Requests whose answer is no longer wanted, until their replica has been told. No clock, no Zenoh.
+
+Telling costs a message, and is worth it only where there is work to be saved. A request that
+was sent a moment ago is most likely answered before the message is there. So a recall is told
+at once if the request has been out for `WORTH_S`, else with the next flush, and not at all if
+the answer comes first.
+
+Owns: which ids are to be told. Each step is one operation on a dictionary, which is atomic.
+"""
+
+from __future__ import annotations
+
+WORTH_S = 0.005
+LIMIT = 4096  # what one message carries; further ones are not told, and their work is not saved
+
+
+class Recalls:
+    """The recalls of one connection."""
+
+    def __init__(self) -> None:
+        self._ids: dict[bytes, None] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._ids)
+
+    def add(self, request_id: bytes) -> None:
+        """Note that a request that was sent is no longer wanted."""
+        if len(self._ids) < LIMIT:
+            self._ids[request_id] = None
+
+    def answered(self, request_id: bytes) -> None:
+        """Its answer came all the same: there is nothing to be told."""
+        self._ids.pop(request_id, None)
+
+    def take(self) -> list[bytes]:
+        """Return what is to be told now, and forget it."""
+        return [id for id in list(self._ids) if self._ids.pop(id, self) is None]
