@@ -20,9 +20,9 @@ from fogft.ros.port import RosClient
 log = logging.getLogger(__name__)
 
 CANCEL_TYPE = "std_srvs/srv/Trigger"
-# A serialised message without fields: the header, and the byte that stands for no fields.
+# A serialised message without fields: the header, the byte that stands for no fields, padding.
 # Kept true by tests/ros/test_types.py.
-EMPTY_REQUEST = bytes((0, 1, 0, 0, 0))
+EMPTY_REQUEST = bytes((0, 1, 0, 0, 0, 0, 0, 0))
 _LIMIT_S = 2.0
 
 

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.core.errors import RosError
+from fogft.proxy.interruption import EMPTY_REQUEST
 from fogft.proxy.responder import Responder
 from fogft.ros.port import Unreadable
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
@@ -302,7 +303,7 @@ def test_a_cancel_service_is_called_for_what_is_at_work():
     scene, stop = interruptible()
     scene.ask(A)
     scene.responder.cancel([A])
-    assert [payload for payload, _ in stop.calls] == [bytes((0, 1, 0, 0, 0))]
+    assert [payload for payload, _ in stop.calls] == [EMPTY_REQUEST]
     assert scene.responder.interrupted == 1
 
 
