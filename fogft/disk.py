@@ -60,7 +60,12 @@ def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> No
 
 def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
     """Replace a file with a value as JSON; see `write_whole`."""
-    write_whole(path, json.dumps(value, indent=1) + "\n", durable=durable)
+    write_whole(path, to_json(value), durable=durable)
+
+
+def to_json(value: Any) -> str:
+    """Return a value as the text that `write_json` writes."""
+    return json.dumps(value, indent=1) + "\n"
 
 
 def read_json(path: Path) -> Any:

@@ -18,7 +18,7 @@ from typing import Any
 from fogft.core.errors import StateError
 from fogft.core.holders import holder_of
 from fogft.core.model import Machine, MachinePhase, Member, Membership, ReplicaId
-from fogft.core.names import POOL_UID_PATTERN
+from fogft.core.names import POOL_UID_PATTERN, replica_certificate_name
 
 
 def members_of(
@@ -27,8 +27,12 @@ def members_of(
     pool_uid: str,
     draining: Collection[ReplicaId] = (),
     ending: Collection[ReplicaId] = (),
+    revoked: Collection[str] = (),
 ) -> tuple[Member, ...]:
-    """Return whom a proxy should hold a link to: ours, not ending, with a known endpoint."""
+    """Return whom a proxy should hold a link to.
+
+    Those are ours, not ending, not revoked, and have a known endpoint.
+    """
     return tuple(
         Member(machine.id, machine.endpoint, machine.id in draining or machine.notice)
         for machine in sorted(machines, key=lambda m: m.id)
@@ -36,6 +40,7 @@ def members_of(
         and machine.endpoint is not None
         and machine.phase is not MachinePhase.FAILED
         and machine.id not in ending
+        and replica_certificate_name(machine.id) not in revoked
     )
 
 

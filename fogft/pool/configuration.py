@@ -19,17 +19,26 @@ from fogft.cloud.port import Launch
 from fogft.core import holders, names
 from fogft.core.errors import CredentialError
 from fogft.core.groups import replica_hash, services_at, task_at
+from fogft.core.holders import Holder, holder_of
 from fogft.core.model import ReplicaId
 from fogft.core.planner import PlannedLaunch
 from fogft.core.service_form import REPLICA_KEYS, to_plain
 from fogft.core.spec import PoolSpec
 from fogft.pool import credentials, templates
+from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import Identity
 
 # A dead manager renews nothing and must stop no traffic.
 CERTIFICATE_DAYS = 365.0
+# What a certificate lasts beyond the end of a pool that has one.
+MARGIN_DAYS = 30.0
 RENEW_BEFORE = datetime.timedelta(days=60)
+
+
+def certificate_days(spec: PoolSpec) -> float:
+    """Return how long a certificate lasts: a year, and a month more than `max_hours`."""
+    return max(CERTIFICATE_DAYS, (spec.max_hours or 0.0) / 24 + MARGIN_DAYS)
 
 
 def robot_name() -> str:
@@ -44,47 +53,77 @@ def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> 
     Raises:
         StateError: It cannot be written.
     """
-    content = templates.render(
-        "proxy.yaml",
-        {
-            "pool": identity.name,
-            "pool_uid": identity.uid,
-            "robot": robot_name(),
-            "membership": paths.membership.name,
-            "status": paths.proxy_status.name,
-            "lease": paths.lease.name,
-            "lock": paths.proxy_lock.name,
-            "ca": f"{paths.credentials.name}/ca.crt",
-            "certificate": f"{paths.credentials.name}/robot.crt",
-            "key": f"{paths.credentials.name}/robot.key",
-            "services": [to_plain(service) for service in spec.services],
-            "suspect_after_s": spec.health.suspect_after_s,
-        },
-    )
+    content = proxy_config(paths, identity, spec)
     if paths.proxy_config.exists() and paths.proxy_config.read_text() == content:
         return False
     disk.write_whole(paths.proxy_config, content)
     return True
 
 
-def certify_robot(paths: PoolPaths, identity: Identity, now: datetime.datetime) -> bool:
-    """See to it that the client proxy has a certificate that lasts; return whether it is new.
+def proxy_config(
+    paths: PoolPaths, identity: Identity, spec: PoolSpec, *, robot: str = "", stem: str = "robot"
+) -> str:
+    """Return a client proxy's configuration.
+
+    Args:
+        paths: How its files are called; where they are does not matter.
+        identity: The pool.
+        spec: Its services.
+        robot: The robot's name; empty for this machine's.
+        stem: How its certificate and key are called.
+    """
+    return templates.render(
+        "proxy.yaml",
+        {
+            "pool": identity.name,
+            "pool_uid": identity.uid,
+            "robot": robot or robot_name(),
+            "membership": paths.membership.name,
+            "status": paths.proxy_status.name,
+            "lease": paths.lease.name,
+            "lock": paths.proxy_lock.name,
+            "ca": f"{paths.credentials.name}/ca.crt",
+            "certificate": f"{paths.credentials.name}/{stem}.crt",
+            "key": f"{paths.credentials.name}/{stem}.key",
+            "services": [to_plain(service) for service in spec.services],
+            "suspect_after_s": spec.health.suspect_after_s,
+        },
+    )
+
+
+def certify_robot(
+    paths: PoolPaths, identity: Identity, spec: PoolSpec, now: datetime.datetime
+) -> bool:
+    """See to it that the client proxy has a certificate that is good; return whether it is new.
 
     Raises:
         CredentialError: The pool's CA cannot be used.
     """
-    certificate = paths.credentials / "robot.crt"
+    ledger = Ledger(paths.credentials)
     try:
-        if not credentials.describe(certificate).problem(now + RENEW_BEFORE):
+        said = credentials.describe(paths.credentials / "robot.crt")
+        holder = holder_of(said.common_name)
+        revoked = holder.common_name in ledger.revoked()
+        if not revoked and not said.problem(now + RENEW_BEFORE):
             return False
-    except CredentialError:
+    except (CredentialError, ValueError):
         pass  # there is none yet, or it is damaged: a new one is issued
-    name = names.robot_certificate_name(identity.uid, robot_name())
-    issued = credentials.issue(
-        paths.credentials, name, role=holders.Role.ROBOT, days=CERTIFICATE_DAYS
+    rotate_robot(paths, identity, spec)
+    return True
+
+
+def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
+    """Give this machine's client proxy new credentials; it takes them into use by itself.
+
+    Raises:
+        CredentialError: The pool's CA cannot be used.
+        StateError: They cannot be written; the old ones stay.
+    """
+    holder, issued = Ledger(paths.credentials).issue_next(
+        holders.Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
     )
     credentials.write(issued, paths.credentials, "robot")
-    return True
+    return holder
 
 
 def build_order(
@@ -96,12 +135,8 @@ def build_order(
         CredentialError: The pool's CA cannot be used.
     """
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
-    issued = credentials.issue(
-        paths.credentials,
-        names.replica_certificate_name(id),
-        role=holders.Role.REPLICA,
-        days=CERTIFICATE_DAYS,
-    )
+    holder = holder_of(names.replica_certificate_name(id))
+    issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
     return Launch(
         id=id,
         pool=identity.name,

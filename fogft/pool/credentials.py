@@ -48,10 +48,11 @@ class Credential:
 
 @dataclass(frozen=True)
 class Description:
-    """What a certificate says, for people. Times are in UTC."""
+    """What a certificate says, for people. Times are in UTC; the serial is hexadecimal."""
 
     common_name: str
     role: str
+    serial: str
     is_authority: bool
     not_before: datetime.datetime
     not_after: datetime.datetime
@@ -136,13 +137,31 @@ def describe(path: Path) -> Description:
     Raises:
         CredentialError: It cannot be read or holds no certificate.
     """
+    return _described(_load_certificate(path))
+
+
+def describe_pem(pem: bytes) -> Description:
+    """Return what a certificate says of itself.
+
+    Raises:
+        CredentialError: It is none.
+    """
     from cryptography import x509
 
-    certificate = _load_certificate(path)
+    try:
+        return _described(x509.load_pem_x509_certificate(pem))
+    except ValueError as error:
+        raise CredentialError("a certificate that is none") from error
+
+
+def _described(certificate: x509.Certificate) -> Description:
+    from cryptography import x509
+
     usage = _extension(certificate, x509.BasicConstraints)
     return Description(
         common_name=_name(certificate, x509.NameOID.COMMON_NAME),
         role=_name(certificate, x509.NameOID.ORGANIZATIONAL_UNIT_NAME),
+        serial=f"{certificate.serial_number:x}",
         is_authority=bool(usage and usage.ca),
         not_before=certificate.not_valid_before_utc,
         not_after=certificate.not_valid_after_utc,

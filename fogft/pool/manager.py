@@ -27,6 +27,7 @@ from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
 from fogft.pool import configuration, farewell, proxy_report, shutdown, status
 from fogft.pool.lease import Lease
+from fogft.pool.ledger import Ledger
 from fogft.pool.proxy_supervisor import ProxySupervisor
 from fogft.pool.reconciler import Reconciler, Tick
 from fogft.pool.store import Identity, PoolStore
@@ -63,7 +64,9 @@ class Manager:
         self._lease = Lease.take(self._paths, at_least=published.epoch if published else 0)
         self._wake = threading.Event()
         self._proxy = ProxySupervisor(self._paths, time.monotonic, proxy_command)
+        self._ledger = Ledger(self._paths.credentials)
         self._certified_at: float | None = None
+        self._revoked: frozenset[str] = frozenset()
         self._seen: dict[Path, tuple[int, int, int] | None] = {}
         self._digest: object = None
         self._trouble: list[str] = []
@@ -76,6 +79,7 @@ class Manager:
             build_order=lambda *order: configuration.build_order(self._paths, *order),
             submit=lambda run: threading.Thread(target=run, daemon=True).start(),
             epoch=self._lease.epoch,
+            revoked=self._ledger.revoked,
             on_done=self._wake.set,
         )
 
@@ -152,10 +156,12 @@ class Manager:
 
     def _keep_proxy(self) -> None:
         now = time.time()
-        if self._certified_at is None or abs(now - self._certified_at) > CERTIFY_EVERY_S:
+        revoked = self._ledger.revoked()
+        due = self._certified_at is None or abs(now - self._certified_at) > CERTIFY_EVERY_S
+        if due or revoked != self._revoked:
             utc = datetime.datetime.now(datetime.timezone.utc)
-            configuration.certify_robot(self._paths, self._identity, utc)
-            self._certified_at = now
+            configuration.certify_robot(self._paths, self._identity, self._store.spec(), utc)
+            self._certified_at, self._revoked = now, revoked
         configuration.write_proxy_config(self._paths, self._identity, self._store.spec())
         intent = self._store.intent()
         over = lifetime.is_over(self._store.spec(), intent, self._identity.created_at, time.time())
@@ -204,7 +210,8 @@ class Manager:
 
     def _something_changed(self) -> bool:
         paths = self._paths
-        changed = [p for p in (paths.spec, paths.intent) if self._is_new(p)]
+        watched = (paths.spec, paths.intent, self._ledger.path)
+        changed = [p for p in watched if self._is_new(p)]
         if self._is_new(paths.proxy_status):
             report = proxy_report.read(paths.proxy_status, self._identity.uid)
             digest = report.digest() if report is not None else None

@@ -91,6 +91,7 @@ class Reconciler:
         build_order: Makes the order of a planned launch, files included.
         submit: Runs a long cloud call, now or on another thread.
         epoch: Of the lease; goes into every membership.
+        revoked: Common names of certificates that were taken back.
         on_done: Called when a long cloud call has ended.
         distances: Says how far regions are from the robot, of what is sold and what runs.
     """
@@ -105,6 +106,7 @@ class Reconciler:
         build_order: BuildOrder = bare_order,
         submit: Submit = lambda run: run(),
         epoch: int = 1,
+        revoked: Callable[[], frozenset[str]] = frozenset,
         on_done: Callable[[], None] = lambda: None,
         distances: Distances = lambda spec, *_: spec.placement.rtt_s,
     ) -> None:
@@ -115,6 +117,7 @@ class Reconciler:
         self._links = links
         self._build_order = build_order
         self._epoch = epoch
+        self._revoked = revoked
         # A planned launch is what a launch is about; None stands for a termination.
         self._operations: Operations[Machine | None] = Operations(submit, on_done)
         self._refreshes: Operations[None] = Operations(submit, on_done)
@@ -244,11 +247,13 @@ class Reconciler:
                 self._remember.add(EventKind.UNDRAINED, machine.id)
 
     def _publish(self, identity: Identity, observed: Observed, plan: Plan) -> None:
+        revoked = self._revoked()
         members = members_of(
             observed.machines or (),
             pool_uid=identity.uid,
             draining=plan.draining,
             ending={end.id for end in plan.terminations} | observed.ending,
+            revoked=revoked,
         )
         membership = successor(
             self._membership,
@@ -256,6 +261,7 @@ class Reconciler:
             pool_uid=identity.uid,
             epoch=self._epoch,
             members=members,
+            revoked=revoked,
         )
         if membership is not None:
             self._store.write_membership(membership)

@@ -99,10 +99,10 @@ def test_relative_paths_are_relative_to_the_pool_file() -> None:
 def test_the_robots_certificate_is_made_once_and_renewed_in_time(paths: PoolPaths) -> None:
     """It lasts a year, is kept while it lasts, and is replaced two months before its end."""
     who, now = identity(paths.folder), datetime.datetime.now(datetime.timezone.utc)
-    assert configuration.certify_robot(paths, who, now)
-    assert not configuration.certify_robot(paths, who, now)
-    assert not configuration.certify_robot(paths, who, now + datetime.timedelta(days=300))
-    assert configuration.certify_robot(paths, who, now + datetime.timedelta(days=310))
+    assert configuration.certify_robot(paths, who, spec(), now)
+    assert not configuration.certify_robot(paths, who, spec(), now)
+    assert not configuration.certify_robot(paths, who, spec(), now + datetime.timedelta(days=300))
+    assert configuration.certify_robot(paths, who, spec(), now + datetime.timedelta(days=310))
     described = credentials.describe(paths.credentials / "robot.crt")
     assert described.role == credentials.Role.ROBOT.value
     assert described.common_name.startswith("robot.")

@@ -1,0 +1,187 @@
+"""What is in a join bundle, and how it becomes a robot, gateway or replica on this machine.
+
+The bundle brings all that a proxy needs: configuration, certificate and key, the CA, and
+the membership as it was. It is used once: the file is destroyed when it has been opened,
+and a copy is refused here by its id. What was there for the same holder is replaced, file
+by file, with the certificate last: a proxy that runs takes it into use by itself.
+
+Owns: the content of bundles, and the folders of joined holders.
+Not here: sealing (`bundle`), which certificates there are (`ledger`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from fogft import disk
+from fogft.core import membership as memberships
+from fogft.core.errors import CredentialError, FogftError
+from fogft.core.holders import Holder, Role
+from fogft.core.model import ReplicaId
+from fogft.pool import bundle, configuration
+from fogft.pool.bundle import Label
+from fogft.pool.credentials import Credential
+from fogft.pool.ledger import Ledger
+from fogft.pool.paths import PoolPaths
+from fogft.pool.store import PoolStore
+
+# The manager counts slots from 0; replicas that people start by hand stay out of its way.
+FIRST_SLOT_BY_HAND = 100
+FILE_LIMIT = 512 << 10
+_USED_LIMIT = 10_000
+
+
+@dataclass(frozen=True)
+class Joined:
+    """What `join` has set up.
+
+    Attributes:
+        config: The configuration to start with: ``fogft <command> --config <config>``.
+        command: ``proxy`` or ``serve``.
+    """
+
+    pool: str
+    holder: Holder
+    config: Path
+    command: str
+
+
+def issue(
+    store: PoolStore, role: Role, name: str, passphrase: str, now: float, *, open_for_s: float
+) -> tuple[Holder, bytes]:
+    """Certify the next generation of a holder, and return it with its sealed bundle.
+
+    Raises:
+        CredentialError: The name or the passphrase will not do, or the CA cannot be used.
+        FogftError: There is no such pool.
+    """
+    identity, spec = store.identity(), store.spec()
+    if role is Role.REPLICA and not (name.isdecimal() and int(name) >= FIRST_SLOT_BY_HAND):
+        raise CredentialError(
+            f"`{name}` is no slot for a replica that is started by hand",
+            f"use {FIRST_SLOT_BY_HAND} or more: the manager launches those below, and certifies "
+            "them itself",
+        )
+    bundle.check_passphrase(passphrase)  # before a generation is used up
+    holder, credential = Ledger(store.paths.credentials).issue_next(
+        role, name, identity.uid, days=configuration.certificate_days(spec)
+    )
+    label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, now + open_for_s)
+    content = {"files": _files(store, holder, credential)}
+    return holder, bundle.seal(label, content, passphrase)
+
+
+def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str, str]:
+    identity, spec = store.identity(), store.spec()
+    stem = holder.role.value
+    folder = "" if holder.role is Role.REPLICA else "credentials/"
+    files = {
+        f"{folder}ca.crt": credential.authority_pem.decode(),
+        f"{folder}{stem}.key": credential.key_pem.decode(),
+    }
+    if holder.role is Role.REPLICA:
+        id = ReplicaId(identity.uid, int(holder.name), holder.generation)
+        files["replica.yaml"] = configuration.replica_config(identity, spec, id)
+    else:
+        files["proxy.yaml"] = configuration.proxy_config(
+            PoolPaths(Path()), identity, spec, robot=holder.name, stem=stem
+        )
+        membership = store.membership()
+        if membership is not None:
+            files["membership.json"] = disk.to_json(memberships.to_dict(membership))
+    # Last: once it stands, all else does too.
+    return {**files, f"{folder}{stem}.crt": credential.certificate_pem.decode()}
+
+
+def join(file: Path, passphrase: str, root: Path, now: float) -> Joined:
+    """Set this machine up from a bundle, and destroy the bundle.
+
+    Args:
+        file: The bundle.
+        passphrase: What it was sealed with.
+        root: The folder of all of fogft's state.
+        now: Seconds since the epoch.
+
+    Raises:
+        CredentialError: It is no bundle, was used, is too old, or the passphrase is wrong.
+        StateError: Something cannot be written; the bundle is still there.
+    """
+    data = read(file)
+    label, content = bundle.open_sealed(data, passphrase, now)
+    files = _checked(content)
+    disk.make_folder(root / "joined")
+    used = root / "joined" / "used.json"
+    with disk.locked(root / "joined" / "used.lock"):
+        ids = list(disk.read_json(used) or ())
+        if label.id in ids:
+            raise CredentialError(
+                f"this bundle for `{label.holder.short}` was used here before",
+                "each is good for one time: have a new one issued",
+            )
+        holder = label.holder
+        folder = root / "joined" / _folder_name(label.pool, holder)
+        for name, text in files.items():
+            place = folder / name
+            disk.make_folder(place.parent)
+            disk.write_whole(place, text)
+        disk.write_json(used, [*ids, label.id][-_USED_LIMIT:])
+    _destroy(file, len(data))
+    is_replica = holder.role is Role.REPLICA
+    config = folder / ("replica.yaml" if is_replica else "proxy.yaml")
+    return Joined(label.pool, holder, config, "serve" if is_replica else "proxy")
+
+
+def read(file: Path) -> bytes:
+    """Return a bundle's bytes.
+
+    Raises:
+        CredentialError: It cannot be read.
+    """
+    try:
+        with file.open("rb") as opened:
+            return opened.read(bundle.SIZE_LIMIT + 1)
+    except OSError as error:
+        raise CredentialError(
+            f"the bundle `{file}` cannot be read: {error.strerror}",
+            "each is good for one time, and gone once it was used",
+        ) from None
+
+
+def _checked(content: dict[str, Any]) -> dict[str, str]:
+    files = content.get("files")
+    if not isinstance(files, dict) or not files:
+        raise CredentialError("the bundle holds no files")
+    for name, text in files.items():
+        parts = PurePosixPath(name).parts
+        safe = parts and all(part.strip(".") and "\0" not in part for part in parts)
+        if not safe or len(parts) > 2 or name.startswith("/") or not isinstance(text, str):
+            raise CredentialError(f"the bundle holds a file with an odd name: {name!r:.60}")
+        if len(text) > FILE_LIMIT:
+            raise CredentialError(f"the bundle holds a file that is too large: {name!r:.60}")
+    return files
+
+
+def _folder_name(pool: str, holder: Holder) -> str:
+    safe = "".join(c for c in pool if c.isalnum() or c == "-")
+    return f"{safe}.{holder.role.value}.{holder.name}"
+
+
+def _destroy(file: Path, size: int) -> None:
+    """Overwrite and remove a file; a removed file's bytes may otherwise be read for long."""
+    with contextlib.suppress(OSError):
+        with file.open("r+b") as opened:
+            opened.write(secrets.token_bytes(size))
+            opened.flush()
+            os.fsync(opened.fileno())
+    try:
+        file.unlink()
+    except OSError as error:
+        raise FogftError(
+            f"this machine has joined, but `{file}` cannot be removed: {error.strerror}",
+            "remove it by hand: it is good for nothing more here",
+        ) from None
