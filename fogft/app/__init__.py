@@ -9,6 +9,9 @@ Not here: text (`fogft.cli`), decisions (`fogft.core`), the parts themselves.
 
 from fogft.app.chaos import chaos, machine_in
 from fogft.app.clouds import CLOUDS, cloud_of, make_cloud, make_store, pool_name, pools
+from fogft.app.credentials import certificates, join, rotate_replicas, rotate_robot
+from fogft.app.credentials import issue as issue_credentials
+from fogft.app.credentials import revoke as revoke_credentials
 from fogft.app.lifecycle import down, order, start
 from fogft.app.looking import (
     doctor,
@@ -35,6 +38,7 @@ from fogft.app.wishes import drain, exclude, include, scale
 
 __all__ = [
     "CLOUDS",
+    "certificates",
     "chaos",
     "cloud_of",
     "clouds_to_sweep",
@@ -48,6 +52,8 @@ __all__ = [
     "file_of",
     "include",
     "init",
+    "issue_credentials",
+    "join",
     "locations",
     "logs",
     "machine_in",
@@ -58,6 +64,9 @@ __all__ = [
     "pool_name",
     "pools",
     "refresh",
+    "revoke_credentials",
+    "rotate_replicas",
+    "rotate_robot",
     "run_manager",
     "run_proxy",
     "run_rendezvous",

@@ -21,7 +21,7 @@ from typing import Annotated
 import typer
 
 from fogft import __version__
-from fogft.cli import change, chaos, doctor, lifecycle, output, parts, sweep, watch
+from fogft.cli import change, chaos, credentials, doctor, lifecycle, output, parts, sweep, watch
 from fogft.cli.sections import Commands
 from fogft.core.errors import FogftError
 
@@ -49,6 +49,7 @@ watch.register(app)
 doctor.register(app)
 change.register(app)
 chaos.register(app)
+credentials.register(app)
 parts.register(app)
 
 

@@ -7,9 +7,9 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 SECTIONS = {
-    "Begin and end": ("init", "up", "down", "sweep"),
+    "Begin and end": ("init", "up", "join", "down", "sweep"),
     "Look": ("status", "logs", "doctor"),
-    "Change what runs": ("scale", "drain", "exclude", "include"),
+    "Change what runs": ("scale", "drain", "exclude", "include", "credentials"),
     "Try what happens when": ("chaos",),
     "Run one part by hand": ("proxy", "serve", "manager", "rendezvous"),
 }

@@ -129,7 +129,8 @@ def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[s
         raise CredentialError("the bundle's content cannot be read") from None
     if now >= label.open_until:
         raise CredentialError(
-            f"this bundle for `{label.holder.short}` could be opened until {_utc(label.open_until)}",
+            f"this bundle for `{label.holder.short}` is too old: it could be opened until "
+            f"{_utc(label.open_until)}",
             f"by this machine's clock it is {_utc(now)}; if that is right, have a new one issued",
         )
     if not isinstance(content, dict):
@@ -188,12 +189,9 @@ def _time(raw: Mapping[str, Any], key: str) -> float:
 
 
 def _bytes(raw: Mapping[str, Any], key: str) -> bytes:
-    value = raw.get(key)
-    if not isinstance(value, str):
-        raise ValueError(f"its `{key}` is missing")
     try:
-        return base64.b64decode(value, validate=True)
-    except binascii.Error as error:
+        return base64.b64decode(raw.get(key, ""), validate=True)
+    except (binascii.Error, TypeError) as error:
         raise ValueError(f"its `{key}` is damaged") from error
 
 

@@ -80,6 +80,7 @@ class ClientProxy:
         self._links: dict[ReplicaId, Link] = {}
         self._members: dict[ReplicaId, Member] = {}
         self._version = (0, 0)
+        self._membership: Membership | None = None
         self._wake = threading.Event()
         self._next_look = NEVER
         self._changed = False  # set before the event, so that it is not missed
@@ -134,7 +135,8 @@ class ClientProxy:
                 log.warning("membership_refused version=%s have=%s", version, self._version)
                 return False
             self._version = version
-            members = {member.id: member for member in membership.members}
+            self._membership = membership
+            members = {} if self._shut_out(membership) else _good_members(membership)
             for id in [id for id in self._links if id not in members]:
                 self._drop(id)
             for id, member in members.items():
@@ -143,6 +145,21 @@ class ClientProxy:
                 if old is None or old.endpoint != member.endpoint:
                     self._redial(id)
         self._change()
+        return True
+
+    def renew(self) -> None:
+        """Take new credentials into use, link by link; no request is lost by it."""
+        self._dialer.renew()
+        if self._membership is not None:
+            self.follow(self._membership)  # who was shut out under the old ones may be in again
+        log.info("credentials_renewed")
+
+    def _shut_out(self, membership: Membership) -> bool:
+        """Whether our own certificate was taken back: then nobody is to be talked to."""
+        own = self._dialer.certificate()
+        if own not in membership.revoked:
+            return False
+        log.error("robot_revoked certificate=%s", own)
         return True
 
     def _redial(self, id: ReplicaId) -> None:
@@ -255,7 +272,12 @@ class ClientProxy:
             services: Mapping[str, Any] = {
                 name: service.dispatcher.report() for name, service in self._services.items()
             }
-        return {"links": links, "services": services, "uplink_suspected": self.uplink_suspected}
+        return {
+            "links": links,
+            "services": services,
+            "uplink_suspected": self.uplink_suspected,
+            "certificate": self._dialer.certificate(),
+        }
 
     def _link_report(self, link: Link) -> dict[str, Any]:
         status = link.status()
@@ -283,3 +305,11 @@ class ClientProxy:
         with self._lock:
             for id in list(self._links):
                 self._drop(id)
+
+
+def _good_members(membership: Membership) -> dict[ReplicaId, Member]:
+    return {
+        member.id: member
+        for member in membership.members
+        if names.replica_certificate_name(member.id) not in membership.revoked
+    }

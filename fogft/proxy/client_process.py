@@ -133,6 +133,8 @@ def _loop(
     memory = memory_tuning.Trimmer()
     watched_config, watched_members = Watched(config_path), Watched(config.membership)
     watched_config.changed()
+    watched_certificate = Watched(config.credentials.certificate)  # written after its key
+    watched_certificate.changed()
     started = reported = time.monotonic()
     while not stop.is_set():
         changed = proxy.run_once()
@@ -142,6 +144,8 @@ def _loop(
             _apply(functools.partial(_reconfigure, config_path, config, proxy), config_path)
         if watched_members.changed():
             _apply(functools.partial(_follow, config.membership, proxy), config.membership)
+        if watched_certificate.changed():
+            proxy.renew()
         now = time.monotonic()
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
             reported = now

@@ -138,6 +138,13 @@ class MemoryDialer:
         self.wire.links.append(link)
         return link
 
+    def renew(self) -> None:
+        """Do nothing: this wire has no certificates."""
+
+    def certificate(self) -> str:
+        """Return nothing: this wire has no certificates."""
+        return ""
+
     def close(self) -> None:
         """Close every link."""
         for link in self._links:

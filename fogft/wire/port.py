@@ -188,6 +188,15 @@ class Dialer(Protocol):
             events: Whom to tell.
         """
 
+    def renew(self) -> None:
+        """Take the credentials that now stand in their files into use. No request is lost."""
+
+    def certificate(self) -> str:
+        """Return the common name of the certificate that every link uses.
+
+        Empty while some still use another one, and where there are no certificates.
+        """
+
     def close(self) -> None:
         """Close every link."""
 

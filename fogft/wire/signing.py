@@ -51,6 +51,14 @@ class Signer:
         self._load()
         return self._der
 
+    @property
+    def common_name(self) -> str:
+        """The certificate's common name."""
+        from cryptography import x509
+
+        self._load()
+        return _attribute(x509.load_der_x509_certificate(self._der), "CN")
+
     def __call__(self, message: bytes) -> tuple[bytes, bytes]:
         """Return certificate and signature (both DER)."""
         from cryptography.hazmat.primitives import hashes

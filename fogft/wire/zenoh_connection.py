@@ -133,8 +133,8 @@ class Connection:
         self._timers = {name: TimerBudget() for name in keys}
         self._token = secrets.token_bytes(frame.TOKEN_BYTES)
         self._origin = frame.origin(robot, self._token)
-        certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
-        greeting = frame.Greeting(self._token, certificate, signature)
+        self.certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
+        greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
         self._queue: SimpleQueue[OpenAttempt | None] = SimpleQueue()
         self._credit = Credit()

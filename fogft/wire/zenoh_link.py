@@ -113,6 +113,12 @@ class ZenohLink:
         answer = self._probe_answer
         return answer is not None and answer.draining
 
+    @property
+    def certificate(self) -> bytes:
+        """The certificate (DER) that its open connection uses; empty unless UP."""
+        live = self._live
+        return b"" if live is None else live.certificate
+
     def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
         """Take one attempt, or return False. Never blocks."""
         live = self._live
@@ -461,9 +467,12 @@ class ZenohDialer:
         Raises:
             CredentialError: They cannot be used.
         """
+        return self._own_signer()(message)
+
+    def _own_signer(self) -> Signer:
         if self._signer is None:
             self._signer = Signer(self.credentials.certificate, self.credentials.key)
-        return self._signer(message)
+        return self._signer
 
     def renew(self) -> None:
         """Take the credentials that now stand in their files into use, link by link."""
@@ -471,6 +480,16 @@ class ZenohDialer:
             links = list(self._links)
         for link in links:
             link.renew()
+
+    def certificate(self) -> str:
+        """Return the common name of the certificate that every open link uses, or nothing."""
+        with self._lock:
+            used = {link.certificate for link in self._links} - {b""}
+        try:
+            signer = self._own_signer()
+        except CredentialError:
+            return ""
+        return signer.common_name if used <= {signer.certificate} else ""
 
     def closed(self, link: ZenohLink) -> None:
         """Forget a link that was closed."""

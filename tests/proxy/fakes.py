@@ -70,6 +70,7 @@ class FakeDialer:
     """Makes `FakeLink`s and keeps them, newest last."""
 
     def __init__(self) -> None:
+        self.renewals, self.name = 0, ""
         self.links: list[FakeLink] = []
 
     def dial(self, peer, services, events) -> FakeLink:
@@ -79,6 +80,12 @@ class FakeDialer:
         link.services = dict(services)  # type: ignore[attr-defined]
         self.links.append(link)
         return link
+
+    def renew(self) -> None:
+        self.renewals += 1
+
+    def certificate(self) -> str:
+        return self.name
 
     def close(self) -> None:
         for link in self.links:

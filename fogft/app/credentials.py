@@ -1,0 +1,152 @@
+"""A pool's certificates: who has one, who gets one, whose is taken back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fogft import disk
+from fogft.app.clouds import make_store
+from fogft.core.errors import FogftError
+from fogft.core.holders import Holder, Role
+from fogft.pool.paths import PoolPaths, home
+
+if TYPE_CHECKING:
+    from fogft.pool.joining import Joined
+    from fogft.pool.ledger import Entry
+
+PUBLISH_LIMIT_S = 10.0
+_POLL_S = 0.05
+
+
+def certificates(pool: str) -> Sequence[Entry]:
+    """Return the certificates that a pool's CA has issued, oldest first. Keys are not in it."""
+    from fogft.pool.ledger import Ledger
+    from fogft.pool.store import read_identity
+
+    paths = PoolPaths.of(pool)
+    read_identity(paths)
+    return Ledger(paths.credentials).entries()
+
+
+def issue(
+    pool: str, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
+) -> tuple[Holder, Path]:
+    """Write a join bundle for the next generation of a holder; return both.
+
+    Raises:
+        CredentialError: The name or the passphrase will not do, or the CA cannot be used.
+        FogftError: The file exists, or there is no such pool.
+    """
+    from fogft.pool import joining
+
+    file = out or Path(f"{name}.join")
+    if file.exists():
+        raise FogftError(f"`{file}` exists", "choose another name with `--out`")
+    holder, data = joining.issue(
+        make_store(pool), role, name, passphrase, time.time(), open_for_s=open_for_s
+    )
+    disk.write_whole(file, data)
+    return holder, file
+
+
+def join(file: Path, passphrase: str) -> Joined:
+    """Set this machine up from a join bundle, which is destroyed by it."""
+    from fogft.pool import joining
+
+    disk.make_folder(home())
+    return joining.join(file, passphrase, home(), time.time())
+
+
+def revoke(pool: str, role: Role, name: str) -> tuple[list[Holder], bool]:
+    """Take certificates back; return them, and whether the pool has been told.
+
+    A replica that is revoked is replaced, too.
+
+    Raises:
+        CredentialError: There is none of that name.
+        FogftError: There is no such pool.
+    """
+    from fogft.pool import wishes
+    from fogft.pool.ledger import Ledger
+
+    store = make_store(pool)
+    store.identity()
+    ledger = Ledger(store.paths.credentials)
+    holders = ledger.named(role, name)
+    ledger.revoke(holders)
+    for holder in holders if role is Role.REPLICA else ():
+        now = time.time()
+        if holder.generation == _generation_in(store.paths, int(holder.name), now):
+            wishes.drain(store, int(holder.name), now)
+    return holders, _published(pool, holders)
+
+
+def _generation_in(paths: PoolPaths, slot: int, now: float) -> int | None:
+    from fogft.pool import wishes
+
+    try:
+        return wishes.generation_in(paths, slot, now)
+    except FogftError:
+        return None  # it is gone already, or was started by hand
+
+
+def rotate_robot(pool: str) -> tuple[Holder, list[Holder], bool]:
+    """Give this machine's client proxy new credentials, and take the old ones back once they
+    are in use; return the new holder, the old ones, and whether that has happened.
+
+    Raises:
+        CredentialError: The pool's CA cannot be used.
+        FogftError: There is no such pool.
+    """
+    from fogft.pool import configuration
+    from fogft.pool.ledger import Ledger
+
+    store = make_store(pool)
+    ledger = Ledger(store.paths.credentials)
+    holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
+    old = [h for h in ledger.named(Role.ROBOT, holder.name) if h != holder]
+    in_use = _wait(lambda: _in_use(store.paths, holder))
+    if in_use and old:
+        ledger.revoke(old)
+        _published(pool, old)
+    return holder, old, in_use
+
+
+def _in_use(paths: PoolPaths, holder: Holder) -> bool:
+    """Whether the client proxy reports that all its links use this certificate."""
+    report = disk.read_json(paths.proxy_status)
+    return isinstance(report, dict) and report.get("certificate") == holder.common_name
+
+
+def rotate_replicas(pool: str, slot: int | None = None) -> list[str]:
+    """Have replicas replaced, the new one first, each with a key of its own; return which."""
+    from fogft.app.looking import slots
+    from fogft.pool import wishes
+
+    store = make_store(pool)
+    chosen = slots(pool) if slot is None else [slot]
+    return [wishes.drain(store, one, time.time()) for one in chosen]
+
+
+def _published(pool: str, holders: Sequence[Holder]) -> bool:
+    from fogft.app.looking import manager_alive
+
+    store, names = make_store(pool), {holder.common_name for holder in holders}
+
+    def told() -> bool:
+        membership = store.membership()
+        return membership is not None and names <= membership.revoked
+
+    return told() or (manager_alive(pool) and _wait(told))
+
+
+def _wait(condition: Callable[[], bool], limit_s: float = PUBLISH_LIMIT_S) -> bool:
+    end = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(_POLL_S)
+    return True

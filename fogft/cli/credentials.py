@@ -1,0 +1,263 @@
+"""``fogft credentials issue | list | revoke | rotate`` and ``fogft join``: who is let in.
+
+A passphrase is typed, read from a file, or made here; it is never an argument. Keys are
+shown nowhere.
+"""
+
+from __future__ import annotations
+
+import datetime
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fogft.cli import output
+from fogft.cli.complete import PoolOption
+from fogft.cli.sections import Command
+from fogft.core.errors import CredentialError, FogftError
+from fogft.core.holders import Role
+
+if TYPE_CHECKING:
+    from fogft.pool.ledger import Entry
+
+DAY_H = 24.0
+RoleName = Annotated[str, typer.Argument(metavar="ROLE", help="`robot`, `replica` or `gateway`.")]
+PassphraseFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--passphrase-file",
+        metavar="FILE",
+        show_default=False,
+        help="Read the passphrase from a file's first line; `-` for standard input.",
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the application."""
+    group = typer.Typer(rich_markup_mode=None, help="Say who is let in, and who no longer is.")
+    for name, command in (
+        ("issue", issue),
+        ("list", list_),
+        ("revoke", revoke),
+        ("rotate", rotate),
+    ):
+        group.command(name, cls=Command)(command)
+    app.add_typer(group, name="credentials")
+    app.command("join", cls=Command)(join)
+
+
+def issue(
+    role: RoleName,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Its name; a replica's slot.")],
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", show_default=False, help="The file to write."),
+    ] = None,
+    hours: Annotated[
+        float,
+        typer.Option("--hours", min=0.1, max=720, metavar="H", help="Good to join for so long."),
+    ] = DAY_H,
+    passphrase_file: PassphraseFile = None,
+    pool: PoolOption = None,
+) -> None:
+    """Write a join bundle: one file that lets another machine into the pool, one time.
+
+    Without a passphrase of yours a good one is made and shown. Tell it on another way than
+    the file goes.
+
+    \b
+    Example:
+      fogft credentials issue robot ada
+    """
+    from fogft import app
+    from fogft.pool import bundle
+
+    own = None if passphrase_file is None else _read_passphrase(passphrase_file)
+    passphrase = own or bundle.new_passphrase()
+    holder, file = app.issue_credentials(
+        app.pool_name(pool), _role(role), name, out, passphrase, open_for_s=hours * 3600
+    )
+    output.data(str(file))
+    if own is None:
+        output.say(f"passphrase: {passphrase}")
+    output.done(f"{holder.role.value} `{holder.short}` may join for {hours:g} hours")
+    output.hint(f"copy `{file}` to the other machine, and run `fogft join {file.name}` there")
+
+
+def list_(
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    pool: PoolOption = None,
+) -> None:
+    """Show the certificates that the pool's CA has issued. Keys are never shown.
+
+    \b
+    Example:
+      fogft credentials list
+    """
+    from fogft import app
+
+    now = time.time()
+    entries = app.certificates(app.pool_name(pool))
+    if json:
+        output.json_data([_as_data(entry, now) for entry in entries])
+        return
+    rows = [("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL")]
+    rows += [
+        (e.holder.role.value, e.holder.short, e.state(now), _utc(e.not_after), e.serial[:16])
+        for e in entries
+    ]
+    output.data(output.aligned(rows))
+
+
+def revoke(
+    role: RoleName,
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="`ada` for all of its generations, or `ada.2`.")
+    ],
+    pool: PoolOption = None,
+) -> None:
+    """Take certificates back: both ends of every link to their holder close it, for good.
+
+    A replica whose certificate is taken back is replaced.
+
+    \b
+    Example:
+      fogft credentials revoke robot ada
+    """
+    from fogft import app
+
+    chosen = app.pool_name(pool)
+    holders, told = app.revoke_credentials(chosen, _role(role), name)
+    listed = ", ".join(f"`{holder.short}`" for holder in holders)
+    if told:
+        output.done(f"{role} {listed} is let in no more")
+    else:
+        output.warn(f"{role} {listed} is revoked, but no manager runs that could tell the others")
+        output.hint("`fogft up` starts one")
+
+
+def rotate(
+    role: RoleName,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="A replica's slot; all of them unless told.", show_default=False
+        ),
+    ] = "",
+    pool: PoolOption = None,
+) -> None:
+    """Give this machine's robot, or the replicas, new keys and certificates. No request is lost.
+
+    The robot's links go over to the new ones while requests flow; then the old ones are
+    taken back. Replicas are replaced, the new one first. For a robot or a gateway on another
+    machine issue a new bundle, join there with it, and revoke the old generation.
+
+    \b
+    Example:
+      fogft credentials rotate robot
+    """
+    from fogft import app
+
+    chosen, which = app.pool_name(pool), _role(role)
+    if which is Role.REPLICA:
+        if name and not name.isdecimal():
+            raise FogftError(f"`{name}` is no slot", "see `fogft status`")
+        replaced = app.rotate_replicas(chosen, int(name) if name else None)
+        listed = ", ".join(f"`{one}`" for one in replaced)
+        output.done(f"{listed} will be replaced, each with a new key; see `fogft status`")
+        return
+    if which is not Role.ROBOT or name:
+        raise FogftError(
+            f"the keys of {role} `{name}` are on another machine".replace(" ``", ""),
+            f"`fogft credentials issue {role} {name or 'NAME'}`, `fogft join` there, then "
+            f"`fogft credentials revoke {role} {name or 'NAME'}.1`",
+        )
+    holder, old, in_use = app.rotate_robot(chosen)
+    if not in_use:
+        output.warn(
+            f"robot `{holder.short}` is certified, but its client proxy does not use it yet"
+        )
+        listed = " ".join(h.short for h in old)
+        output.hint(f"the old one stays good; later: `fogft credentials revoke robot {listed}`")
+        return
+    taken = f"; `{'`, `'.join(h.short for h in old)}` is taken back" if old else ""
+    output.done(f"all links use the keys of robot `{holder.short}`{taken}")
+
+
+def join(
+    bundle: Annotated[
+        Path, typer.Argument(metavar="BUNDLE", help="From `fogft credentials issue`.")
+    ],
+    passphrase_file: PassphraseFile = None,
+) -> None:
+    """Set this machine up as a robot, gateway or replica of a pool, from one file.
+
+    The file is good for one time and destroyed. To give a robot new keys, join again with a
+    new bundle: a proxy that runs takes them into use without losing a request.
+
+    \b
+    Example:
+      fogft join ada.join
+    """
+    from fogft import app
+    from fogft.pool import bundle as bundles
+    from fogft.pool import joining
+
+    label = bundles.read_label(joining.read(bundle))
+    whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"
+    output.say(f"this bundle is for {whom}")
+    joined = app.join(bundle, _read_passphrase(passphrase_file))
+    output.data(str(joined.config))
+    output.done(f"this machine is {whom}")
+    output.hint(f"start it with `fogft {joined.command} --config {joined.config}`")
+
+
+def _role(text: str) -> Role:
+    allowed = (Role.ROBOT, Role.REPLICA, Role.GATEWAY)
+    for role in allowed:
+        if role.value == text:
+            return role
+    raise CredentialError(
+        f"there is no role `{text}`", "roles: " + ", ".join(f"`{role.value}`" for role in allowed)
+    )
+
+
+def _read_passphrase(file: Path | None) -> str:
+    if file is not None:
+        try:
+            text = sys.stdin.readline() if str(file) == "-" else file.read_text()
+        except (OSError, UnicodeDecodeError):
+            raise FogftError(f"the passphrase file `{file}` cannot be read") from None
+        found = text.splitlines()[0].strip() if text.strip() else ""
+        if not found:
+            raise FogftError(f"the passphrase file `{file}` is empty")
+        return found
+    if not output.is_terminal(sys.stdin):
+        raise FogftError(
+            "there is no terminal to ask for the passphrase", "use `--passphrase-file FILE`"
+        )
+    import getpass
+
+    return getpass.getpass("passphrase: ").strip()
+
+
+def _as_data(entry: Entry, now: float) -> dict[str, object]:
+    return {
+        "role": entry.holder.role.value,
+        "name": entry.holder.name,
+        "generation": entry.holder.generation,
+        "state": entry.state(now),
+        "serial": entry.serial,
+        "issued_at": entry.issued_at,
+        "not_after": entry.not_after,
+        "revoked_at": entry.revoked_at,
+    }
+
+
+def _utc(seconds: float) -> str:
+    return f"{datetime.datetime.fromtimestamp(seconds, datetime.timezone.utc):%Y-%m-%d %H:%M} UTC"

@@ -1,0 +1,137 @@
+"""``fogft credentials`` and ``fogft join``: what they print, and what they never print."""
+
+from __future__ import annotations
+
+import io
+import json
+import stat
+from pathlib import Path
+
+import pytest
+
+from fogft.cli import main
+from fogft.core import names
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.pool import bundle, credentials
+from fogft.pool.ledger import Ledger
+from fogft.pool.paths import PoolPaths
+from fogft.pool.store import Identity, write_identity
+
+UID = "0123456789abcdef"
+POOL_FILE = """
+name: planner
+resources: {any_of: [{infra: local/us-west-1}]}
+run: exec serve
+fogft: {services: [{name: /s, type: std_srvs/srv/SetBool}]}
+"""
+
+
+@pytest.fixture
+def paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PoolPaths:
+    """A pool without a manager, in a home of its own."""
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(bundle._SCRYPT, "n", 2)
+    paths = PoolPaths.of("planner")
+    credentials.create_authority(paths.credentials, UID)
+    write_identity(paths, Identity("planner", UID, "local", str(tmp_path / "p.yaml"), 0.0))
+    paths.spec.write_text(POOL_FILE)
+    return paths
+
+
+def run(*words: str) -> int:
+    return main.run(list(words))
+
+
+def issue_ada(capsys: pytest.CaptureFixture[str]) -> str:
+    """Issue a bundle for `ada`; return the passphrase that was shown."""
+    assert run("credentials", "issue", "robot", "ada") == 0
+    said = capsys.readouterr()
+    assert said.out == "ada.join\n"
+    line = next(one for one in said.err.splitlines() if one.startswith("passphrase: "))
+    return line.removeprefix("passphrase: ")
+
+
+def test_a_second_robot_from_one_file(paths, tmp_path, capsys, monkeypatch):
+    passphrase = issue_ada(capsys)
+    assert stat.S_IMODE((tmp_path / "ada.join").stat().st_mode) == 0o600
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "another machine"))
+    (tmp_path / "told").write_text(passphrase + "\n")
+    assert run("join", "ada.join", "--passphrase-file", "told") == 0
+    said = capsys.readouterr()
+    config = Path(said.out.strip())
+    assert config.name == "proxy.yaml"
+    assert f"fogft proxy --config {config}" in said.err
+    assert not (tmp_path / "ada.join").exists()
+
+
+def test_the_passphrase_can_come_from_standard_input(paths, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("a passphrase of mine\n"))
+    assert run("credentials", "issue", "robot", "ada", "--passphrase-file", "-") == 0
+    assert "a passphrase of mine" not in "".join(capsys.readouterr())
+    monkeypatch.setattr("sys.stdin", io.StringIO("a passphrase of mine\n"))
+    assert run("join", "ada.join", "--passphrase-file", "-") == 0
+
+
+def test_without_a_terminal_it_says_how_to_give_the_passphrase(paths, capsys, monkeypatch):
+    issue_ada(capsys)
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    assert run("join", "ada.join") == 1
+    assert "--passphrase-file" in capsys.readouterr().err
+
+
+def test_the_list_shows_states_and_no_key(paths, capsys):
+    passphrase = issue_ada(capsys)
+    assert run("credentials", "revoke", "robot", "ada") == 0
+    assert "no manager runs" in capsys.readouterr().err
+    assert run("credentials", "issue", "robot", "ada", "--out", "again.join") == 0
+    capsys.readouterr()
+    assert run("credentials", "list") == 0
+    rows = [line.split()[:3] for line in capsys.readouterr().out.splitlines()]
+    assert rows[1:] == [["robot", "ada.1", "revoked"], ["robot", "ada.2", "good"]]
+    assert run("credentials", "list", "--json") == 0
+    text = capsys.readouterr().out
+    assert [(e["name"], e["generation"], e["state"]) for e in json.loads(text)] == [
+        ("ada", 1, "revoked"),
+        ("ada", 2, "good"),
+    ]
+    assert passphrase not in text
+    assert "PRIVATE" not in text
+
+
+def test_revoking_what_is_known_to_all_says_so(paths, capsys):
+    issue_ada(capsys)
+    revoked = frozenset({names.robot_certificate_name(UID, "ada")})
+    membership = Membership("planner", UID, 1, 1, (Member(ReplicaId(UID, 0, 1), "h:1"),), revoked)
+    from fogft import app
+
+    app.make_store("planner").write_membership(membership)
+    assert run("credentials", "revoke", "robot", "ada") == 0
+    assert "is let in no more" in capsys.readouterr().err
+    assert Ledger(paths.credentials).revoked() == revoked
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["issue", "manager", "x"], "there is no role `manager`"),
+        (["issue", "robot", "a b"], "cannot be named"),
+        (["issue", "replica", "3"], "no slot for a replica"),
+        (["revoke", "robot", "nobody"], "no certificate of robot `nobody`"),
+        (["rotate", "gateway", "edge"], "on another machine"),
+        (["rotate", "robot", "ada"], "on another machine"),
+        (["rotate", "replica", "x"], "no slot"),
+    ],
+)
+def test_mistakes_are_told_in_one_line_with_a_hint(paths, capsys, words, said):
+    assert run("credentials", *words) == 1
+    text = capsys.readouterr().err
+    assert said in text.splitlines()[0]
+    assert "hint:" in text
+
+
+def test_a_bundle_is_not_written_over(paths, capsys):
+    issue_ada(capsys)
+    assert run("credentials", "issue", "robot", "ada") == 1
+    assert "exists" in capsys.readouterr().err
+    assert len(Ledger(paths.credentials).entries()) == 1

@@ -1,0 +1,192 @@
+"""A join bundle: opened with its passphrase only, in its time only, and once."""
+
+from __future__ import annotations
+
+import base64
+import json
+import stat
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fogft.core.errors import CredentialError
+from fogft.core.holders import Role
+from fogft.core.membership import from_dict
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.spec import PoolSpec, ServiceSpec
+from fogft.pool import bundle, credentials, joining
+from fogft.pool.bundle import Label
+from fogft.pool.paths import PoolPaths
+from fogft.pool.store import Identity, PoolStore, write_identity
+from fogft.proxy.config import read_client, read_server
+
+UID, NOW = "0123456789abcdef", 2e9
+PASSPHRASE = "correct-horse-battery"
+SPEC = PoolSpec("pool", (ServiceSpec("/s", "std_srvs/srv/SetBool"),), task={"run": "exec serve"})
+MEMBERSHIP = Membership("pool", UID, 3, 4, (Member(ReplicaId(UID, 0, 1), "10.0.0.1:7447"),))
+LABEL = Label("id", "pool", f"robot.ada.1.{UID}", NOW, NOW + 60)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A passphrase is not made slow to guess here."""
+    monkeypatch.setitem(bundle._SCRYPT, "n", 2)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> PoolStore:
+    paths = PoolPaths(tmp_path / "pool")
+    credentials.create_authority(paths.credentials, UID)
+    write_identity(paths, Identity("pool", UID, "local", str(tmp_path / "pool.yaml"), 0.0))
+    paths.spec.write_text("any")
+    store = PoolStore(paths, lambda *_: SPEC, lambda: NOW)
+    store.write_membership(MEMBERSHIP)
+    return store
+
+
+@pytest.fixture
+def file(store: PoolStore, tmp_path: Path) -> Path:
+    path = tmp_path / "ada.join"
+    path.write_bytes(issued(store, Role.ROBOT, "ada"))
+    return path
+
+
+def issued(store: PoolStore, role: Role, name: str) -> bytes:
+    return joining.issue(store, role, name, PASSPHRASE, NOW, open_for_s=3600)[1]
+
+
+def test_a_robot_joins_from_one_file(file: Path, tmp_path: Path) -> None:
+    """All that its proxy needs is there, private, and belongs together."""
+    joined = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    assert (joined.command, joined.holder.short, joined.pool) == ("proxy", "ada.1", "pool")
+    config = read_client(joined.config)
+    assert (config.robot, config.pool_uid, config.services) == ("ada", UID, SPEC.services)
+    assert from_dict(json.loads(config.membership.read_text())) == MEMBERSHIP
+    said = credentials.describe(config.credentials.certificate)
+    assert (said.common_name, said.role) == (f"robot.ada.1.{UID}", "robot")
+    for path in [joined.config, *joined.config.parent.rglob("*")]:
+        assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
+
+
+def test_a_replica_by_hand_joins_too(store: PoolStore, tmp_path: Path) -> None:
+    """In a slot that the manager leaves alone."""
+    path = tmp_path / "lab.join"
+    path.write_bytes(issued(store, Role.REPLICA, "100"))
+    joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
+    assert joined.command == "serve"
+    config = read_server(joined.config)
+    assert config.id == ReplicaId(UID, 100, 1)
+    assert credentials.describe(config.credentials.certificate).role == "replica"
+    for slot in ("3", "99", "x", "-1"):
+        with pytest.raises(CredentialError, match="no slot for a replica"):
+            issued(store, Role.REPLICA, slot)
+
+
+def test_it_is_good_for_one_time(file: Path, tmp_path: Path) -> None:
+    """The file is gone, and a copy is refused here."""
+    copy = tmp_path / "copy"
+    copy.write_bytes(file.read_bytes())
+    joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    assert not file.exists()
+    with pytest.raises(CredentialError, match="was used here before"):
+        joining.join(copy, PASSPHRASE, tmp_path / "home", NOW)
+    with pytest.raises(CredentialError, match="cannot be read"):
+        joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+
+
+def test_joining_again_brings_the_next_generation(
+    store: PoolStore, file: Path, tmp_path: Path
+) -> None:
+    """To the same place, so that a proxy that runs takes it into use."""
+    first = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    file.write_bytes(issued(store, Role.ROBOT, "ada"))
+    second = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    assert (second.holder.generation, second.config) == (2, first.config)
+    said = credentials.describe(read_client(second.config).credentials.certificate)
+    assert said.common_name == f"robot.ada.2.{UID}"
+
+
+def test_a_wrong_passphrase_opens_nothing_and_spoils_nothing(file: Path, tmp_path: Path) -> None:
+    with pytest.raises(CredentialError, match="passphrase is wrong"):
+        joining.join(file, "wrong-horse-battery", tmp_path / "home", NOW)
+    assert not (tmp_path / "home").exists()
+    joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+
+
+def test_its_time_ends_and_cannot_be_prolonged(file: Path, tmp_path: Path) -> None:
+    with pytest.raises(CredentialError, match="too old") as caught:
+        joining.join(file, PASSPHRASE, tmp_path / "home", NOW + 3600)
+    assert "by this machine's clock" in caught.value.hint
+    raw = json.loads(file.read_text())
+    raw["open_until"] += 1e6
+    file.write_text(json.dumps(raw))
+    with pytest.raises(CredentialError, match="passphrase is wrong, or the bundle was changed"):
+        joining.join(file, PASSPHRASE, tmp_path / "home", NOW + 3600)
+
+
+@pytest.mark.parametrize("passphrase", ["", "short", " " * 20])
+def test_a_passphrase_that_is_too_short_uses_no_generation_up(
+    store: PoolStore, passphrase: str
+) -> None:
+    with pytest.raises(CredentialError, match="fewer than 12"):
+        joining.issue(store, Role.ROBOT, "ada", passphrase, NOW, open_for_s=60)
+    assert (
+        joining.issue(store, Role.ROBOT, "ada", PASSPHRASE, NOW, open_for_s=60)[0].generation == 1
+    )
+
+
+def test_nothing_secret_is_readable(file: Path, tmp_path: Path) -> None:
+    """Neither the key nor who may be reached; the passphrase is nowhere."""
+    data = file.read_bytes()
+    joined = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    key = read_client(joined.config).credentials.key.read_bytes().splitlines()[1]
+    sealed = base64.b64decode(json.loads(data)["sealed"])
+    for secret in (key, b"10.0.0.1", PASSPHRASE.encode()):
+        assert secret not in data
+        assert secret not in sealed
+
+
+def test_made_passphrases_differ_and_are_long_enough() -> None:
+    made = {bundle.new_passphrase() for _ in range(50)}
+    assert len(made) == 50
+    for passphrase in made:
+        bundle.check_passphrase(passphrase)
+
+
+@pytest.mark.parametrize(
+    "name", ["../x", "/etc/x", "a/b/c", "", ".", "..", "a/..", "x\0y", "./../x"]
+)
+def test_a_bundle_can_write_nowhere_else(name: str, tmp_path: Path) -> None:
+    """Even one that was sealed with the right passphrase by somebody hostile."""
+    path = tmp_path / "evil.join"
+    path.write_bytes(bundle.seal(LABEL, {"files": {name: "x"}}, PASSPHRASE))
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(CredentialError, match="odd name"):
+        joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_any_damage_is_told(data: st.DataObject) -> None:
+    """One changed, added or missing byte, wherever: an error, never another content."""
+    sealed = bundle.seal(LABEL, {"files": {"a": "b"}}, PASSPHRASE)
+    at = data.draw(st.integers(0, len(sealed) - 1))
+    put = data.draw(st.binary(max_size=3))
+    damaged = sealed[:at] + put + sealed[at + data.draw(st.integers(0, 2)) :]
+    try:
+        opened = bundle.open_sealed(damaged, PASSPHRASE, NOW)
+    except CredentialError:
+        return
+    assert opened == (LABEL, {"files": {"a": "b"}})  # white space only
+
+
+@given(
+    st.binary(max_size=300)
+    | st.text().map(lambda t: json.dumps({"fogft_bundle": 1, "id": t}).encode())
+)
+def test_garbage_is_no_bundle(data: bytes) -> None:
+    with pytest.raises(CredentialError, match="no join bundle"):
+        bundle.read_label(data)
