@@ -6,6 +6,7 @@ To put another cloud under the contract: write a maker like `mock_cloud` and add
 
 from __future__ import annotations
 
+import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -169,6 +170,12 @@ MAKERS: dict[str, Callable[[Path], Iterator[CloudUnderTest]]] = {
     "local": local_cloud,
     "mock": mock_cloud,
 }
+
+
+if "EMULATED_AWS" in os.environ:  # inside a world of `scripts/test-sky --contract`
+    from tests.sky.emulated_aws.under_contract import emulated
+
+    MAKERS["emulated"] = lambda folder: emulated(folder, CloudUnderTest)
 
 
 def is_unreachable(call: Callable[[], object]) -> bool:

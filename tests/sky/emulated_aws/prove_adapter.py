@@ -2,39 +2,28 @@
 
 Runs inside a world (`world.sh`). The server proxy's place is taken by a plain web server, after
 fogft's own set-up has run on the VM: what is proved here is the cloud, not the wire.
-Prints a table of steps and writes it to RESULTS; ends with status 1 at the first thing wrong.
+Prints a table of steps and writes it to the folder $RESULTS; ends with status 1 at the first
+thing wrong.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-import threading
-import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from fogft.cloud.port import Launch
-from fogft.cloud.sky import template
 from fogft.cloud.sky.adapter import SkyCloud
-from fogft.cloud.sky.aws import Aws
-from fogft.cloud.sky.installed import InstalledSky
 from fogft.core.errors import CloudUnreachable
 from fogft.core.model import Machine, MachinePhase, Offer, ReplicaId
+from tests.sky.emulated_aws.emulation import Steps, control, running, until
+from tests.sky.emulated_aws.under_contract import RESOURCES, adapter, stub_server
 
 UID = "00000000000000aa"
-CONTROL = os.environ["EMULATED_AWS"]
-RESOURCES = {
-    "cpus": "2",
-    "use_spot": True,
-    "any_of": [{"infra": f"aws/{region}"} for region in ("us-east-1", "us-west-2", "eu-west-1")],
-}
 TASK = {
     "resources": RESOURCES,
     "envs": {"GREETING": "hello"},
@@ -42,34 +31,7 @@ TASK = {
     "run": "unused",
 }
 FILES = {"replica.yaml": b"slot: 0\n", "replica.key": b"secret\n"}
-STEPS: list[tuple[str, float]] = []
-
-
-def control(path: str, *, post: bool = True) -> Any:
-    request = urllib.request.Request(CONTROL + path, method="POST" if post else "GET")
-    return json.load(urllib.request.urlopen(request, timeout=30))
-
-
-def running() -> list[dict[str, Any]]:
-    return [i for i in control("/instances", post=False) if i["state"] == "running"]
-
-
-@contextmanager
-def step(name: str) -> Iterator[None]:
-    start = time.monotonic()
-    yield
-    STEPS.append((name, time.monotonic() - start))
-    print(f"{STEPS[-1][1]:7.1f} s  {name}", flush=True)
-
-
-def until(what: str, is_so: Callable[[], Any], limit_s: float = 600.0) -> Any:
-    pause, end = threading.Event(), time.monotonic() + limit_s
-    while time.monotonic() < end:
-        found = is_so()
-        if found:
-            return found
-        pause.wait(0.25)
-    raise AssertionError(f"not within {limit_s:.0f} s: {what}")
+step = Steps()
 
 
 def get(endpoint: str, path: str = "/") -> str:
@@ -85,7 +47,7 @@ class Proof:
         self.cloud = self.another_process()
 
     def another_process(self) -> SkyCloud:
-        return SkyCloud(self.folder, InstalledSky(), [Aws()], owner="proof", base=Path("/tmp"))
+        return adapter(self.folder)
 
     def offer(self, region: str) -> Offer:
         offers = self.cloud.offers(RESOURCES)
@@ -238,30 +200,13 @@ class Proof:
         assert not self.cloud.machines(UID)
 
 
-def stub_server() -> None:
-    """Let a web server stand where the server proxy will: it shows what the VM looks like."""
-    read = template.read
-
-    def with_stub() -> dict[str, Any]:
-        made = read()
-        made["run"] = (
-            "cd ~ && mkdir -p shown && cp setup-ran shown/ && cd shown\n"
-            "~/.fogft/venv/bin/fogft --help > fogft-help\n"
-            "stat -c %a ~/.fogft/replica ~/.fogft/replica/replica.key > modes\n"
-            "exec python3 -m http.server @PORT@\n"
-        )
-        return made
-
-    template.read = with_stub
-
-
 def main() -> int:
     stub_server()
     try:
         Proof(Path("/robot/fogft/sky")).run()
     finally:
-        table = "".join(f"{seconds:7.1f} s  {name}\n" for name, seconds in STEPS)
-        Path(sys.argv[1], "adapter.txt").write_text(table)
+        table = "".join(f"{end - begin:7.1f} s  {name}\n" for name, begin, end in step.done)
+        Path(os.environ["RESULTS"], "adapter.txt").write_text(table)
     print("every step passed")
     return 0
 

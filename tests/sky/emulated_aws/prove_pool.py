@@ -6,7 +6,8 @@ time. Machines are preempted with notice and without, a region runs out of capac
 manager is killed in the middle of a launch: no request may fail. At the end the account is
 empty, and nothing of it runs here any more.
 
-Prints a table of steps and writes it to RESULTS; ends with status 1 at the first thing wrong.
+Prints a table of steps and writes it to the folder $RESULTS; ends with status 1 at the first
+thing wrong.
 """
 
 from __future__ import annotations
@@ -275,7 +276,7 @@ def processes() -> list[str]:
 
 
 def main() -> int:
-    results = Path(sys.argv[1])
+    results = Path(os.environ["RESULTS"])
     proof = Proof()
     try:
         proof.run()

@@ -42,8 +42,8 @@ mount --bind "$results" "$root$results"
 cp -r "$image/robot/." "$root/robot/"
 
 unshare --net --pid --ipc --uts --fork --kill-child bash -euc '
-  root=$1 here=$2 venv=$3 image=$4
-  shift 4
+  root=$1 here=$2 venv=$3 image=$4 results=$5
+  shift 5
   ip link set lo up
   ip link add br0 type bridge
   ip addr add 10.66.0.1/16 dev br0
@@ -51,6 +51,6 @@ unshare --net --pid --ipc --uts --fork --kill-child bash -euc '
   ip link set br0 up
   mount -t proc proc "$root/proc"
   exec chroot "$root" env -i HOME=/robot PATH="$venv/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \
-    LANG=C.UTF-8 PYTHONPATH= EMULATION="$image" HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
+    LANG=C.UTF-8 PYTHONPATH= RESULTS="$results" EMULATION="$image" HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
     "$venv/bin/python" "$here/inside.py" "$@"
-' world "$root" "$here" "$venv" "$image" "$@"
+' world "$root" "$here" "$venv" "$image" "$results" "$@"
