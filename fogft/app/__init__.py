@@ -8,7 +8,7 @@ Not here: text (`fogft.cli`), decisions (`fogft.core`), the parts themselves.
 """
 
 from fogft.app.chaos import chaos, machine_in
-from fogft.app.clouds import CLOUDS, cloud_of, make_cloud, make_store, pool_name, pools
+from fogft.app.clouds import CLOUDS, cloud_of, costs_money, make_cloud, make_store, pool_name, pools
 from fogft.app.credentials import certificates, join, rotate_replicas, rotate_robot
 from fogft.app.credentials import issue as issue_credentials
 from fogft.app.credentials import revoke as revoke_credentials
@@ -42,6 +42,7 @@ __all__ = [
     "chaos",
     "cloud_of",
     "clouds_to_sweep",
+    "costs_money",
     "doctor",
     "down",
     "drain",

@@ -70,6 +70,15 @@ def cloud_of(identity: Identity) -> Cloud:
     return make_cloud(identity.cloud, Path(identity.file).parent)
 
 
+def costs_money(pool: str) -> bool:
+    """Whether a pool's machines are paid for.
+
+    Raises:
+        PoolNotFound: There is no such pool.
+    """
+    return make_store(pool).identity().cloud != LOCAL
+
+
 def make_store(pool: str) -> PoolStore:
     """Return the store of a pool."""
     from fogft.pool import pool_file

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -197,7 +198,8 @@ def not_answering(seen: Seen, what: str) -> FogftError:
 def down(
     pool: PoolArgument = None,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask. Nothing is asked on the local cloud.")
+        bool,
+        typer.Option("--yes", "-y", help="Do not ask; only a person at a terminal is asked."),
     ] = False,
 ) -> None:
     """End a pool: its replicas, its client proxy and its manager.
@@ -214,5 +216,9 @@ def down(
         output.say("nothing to end: there is no pool here")
         return
     name = app.pool_name(pool)
+    asks = not yes and app.costs_money(name) and output.is_terminal(sys.stdin)
+    if asks and not output.confirm(f"end `{name}` and all its machines?"):
+        output.say("nothing was done")
+        raise typer.Exit(1)
     app.down(name, lambda what: output.say(f"ended {what}"), output.warn)
     output.done(f"nothing of `{name}` is left")

@@ -65,6 +65,6 @@ class Remembering:
             elif up and not judged.serving and record.first_ready_at and not record.unready_since:
                 log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
                 self.add(EventKind.UNREADY, id)
-            if judged.verdict is Verdict.FAILED and not record.failed:
+            if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
                 log.warning("replica_failed replica=%s reason=%r", id.short, judged.why)
                 self.add(EventKind.FAILED, id, detail=judged.why)

@@ -178,3 +178,22 @@ def test_a_section_that_a_pool_decides_itself_is_refused_before_anything_runs(
     said = capsys.readouterr().err
     assert f"error: {file}:8: file_mounts.~/.fogft/x: " in said
     assert started == []
+
+
+@pytest.mark.parametrize(("text", "ends"), [("y\n", True), ("n\n", False)])
+def test_down_asks_a_person(home, scene, monkeypatch, capsys, text, ends):
+    paths = lay_down(home)
+    paths.identity.write_text(paths.identity.read_text().replace('"local"', '"sky"'))
+    answer(monkeypatch, text)
+    assert main.run(["down"]) == (0 if ends else 1)
+    assert "end `planner` and all its machines? [y/N] " in capsys.readouterr().err
+    assert paths.folder.exists() is not ends
+
+
+def test_down_without_a_terminal_does_as_it_is_told(home, scene, monkeypatch):
+    """Ending costs nothing: a script that ends a pool need not say so twice."""
+    paths = lay_down(home)
+    paths.identity.write_text(paths.identity.read_text().replace('"local"', '"sky"'))
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    assert main.run(["down"]) == 0
+    assert not paths.folder.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
@@ -166,11 +167,11 @@ def vm(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def shell(home: Path, script: str) -> subprocess.CompletedProcess[str]:
+def shell(home: Path, script: str, **environ: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         ["bash", "-c", script],
         cwd=home,
-        env={"HOME": str(home), "PATH": "/usr/local/bin:/usr/bin:/bin"},
+        env={"HOME": str(home), "PATH": "/usr/local/bin:/usr/bin:/bin", **environ},
         capture_output=True,
         text=True,
         timeout=60,
@@ -189,6 +190,58 @@ def test_a_failing_setup_of_the_pool_file_fails_the_whole(vm: Path):
     done = shell(vm, built({"setup": "echo before\nexit 3"})["setup"])
     assert done.returncode != 0
     assert "the pool file's setup failed" in done.stdout
+
+
+@pytest.fixture
+def bare_vm(vm: Path) -> Path:
+    """A home as on a VM that was just made: the wheel came, and SkyPilot brought `uv`."""
+    shutil.rmtree(vm / ".fogft/venv")
+    (vm / ".fogft/wheel").mkdir()
+    (vm / ".fogft/wheel/fogft-0.1.0-py3-none-any.whl").touch()
+    (vm / ".local/bin").mkdir(parents=True)
+    uv = vm / ".local/bin/uv"
+    uv.write_text('#!/bin/sh\necho "uv $*" >> ~/uv-calls\n')
+    uv.chmod(0o755)
+    return vm
+
+
+def with_ros_at(folder: Path, script: str) -> str:
+    """Return a script that looks for ROS 2 in another folder than /opt/ros."""
+    assert "/opt/ros" in script
+    return script.replace("/opt/ros", str(folder))
+
+
+def test_plain_ubuntu_gets_ros_with_the_wheel(bare_vm: Path, tmp_path: Path):
+    done = shell(bare_vm, with_ros_at(tmp_path / "no-ros", built({})["setup"]))
+    assert done.returncode == 0, done.stderr
+    made, installed = (bare_vm / "uv-calls").read_text().splitlines()
+    assert made.startswith("uv venv --quiet --system-site-packages ")
+    assert installed.endswith("/.fogft/wheel/fogft-0.1.0-py3-none-any.whl[ros]")
+
+
+def test_an_image_with_ros_keeps_its_own(bare_vm: Path, tmp_path: Path):
+    """Sourced, so that `rclpy` is found; the wheel then brings none."""
+    ros = tmp_path / "ros/kilted"
+    (ros / "lib/rclpy").mkdir(parents=True)
+    (ros / "lib/rclpy/__init__.py").touch()
+    (ros / "setup.bash").write_text(f"export PYTHONPATH={ros}/lib ROS_DISTRO=kilted\n")
+    done = shell(bare_vm, with_ros_at(tmp_path / "ros", built({})["setup"]))
+    assert done.returncode == 0, done.stderr
+    made, installed = (bare_vm / "uv-calls").read_text().splitlines()
+    assert installed.endswith("/.fogft/wheel/fogft-0.1.0-py3-none-any.whl")
+    if Path("/usr/bin/python3").exists():  # the one that ROS 2 was built for
+        assert "--python /usr/bin/python3 " in made
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [({}, "LOCALHOST"), ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "SUBNET")],
+)
+def test_ros_speaks_to_its_own_machine_unless_told(vm: Path, given: dict[str, str], found: str):
+    fogft = vm / ".fogft/venv/bin/fogft"
+    fogft.write_text('#!/bin/sh\necho "$ROS_AUTOMATIC_DISCOVERY_RANGE"\n')
+    done = shell(vm, built({})["run"], **given)
+    assert done.stdout.strip() == found
 
 
 def test_run_becomes_the_server_proxy(vm: Path):
