@@ -216,9 +216,12 @@ def down(
         output.say("nothing to end: there is no pool here")
         return
     name = app.pool_name(pool)
-    asks = not yes and app.costs_money(name) and output.is_terminal(sys.stdin)
+    paid = app.costs_money(name)
+    asks = paid and not yes and output.is_terminal(sys.stdin)
     if asks and not output.confirm(f"end `{name}` and all its machines?"):
         output.say("nothing was done")
         raise typer.Exit(1)
     app.down(name, lambda what: output.say(f"ended {what}"), output.warn)
     output.done(f"nothing of `{name}` is left")
+    if paid and not app.pools():
+        output.hint("SkyPilot's own API server runs on; `sky api stop` ends one on this machine")

@@ -8,6 +8,7 @@ import pytest
 
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.following import DEFAULT_LIMITS
+from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
 from fogft.core.model import MachinePhase
@@ -341,6 +342,21 @@ def test_down_that_claims_success_is_not_believed(tmp_path: Path):
     scene.sky.down_lies = False
     scene.cloud.terminate(ID)
     assert not scene.machines()
+
+
+def test_an_end_is_looked_at_where_the_answer_is_surest(scene: Scene, tmp_path: Path):
+    """The provider's own list, where it may be asked; else a refresh of SkyPilot's."""
+    scene.launched()
+    scene.cloud.terminate(ID)
+    assert scene.sky.asked("refresh") == []
+    scene.launched(replica(1))
+    scene.provider.allowed = False
+    scene.cloud.terminate(replica(1))
+    assert scene.sky.asked("refresh") == [cluster_name(replica(1))]
+    alone = Scene(tmp_path / "alone", with_provider=False)
+    alone.launched()
+    alone.cloud.terminate(ID)
+    assert alone.sky.asked("refresh") == [NAME]
 
 
 # -- what SkyPilot has forgotten ---------------------------------------------------------------

@@ -107,9 +107,11 @@ class Ending:
 
     def _left(self, id: ReplicaId, name: str) -> list[str]:
         """Return what still exists; ask the provider to end what SkyPilot did not."""
-        clusters = self._sky.clusters(name, refresh=True)
+        instances = self._instances(id)
+        # The provider knows best; SkyPilot's own look at the cloud waits behind its other requests.
+        clusters = self._sky.clusters(name, refresh=instances is None)
         left = [f"cluster {c.name} ({c.state.value})" for c in clusters if c.name == name]
-        for instance in self._instances(id):
+        for instance in instances or ():
             left.append(f"{instance.placement.cloud} instance {instance.key}")
             try:
                 self._providers[instance.placement.cloud].terminate([instance])
@@ -117,16 +119,21 @@ class Ending:
                 raise CloudUnreachable(f"{instance.key} may not be ended: {error}") from error
         return left
 
-    def _instances(self, id: ReplicaId) -> list[Instance]:
+    def _instances(self, id: ReplicaId) -> list[Instance] | None:
+        """Return a replica's machines by the provider; None where SkyPilot's word has to do."""
         entry = self._journal.get(id)
+        asked = list(self._providers)
+        if entry is not None:
+            asked = [cloud for cloud in asked if cloud == entry.placement.cloud]
         out: list[Instance] = []
-        for cloud, provider in self._providers.items():
-            if entry is not None and entry.placement.cloud != cloud:
-                continue
+        sure = entry is not None and bool(asked)  # else it may be where nobody can be asked
+        for cloud in asked:
+            provider = self._providers[cloud]
             regions = None if entry is None else [entry.placement.region]
             try:
                 found: Sequence[Instance] = provider.instances(regions, id.pool_uid)
             except NotAllowedError:
-                continue  # SkyPilot's word has to do
-            out += [instance for instance in found if instance.id == id]
-        return out
+                sure = False
+            else:
+                out += [instance for instance in found if instance.id == id]
+        return out if sure or out else None
