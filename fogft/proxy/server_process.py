@@ -71,18 +71,20 @@ def run(
 
 def _make(config: ServerProxyConfig) -> ServerProxy:
     from fogft.ros.node import SerialisedNode
+    from fogft.wire.handshakes import HandshakeLog
     from fogft.wire.zenoh_listener import ZenohListener
 
     def make_node() -> RosNode:
         return SerialisedNode(f"fogft_replica_{config.id.slot}", config.domain_id)
 
     environ = run_environment(config)
+    handshakes = HandshakeLog()
     return ServerProxy(
         config.id,
         config.services,
-        ZenohListener(config.listen, config.credentials, config.id),
+        ZenohListener(config.listen, config.credentials, config.id, handshakes=handshakes),
         make_node,
-        Supervisor(config.run, config.workdir, environ),
+        Supervisor(config.run, config.workdir, environ, stdout=handshakes.stdout),
         max_in_flight=config.max_in_flight,
         orphan_after_s=config.orphan_after_s,
     )

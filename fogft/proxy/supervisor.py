@@ -34,6 +34,7 @@ class Supervisor:
         clock: Monotonic seconds.
         backoff_s: First and longest wait between a death and the next start. A run
             longer than the longest wait resets it.
+        stdout: Descriptor for its standard output; None for our own.
     """
 
     def __init__(
@@ -44,7 +45,9 @@ class Supervisor:
         *,
         clock: Callable[[], float] = time.monotonic,
         backoff_s: tuple[float, float] = (0.5, 15.0),
+        stdout: int | None = None,
     ) -> None:
+        self._stdout = stdout
         self._command = command
         self._workdir = workdir
         self._environ = dict(environ)
@@ -102,6 +105,7 @@ class Supervisor:
                 cwd=self._workdir,
                 env=self._environ,
                 stdin=subprocess.DEVNULL,
+                stdout=self._stdout,
                 start_new_session=True,
             )
         except OSError as error:

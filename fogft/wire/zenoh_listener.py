@@ -25,7 +25,9 @@ from fogft.core.errors import WireError
 from fogft.core.model import ReplicaId
 from fogft.wire import config, frame
 from fogft.wire.config import CredentialPaths, LinkSettings
+from fogft.wire.doorkeeper import Address, Doorkeeper, address
 from fogft.wire.guests import Guests, NotAdmittedError
+from fogft.wire.handshakes import HandshakeLog
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
 from fogft.wire.reply_queue import Counters, Reply, ReplyQueues
@@ -122,6 +124,7 @@ class ZenohListener:
         credentials: The replica's certificate and key, and the pool's CA.
         id: Which replica this is: it hears the keys of its slot only.
         settings: Zenoh's times.
+        handshakes: Tells which handshakes were refused; None where they need not be counted.
 
     Raises:
         WireError: `listen` is not ``host:port``.
@@ -134,8 +137,11 @@ class ZenohListener:
         id: ReplicaId,
         *,
         settings: LinkSettings | None = None,
+        handshakes: HandshakeLog | None = None,
     ) -> None:
         self._endpoint = _with_port(listen)
+        self._handshakes = handshakes
+        self._doorkeeper: Doorkeeper | None = None
         self._id = id
         self._config = config.replica_settings(
             self._endpoint, id, credentials, settings or LinkSettings()
@@ -174,6 +180,13 @@ class ZenohListener:
                 "see that the port is free and that the certificate, its key and the CA exist",
             ) from error
         threading.Thread(target=self._do_chores, name="fogft-probes", daemon=True).start()
+        self._doorkeeper = Doorkeeper(
+            int(self._endpoint.rpartition(":")[2]),
+            self._peers,
+            lambda: self._guests.revoked,
+            self._counters,
+            also=self._count_handshakes,
+        )
         for name, key in services.items():
             self._declare(session, key, partial(self._request, name, on_request))
         cancel_key = names.cancel_key(self._id.pool_uid, self._id.slot)
@@ -181,6 +194,17 @@ class ZenohListener:
         # Last: who is told that this replica is ready finds every service.
         probe_key = names.probe_key(self._id.pool_uid, self._id.slot)
         self._declare(session, probe_key, partial(self._probe, on_probe))
+
+    def _peers(self) -> dict[Address, str]:
+        session = self._session
+        links = [] if session is None else session.info.links()
+        return {address(link.dst): link.auth_identifier or "" for link in links}
+
+    def _count_handshakes(self) -> None:
+        for reason in self._handshakes.refusals() if self._handshakes else ():
+            count = self._counters.add("handshakes_refused")
+            if count & (count - 1) == 0:
+                log.warning("handshake_refused reason=%r count=%d", reason, count)
 
     def _declare(
         self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query], None]
@@ -286,7 +310,8 @@ class ZenohListener:
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
-        ``malformed``, ``not_admitted``, ``reply_dropped``, ``failed``, ``cancellations``.
+        ``malformed``, ``not_admitted``, ``handshakes_refused``,
+        ``unauthenticated``, ``revoked_links``, ``reply_dropped``, ``failed``, ``cancellations``.
         """
         return self._counters.snapshot()
 
@@ -296,6 +321,8 @@ class ZenohListener:
         if session is None:
             return
         self._queryables.clear()
+        if self._doorkeeper is not None:
+            self._doorkeeper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)
         self._chores.put(None)
         closer = threading.Thread(

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from fogft.core.model import ReplicaId
 from fogft.wire.config import LinkSettings
+from fogft.wire.handshakes import HandshakeLog
 from fogft.wire.port import Incoming, Probe, ProbeAnswer
 from fogft.wire.zenoh_listener import ZenohListener
 from tests.wire.wire_pool import POOL_UID, SERVICE, Files, keys
@@ -66,7 +67,9 @@ def main() -> None:
     files = Files(Path(given["ca"]), Path(given["certificate"]), Path(given["key"]))
     id = ReplicaId(POOL_UID, given["slot"], given["generation"])
     settings = LinkSettings(**given["settings"])
-    listener = ZenohListener(given["endpoint"], files, id, settings=settings)
+    listener = ZenohListener(
+        given["endpoint"], files, id, settings=settings, handshakes=HandshakeLog()
+    )
     service = Service(given["delay_s"], given["reply_bytes"])
     service.start()
     state = {"ready": [SERVICE], "draining": False}
