@@ -297,6 +297,7 @@ class ClientProxy:
             "reopened": status.reopened,
             "won": sum(s.dispatcher.won(id) for s in self._services.values()),
             "restarts": answer.restarts if answer else 0,
+            "work": dict(answer.work) if answer else {},
             "detail": status.detail or (answer.detail if answer else ""),
         }
 

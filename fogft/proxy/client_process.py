@@ -103,6 +103,7 @@ def _dialer(config: ClientProxyConfig, sign: ManagerSign) -> Any:
         pool_uid=config.pool_uid,
         suspect_after_s=config.suspect_after_s,
         manager_age=sign.age_s,
+        tell_losers=config.tell_losers,
     )
 
 

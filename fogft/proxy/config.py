@@ -43,6 +43,7 @@ class ClientProxyConfig:
     credentials: CredentialFiles
     services: tuple[ServiceSpec, ...]
     suspect_after_s: float = 2.0
+    tell_losers: bool = True
     domain_id: int | None = None
 
 
@@ -89,6 +90,7 @@ def read_client(path: Path) -> ClientProxyConfig:
             services=tuple(from_plain(s) for s in raw["services"]),
             suspect_after_s=seconds((raw.get("health") or {}).get("suspect_after_s") or 2.0),
             domain_id=_optional_int(raw.get("domain_id")),
+            tell_losers=bool(raw.get("tell_losers", True)),
         )
     raise AssertionError("unreachable")
 

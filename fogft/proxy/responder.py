@@ -52,6 +52,7 @@ class Responder:
 
     Attributes:
         ran: Requests passed on.
+        ran_s: The time from then until their responses, together, in seconds.
         joined: Copies of requests that were known.
         saved: Requests that were dropped unbegun because their robot had its answer.
         interrupted: Requests at work that were told to stop for the same reason.
@@ -92,6 +93,7 @@ class Responder:
         self._kept_bytes = 0
         self._kept: OrderedDict[bytes, Work] = OrderedDict()
         self.ran = 0
+        self.ran_s = 0.0
         self.joined = 0
         self.saved = 0
         self.interrupted = 0
@@ -107,7 +109,9 @@ class Responder:
     def report(self) -> dict[str, float]:
         """Return what became of the work, as a probe's answer tells it."""
         return {
+            "held": self._running,
             "ran": self.ran,
+            "ran_s": round(self.ran_s, 3),
             "saved": self.saved,
             "interrupted": self.interrupted,
             "wasted": self.wasted,
@@ -254,6 +258,7 @@ class Responder:
         line = self._lines[work.service]
         with self._lock:
             line.finished(work, now)
+            self.ran_s += now - work.begun
             waiting, work.waiting = work.waiting or [], None
             if waiting:
                 self._running -= 1

@@ -99,6 +99,7 @@ class Connection:
         keys: Service name -> key.
         sign: Signs our greeting.
         turns: Shared with the robot's other connections.
+        recalls: Of whom the replica is told that it may stop; None to tell of nobody.
         answered: Called with each attempt's end, once. Must not block.
         late: Called with service and id when a forgotten request was answered. Must not block.
         lost: Called, from any thread and perhaps more than once, when it is no longer of use.
@@ -119,6 +120,7 @@ class Connection:
         *,
         sign: Sign,
         turns: Turns,
+        recalls: Recalls | None = None,
         answered: Callable[[Answer], None],
         late: Callable[[str, bytes], None],
         lost: Callable[[], None],
@@ -139,7 +141,7 @@ class Connection:
         self._queue: SimpleQueue[OpenAttempt | None] = SimpleQueue()
         self._credit = Credit()
         self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
-        self._recalls = Recalls()
+        self._recalls = recalls
         self._telling = False
         self.window: LinkWindow[OpenAttempt] = LinkWindow()
         self.lost_because = ""
@@ -191,7 +193,7 @@ class Connection:
         attempt = self.window.forget(request_id)
         if attempt is None:
             return
-        if attempt.payload is None:  # it was sent
+        if attempt.payload is None and self._recalls is not None:  # it was sent
             self._recalls.add(request_id)
             if time.monotonic() - attempt.offered >= WORTH_S:
                 self.flush()
@@ -201,7 +203,7 @@ class Connection:
 
     def flush(self) -> None:
         """Have the replica told of what was forgotten and not answered."""
-        if self._recalls and not self._telling:
+        if self._recalls and not self._telling:  # there are some
             self._telling = True
             self._queue.put(_TELL)
 
@@ -228,7 +230,7 @@ class Connection:
 
     def _tell(self) -> None:
         self._telling = False
-        ids = self._recalls.take()
+        ids = self._recalls.take() if self._recalls is not None else []
         if not ids:
             return
         try:
@@ -288,7 +290,8 @@ class Connection:
         if reply.ok is not None:
             self._credit.heard(attempt.mark)  # requests of one connection arrive in order
         if not self.window.holds(attempt):
-            self._recalls.answered(attempt.request_id)  # it was forgotten, or has ended
+            if self._recalls is not None:  # it was forgotten, or has ended
+                self._recalls.answered(attempt.request_id)
             if reply.ok is not None or _ran_in_vain(reply):
                 self._late(attempt.service, attempt.request_id)
             return

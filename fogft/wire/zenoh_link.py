@@ -26,6 +26,7 @@ from fogft.wire import config, diagnosis, frame
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.wire.recalls import Recalls
 from fogft.wire.signing import Signer
 from fogft.wire.silence import Silence
 from fogft.wire.turns import Turns
@@ -240,6 +241,7 @@ class ZenohLink:
                 self._services,
                 sign=self._dialer.sign,
                 turns=self._dialer.turns,
+                recalls=Recalls() if self._dialer.tell_losers else None,
                 answered=self._answered,
                 late=self._late,
                 lost=self._wake.set,
@@ -425,6 +427,7 @@ class ZenohDialer:
         manager_age: Seconds since the pool's manager gave a sign, None if never; told to
             replicas with each probe.
         settings: Zenoh's times.
+        tell_losers: Whether replicas are told which requests are no longer wanted.
     """
 
     def __init__(
@@ -436,7 +439,9 @@ class ZenohDialer:
         suspect_after_s: float = 2.0,
         manager_age: Callable[[], float | None] = lambda: None,
         settings: LinkSettings | None = None,
+        tell_losers: bool = True,
     ) -> None:
+        self.tell_losers = tell_losers
         self.credentials = credentials
         self.robot = robot
         self.suspect_after_s = suspect_after_s

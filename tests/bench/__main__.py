@@ -23,7 +23,7 @@ Rows = list[dict[str, Any]]
 
 def measurements() -> dict[str, Callable[..., Rows]]:
     """Return what can be measured, by name, in the order of running."""
-    from tests.bench import commands, faults, speed
+    from tests.bench import commands, faults, speed, tail
 
     found: dict[str, Callable[..., Rows]] = {"commands": commands.commands}
     for replicas in (1, 2, 3):
@@ -32,6 +32,8 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["stalls"] = faults.stalls
     found["killed"] = faults.killed
     found["memory"] = speed.memory
+    found["hedging"] = tail.hedging
+    found["cancellation"] = tail.cancellation
     return found
 
 

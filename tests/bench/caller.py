@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from collections.abc import Sequence
@@ -98,6 +99,26 @@ class Caller:
                 break
         result.seconds = time.perf_counter() - began
         return result
+
+    def spread(
+        self, service: str, payload: bytes, count: int, per_s: float, source: random.Random
+    ) -> list[float]:
+        """Call at random moments, so many a second on average; return how long each took.
+
+        Calls without an answer are left out; the last ones have `CALL_LIMIT_S` to come.
+        """
+        client, took = self._clients[service], []
+        began = time.perf_counter()
+        at = began
+        for _ in range(count):
+            at += source.expovariate(per_s)
+            time.sleep(max(0.0, at - time.perf_counter()))
+            sent = time.perf_counter()
+            client.call(payload, lambda _, sent=sent: took.append(time.perf_counter() - sent))
+        end = time.perf_counter() + CALL_LIMIT_S
+        while len(took) < count and time.perf_counter() < end:
+            time.sleep(0.02)
+        return took
 
     def close(self) -> None:
         """Leave ROS."""

@@ -94,16 +94,32 @@ class Rig:
         replicas: How many.
         sleep_s: How long the service sleeps over each request.
         relayed: Slots that are reached through a relay.
+        services: What each slot's service is started with, instead of `sleep_s`.
+        replica: More of the `/bench_flag` service for the replicas' configurations.
+        policy: More of it for the client proxy's.
+        tell_losers: Whether the client proxy tells replicas what is no longer wanted.
     """
 
     def __init__(
-        self, folder: Path, replicas: int, *, sleep_s: float = 0.0, relayed: Sequence[int] = ()
+        self,
+        folder: Path,
+        replicas: int,
+        *,
+        sleep_s: float = 0.0,
+        relayed: Sequence[int] = (),
+        services: Sequence[str] = (),
+        replica: dict[str, Any] | None = None,
+        policy: dict[str, Any] | None = None,
+        tell_losers: bool = True,
     ) -> None:
         self._folder = folder
         self._uid = secrets.token_hex(8)
         self._version = 0
         self._processes: list[subprocess.Popen[bytes]] = []
-        self._sleep_s = sleep_s
+        self._arguments = services or [str(sleep_s)] * replicas
+        self._of_replica = replica or {}
+        self._tell_losers = tell_losers
+        self._policy: dict[str, Any] = policy or {}
         self.robot_domain, *domains = free_domains(replicas + 1)
         self.domains = domains
         credentials.create_authority(folder / "ca", self._uid)
@@ -136,6 +152,15 @@ class Rig:
         """Return the client proxy's links by slot, as it last reported them."""
         report = disk.read_json(self._folder / "proxy-status.json") or {}
         return {link["slot"]: link for link in report.get("links", ())}
+
+    def report(self, after: float = 0.0) -> dict[str, Any]:
+        """Return the client proxy's report, one written after this moment (of `time.time`)."""
+
+        def read() -> dict[str, Any]:
+            return disk.read_json(self._folder / "proxy-status.json") or {}
+
+        self._wait(lambda: read().get("written_at", 0.0) > after, "the client proxy's report")
+        return read()
 
     def wait_ready(self, slots: Sequence[int]) -> None:
         """Wait until the client proxy holds exactly these links, all up and ready."""
@@ -173,8 +198,8 @@ class Rig:
             "slot": slot,
             "generation": 1,
             "listen": f"127.0.0.1:{port}",
-            "services": self._services(),
-            "run": f"exec {sys.executable} -m tests.bench.service {self._sleep_s}",
+            "services": self._services(self._of_replica),
+            "run": f"exec {sys.executable} -m tests.bench.service {self._arguments[slot]}",
             "workdir": str(ROOT),
             "credentials": _pair(name, "replica"),
             "domain_id": self.domains[slot],
@@ -193,6 +218,18 @@ class Rig:
             names.robot_certificate_name(self._uid, "bench"),
             credentials.Role.ROBOT,
         )
+        self._write_policy()
+        return self._start("proxy", "fogft", "proxy", "--config", "proxy.yaml")
+
+    def change(self, **policy: Any) -> None:
+        """Give the client proxy another policy for `/bench_flag` while it runs, and wait for it."""
+        before = (self._folder / "proxy.log").read_text().count("config_applied")
+        self._policy = policy
+        self._write_policy()
+        log = self._folder / "proxy.log"
+        self._wait(lambda: log.read_text().count("config_applied") > before, "the new policy")
+
+    def _write_policy(self) -> None:
         config = {
             "pool": "bench",
             "pool_uid": self._uid,
@@ -202,11 +239,11 @@ class Rig:
             "lease": "lease.json",
             "lock": "proxy.lock",
             "credentials": _pair("robot", "robot"),
-            "services": self._services(),
+            "services": self._services(self._policy),
             "domain_id": self.robot_domain,
+            "tell_losers": self._tell_losers,
         }
-        (self._folder / "proxy.yaml").write_text(json.dumps(config))
-        return self._start("proxy", "fogft", "proxy", "--config", "proxy.yaml")
+        disk.write_whole(self._folder / "proxy.yaml", json.dumps(config))
 
     def _floor(self) -> int:
         """Start the bare replier, with certificates like a replica's."""
@@ -232,8 +269,9 @@ class Rig:
         credential = credentials.issue(self._folder / "ca", name, role=role)
         credentials.write(credential, self._folder / folder, stem)
 
-    def _services(self) -> list[dict[str, Any]]:
-        return [{"name": n, "type": t, "timeout_s": 10.0} for n, t in (FLAG, MAP)]
+    def _services(self, of_flag: dict[str, Any]) -> list[dict[str, Any]]:
+        flag, other = ({"name": n, "type": t, "timeout_s": 10.0} for n, t in (FLAG, MAP))
+        return [{**flag, **of_flag}, other]
 
     def _start(self, name: str, module: str, *arguments: str) -> subprocess.Popen[bytes]:
         environ = {**child_environment(), "PYTHONPATH": str(ROOT)}

@@ -1,14 +1,17 @@
 """A fast service to measure against: SetBool and SetMap, serialised, with a given delay.
 
-    python tests/bench/service.py SLEEP_S
+    python tests/bench/service.py SLEEP_S [SIGMA STALLED STALL_S WORKERS]
 
 Answers are made once and sent as bytes, so that the service itself costs next to nothing.
-With a delay each request sleeps on a thread of its own, so that requests do not queue.
+With a delay requests sleep on WORKERS threads (16), for SLEEP_S, or for lognormal times of
+that median and sigma; a share STALLED of them sleeps STALL_S longer. `/bench_cancel` ends
+every sleep under way.
 """
 
 from __future__ import annotations
 
 import os
+import random
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -18,20 +21,24 @@ from fogft.ros import environment, memory_tuning
 
 FLAG = ("/bench_flag", "std_srvs/srv/SetBool")
 MAP = ("/bench_map", "nav_msgs/srv/SetMap")
+CANCEL = ("/bench_cancel", "std_srvs/srv/Trigger")
+_DEFAULTS = ("0", "0", "0", "0", "16")
 
 
 def main() -> None:
-    sleep_s = float(sys.argv[1])
+    given = sys.argv[1:]
+    sleep_s, sigma, stalled, stall_s, workers = map(float, (*given, *_DEFAULTS[len(given) :]))
     environment.prepare(os.environ)
     from nav_msgs.srv import SetMap
     from rclpy.serialization import serialize_message
-    from std_srvs.srv import SetBool
+    from std_srvs.srv import SetBool, Trigger
 
     from fogft.ros.node import SerialisedNode
 
     memory_tuning.tune()
     node = SerialisedNode("bench_service")
-    pool = ThreadPoolExecutor(16)
+    pool = ThreadPoolExecutor(int(workers))
+    sleeps = Sleeps(sleep_s, sigma, stalled, stall_s)
     answers = {
         FLAG: bytes(serialize_message(SetBool.Response(success=True))),
         MAP: bytes(serialize_message(SetMap.Response(success=True))),
@@ -43,14 +50,45 @@ def main() -> None:
             ends[0].respond(handle, it)
 
         def answer_later(_: bytes, handle: Any, ends: list[Any] = ends, it: bytes = answer) -> None:
-            pool.submit(_respond_after, sleep_s, ends[0], handle, it)
+            pool.submit(_respond_after, sleeps, ends[0], handle, it)
 
         ends.append(node.serve(name, type_name, answer_later if sleep_s else answer_now))
+    stopped = bytes(serialize_message(Trigger.Response(success=True)))
+
+    def stop(_: bytes, handle: Any) -> None:
+        sleeps.end()
+        cancel.respond(handle, stopped)
+
+    cancel = node.serve(*CANCEL, stop)
     threading.Event().wait()  # its server proxy ends it
 
 
-def _respond_after(sleep_s: float, server: Any, handle: Any, answer: bytes) -> None:
-    threading.Event().wait(sleep_s)
+class Sleeps:
+    """Sleeps that can be ended early, all together."""
+
+    def __init__(self, median_s: float, sigma: float, stalled: float, stall_s: float) -> None:
+        self._median_s = median_s
+        self._sigma = sigma
+        self._stalled = stalled
+        self._stall_s = stall_s
+        self._source = random.Random()
+        self._end = threading.Event()
+
+    def sleep(self) -> None:
+        """Sleep for a drawn time."""
+        seconds = self._median_s * self._source.lognormvariate(0.0, self._sigma)
+        if self._source.random() < self._stalled:
+            seconds += self._stall_s
+        self._end.wait(seconds)
+
+    def end(self) -> None:
+        """End the sleeps that are under way."""
+        old, self._end = self._end, threading.Event()
+        old.set()
+
+
+def _respond_after(sleeps: Sleeps, server: Any, handle: Any, answer: bytes) -> None:
+    sleeps.sleep()
     server.respond(handle, answer)
 
 

@@ -44,4 +44,6 @@ def test_there_is_a_measurement_for_each_promise():
         "stalls",
         "killed",
         "memory",
+        "hedging",
+        "cancellation",
     ]
