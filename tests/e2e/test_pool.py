@@ -43,6 +43,26 @@ def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
     assert pool.processes() == []
 
 
+def test_the_replacement_is_launched_at_the_notice_and_not_at_the_death(pool):
+    """A machine has 60 s left; long before they are over its successor serves, and none is lost."""
+    pool.write(replicas=2)
+    pool.up()
+    client = pool.client(60, 20)
+    pool.fogft("chaos", "preempt", "0", "--notice", "60")
+    pool.wait(
+        lambda: any(
+            (r["slot"], r["generation"], r["phase"]) == (0, 2, "ready")
+            for r in pool.status()["replicas"]
+        )
+    )
+    events = [(e["event"], e["replica"]) for e in pool.status()["events"]]
+    assert ("gone", "0.1") not in events, "the old one was to live for a minute"
+    pool.wait(lambda: len(pool.status()["replicas"]) == pool.ready() == 2)
+    assert flawless(client.finish())
+    events = [(e["event"], e["replica"]) for e in pool.status()["events"]]
+    assert events.index(("launched", "0.2")) < events.index(("ending", "0.1"))
+
+
 def test_a_slow_service_is_never_taken_for_a_dead_one(pool):
     """A service that thinks six times longer than the suspicion limit is left in peace."""
     pool.write(

@@ -49,6 +49,21 @@ def preempt(world: World) -> None:
         world.cloud.preempt(victim.id, notice_s=world.random.choice([0.0, 20.0]))
 
 
+def tell_of_the_end(world: World) -> Callable[[], None] | None:
+    ours = [m for m in world.truth() if m.id.pool_uid == UID]
+    if not ours:
+        return None
+    victim = world.random.choice(ours).id
+    world.told.add(victim)
+    return lambda: world.cloud.preempt(victim, notice_s=0.0)
+
+
+def recommend_to_move(world: World) -> None:
+    ours = [m for m in world.truth() if m.id.pool_uid == UID]
+    if ours:
+        world.at_risk.add(world.random.choice(ours).id)
+
+
 def freeze(world: World) -> Callable[[], None] | None:
     ours = [m for m in world.truth() if m.id.pool_uid == UID]
     if not ours:
@@ -141,6 +156,8 @@ def edit_the_file(world: World) -> None:
 FAULTS = [
     preempt,
     preempt,
+    tell_of_the_end,
+    recommend_to_move,
     freeze,
     crash_service,
     fill_a_zone,

@@ -91,6 +91,8 @@ class World:
         self.cloud.world = self
         self.frozen: set[ReplicaId] = set()
         self.crashing: set[ReplicaId] = set()  # their service is away
+        self.told: set[ReplicaId] = set()  # of their end, by a notice that only they hear
+        self.at_risk: set[ReplicaId] = set()  # their cloud recommends to move them
         self.uplink_down = False
         self.proxy_down = False
         self.echo_draining = self.random.random() < 0.5
@@ -197,11 +199,14 @@ class World:
             else:
                 state = LinkState.UP
             serving = state is LinkState.UP and (not up or self.serves(member.id))
+            draining = member.draining and self.echo_draining
+            draining = draining or (up and member.id in self.told)
             self._reported[member.id] = LinkReport(
                 member.id,
                 state,
                 ready=frozenset({SERVICE.name}) if serving else frozenset(),
-                draining=member.draining and self.echo_draining,
+                draining=draining,
+                at_risk=up and member.id in self.at_risk,
                 silent_for_s=silent,
                 in_flight=self.random.randrange(2) if serving else 0,
             )

@@ -1,0 +1,171 @@
+"""A SkyPilot API server elsewhere does what the local one does, for a robot without credentials.
+
+Unmodified SkyPilot, its real API server as a process with its own home, AWS's interface under
+moto; all on loopback.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).parent
+WITHIN_S = 300.0  # a busy machine takes minutes to start an API server
+missing = [
+    name for name in ("sky", "moto", "boto3", "flask") if importlib.util.find_spec(name) is None
+]
+pytestmark = [
+    pytest.mark.skipif(
+        bool(missing),
+        reason="SKYPILOT OR MOTO IS NOT INSTALLED: a remote API server is not tried "
+        "(`pip install '.[cloud]' 'moto[ec2,server]'`)",
+    ),
+    pytest.mark.timeout(900),
+]
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    end = time.monotonic() + WITHIN_S
+    while not (found := condition()):
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.2)
+    return found
+
+
+class World:
+    """The emulated AWS, the API server, and the homes of server and robot."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.started: list[subprocess.Popen[Any]] = []
+        self.aws = f"http://127.0.0.1:{(port := free_port())}"
+        self._start("aws", [str(HERE / "loopback_aws.py"), str(port)], dict(os.environ))
+        wait_for(lambda: "ready" in self.log("aws"), "AWS's interface")
+        self.endpoint = f"http://127.0.0.1:{(port := free_port())}"
+        metrics = free_port()
+        self._start(
+            "server",
+            ["-m", "sky.server.server", f"--port={port}", f"--metrics-port={metrics}"],
+            self.environ("server", AWS_ENDPOINT_URL=self.aws, IS_SKYPILOT_SERVER="true"),
+        )
+        wait_for(self._answers, "SkyPilot's API server")
+
+    def environ(self, whose: str, **more: str) -> dict[str, str]:
+        """Return an environment with a home of its own, and no credentials of this user's."""
+        home = self.folder / whose
+        if not home.exists():
+            made = [sys.executable, str(HERE / "emulated_aws" / "home.py"), str(home)]
+            subprocess.run(made, check=True, timeout=60)
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("AWS_", "SKYPILOT_"))}
+        return {
+            **kept,
+            "HOME": str(home),
+            "SKYPILOT_DISABLE_USAGE_COLLECTION": "1",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "PYTHONPATH": str(HERE.parents[1]),
+            **more,
+        }
+
+    def robot(self) -> subprocess.Popen[Any]:
+        """Start a robot that has no credentials, and may start no API server."""
+        environ = self.environ(
+            "robot",
+            SKYPILOT_API_SERVER_ENDPOINT=self.endpoint,
+            SKYPILOT_DISABLE_LOCAL_API_SERVER="1",
+            AWS_ENDPOINT_URL=self.aws,
+        )
+        shutil.rmtree(self.folder / "robot" / ".aws")
+        return self._start("client", [str(HERE / "remote_client.py"), str(self.folder)], environ)
+
+    def instances(self) -> list[str]:
+        """Return the state of every instance that the provider knows, by name."""
+        import boto3
+
+        ec2 = boto3.client(
+            "ec2", region_name="us-east-1", endpoint_url=self.aws,
+            aws_access_key_id="test", aws_secret_access_key="test",
+        )  # fmt: skip
+        found = ec2.describe_instances()["Reservations"]
+        return [i["State"]["Name"] for r in found for i in r["Instances"]]
+
+    def log(self, name: str) -> str:
+        return (self.folder / f"{name}.log").read_text()
+
+    def _answers(self) -> bool:
+        try:
+            with urllib.request.urlopen(f"{self.endpoint}/api/health", timeout=5) as answer:
+                return bool(answer.status == 200)
+        except OSError:
+            assert self.started[-1].poll() is None, self.log("server")[-3000:]
+            return False
+
+    def _start(self, name: str, words: list[str], environ: dict[str, str]) -> subprocess.Popen[Any]:
+        with (self.folder / f"{name}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, *words], env=environ, cwd=self.folder, stdout=log, stderr=log,
+                start_new_session=True,
+            )  # fmt: skip
+        self.started.append(process)
+        return process
+
+    def close(self) -> None:
+        for process in reversed(self.started):  # each leads a session of its own
+            for number in (signal.SIGTERM, signal.SIGKILL):
+                if process.poll() is None:
+                    os.killpg(process.pid, number)
+                    try:
+                        process.wait(10)
+                    except subprocess.TimeoutExpired:
+                        continue
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    made = World.__new__(World)
+    made.started = []
+    try:
+        made.__init__(tmp_path)  # type: ignore[misc]
+        yield made
+    finally:
+        made.close()
+
+
+def test_a_robot_without_credentials_launches_and_ends_through_a_server_elsewhere(world: World):
+    """Credentials tested, prices told, a VM launched with its files, aborted and ended."""
+    robot = world.robot()
+    wait_for(lambda: (world.folder / "launched").exists() or robot.poll() is not None, "the order")
+    assert robot.poll() is None, world.log("client")[-4000:]
+    wait_for(lambda: "running" in world.instances(), "the VM at the provider")
+    (world.folder / "seen").touch()
+    assert robot.wait(WITHIN_S) == 0, world.log("client")[-4000:]
+    told = json.loads(world.log("client").splitlines()[-1])
+    assert told["check"] == {"aws": ""}
+    assert {(place.split("/")[1], kind, source) for place, kind, source in told["offers"]} == {
+        ("us-east-1", "m6i.large", "catalogue")
+    }
+    assert told["listed"] == [["0.1", "provisioning"]]
+    assert told["before"] == ["provisioning", ""]
+    assert told["after"] == []
+    assert told["audit"] == [[], []], "nobody but SkyPilot could be asked"
+    assert "SkyPilot's word" in told["unverified"], "and `up` says so"
+    assert set(world.instances()) == {"terminated"}
