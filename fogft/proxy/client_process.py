@@ -150,6 +150,9 @@ def _loop(
         now = time.monotonic()
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
             reported = now
+            if not config_path.parent.exists():  # the pool's folder: its end is the pool's
+                log.warning("folder_gone path=%s", config_path.parent)
+                return
             _apply(functools.partial(_report, config, proxy, now - started), config.status)
 
 

@@ -140,3 +140,13 @@ def test_a_proxy_starts_again_without_a_manager(parts, call):
     caller.wait()
     caller.ask(50)
     assert caller.all_answered()
+
+
+def test_a_proxy_ends_when_its_folder_is_gone(parts):
+    """Who removes a pool's folder by hand leaves no process behind."""
+    robot = parts.robot("robot")
+    wait_for(lambda: (parts.folder / "robot-status.json").exists(), "the first report")
+    gone = parts.folder.rename(parts.folder.with_name("gone"))
+    assert robot.process.wait(LIMIT_S) == 0
+    gone.rename(parts.folder)
+    assert "folder_gone" in (parts.folder / "robot.log").read_text()
