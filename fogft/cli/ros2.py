@@ -1,0 +1,98 @@
+"""``ros2 fog``: the commands of ``fogft`` for who types ``ros2``. Loaded by ros2cli only.
+
+Each verb hands its words to `fogft.cli.main` unread, so that both ways behave the same.
+
+Owns: the plugin's shape. Not here: any command.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from ros2cli.command import CommandExtension, add_subparsers_on_demand
+from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
+
+VERBS = "fogft.ros2_verb"  # the group of entry points
+
+
+class FogCommand(CommandExtension):  # type: ignore[misc]
+    """Keep services answering on replicas that come and go."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add a parser for each verb."""
+        self._parser = parser
+        add_subparsers_on_demand(parser, cli_name, "_verb", VERBS, required=False)
+
+    def main(self, *, parser: argparse.ArgumentParser, args: Any) -> int:
+        """Run the verb; without one, show which there are."""
+        del parser
+        if not hasattr(args, "_verb"):
+            self._parser.print_help()
+            return 0
+        status: int = args._verb.main(args=args)
+        return status
+
+
+class Verb:
+    """A verb that is a command of ``fogft``, its options and help included."""
+
+    EXTENSION_POINT_VERSION = "0.1"
+    NAME = ""
+
+    def __init__(self) -> None:
+        satisfies_version(PLUGIN_SYSTEM_VERSION, "^0.1")
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Take every word as it is, ``--help`` too."""
+        del cli_name
+        parser.add_argument("words", nargs=argparse.REMAINDER)
+        parser.prefix_chars = "\0"  # no word is an option of this parser
+
+    def main(self, *, args: Any) -> int:
+        """Run the command; return its exit status."""
+        from fogft.cli import main
+
+        return main.run([self.NAME, *args.words])
+
+
+class Up(Verb):
+    """Start a pool, or make a running one as its file says now."""
+
+    NAME = "up"
+
+
+class Down(Verb):
+    """End a pool and everything it started."""
+
+    NAME = "down"
+
+
+class Status(Verb):
+    """Show a pool's replicas and services."""
+
+    NAME = "status"
+
+
+class Scale(Verb):
+    """Ask for more or fewer replicas."""
+
+    NAME = "scale"
+
+
+class Plan(Verb):
+    """Explain where replicas would go, and at what price."""
+
+    NAME = "plan"
+
+
+class Logs(Verb):
+    """Show what the manager, the client proxy and the replicas log."""
+
+    NAME = "logs"
+
+
+class Doctor(Verb):
+    """Check this machine, ROS 2 and the pools here."""
+
+    NAME = "doctor"

@@ -1,0 +1,20 @@
+"""Launch files with nodes in the cloud: `FogPool` and `CloudNode`, in Python, XML and YAML.
+
+Needs ROS 2's `launch` and `launch_ros`, which are loaded when a name is first used::
+
+    from fogft.launch import CloudNode, FogPool
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["CloudNode", "FogPool"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module `{__name__}` has no attribute `{name}`")
+    from fogft.launch import actions
+
+    return getattr(actions, name)

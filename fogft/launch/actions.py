@@ -1,0 +1,300 @@
+"""The launch actions `fog_pool` and `cloud_node`, for ROS 2's launch files in any format.
+
+Needs `launch` and `launch_ros`: import `fogft.launch` instead, which loads this lazily.
+`cloud:=false` on the command line of ``ros2 launch`` runs everything here; ``cloud:=NAME``
+picks a cloud.
+
+Owns: evaluating what a launch file says, and when its local nodes start.
+Not here: the pool file's text (`words`), the pool (`hold`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from launch import Action, LaunchContext
+from launch.actions import EmitEvent, ExecuteProcess, RegisterEventHandler
+from launch.event_handlers import OnProcessExit, OnProcessIO
+from launch.events import Shutdown
+from launch.frontend import Entity, Parser, expose_action
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+from launch_ros.actions import Node
+
+from fogft.core.errors import FogftError
+from fogft.disk import make_folder, write_whole
+from fogft.launch.hold import READY
+from fogft.launch.words import NodeWords, pool_tree, run_text
+from fogft.pool.paths import home
+
+_END_LIMIT_S = 900  # how long launch waits for `fogft down` before it kills
+# What a node on another machine cannot do, and what to do instead.
+_NOT_CARRIED = {
+    "prefix": "a debugger or wrapper runs on the replica; put it into the pool file's `run`",
+    "env": "a replica has its own environment; use `additional_env` to add to it",
+    "cwd": "a replica works in the pool file's `workdir`",
+    "on_exit": "a replica starts its nodes again by itself",
+    "shell": "write the pool file's `run` instead",
+    "log_cmd": "`fogft logs` shows the commands of replicas",
+}
+
+
+@expose_action("cloud_node")
+class CloudNode(Node):  # type: ignore[misc]
+    """A node that runs on every replica of the fog pool that it stands in.
+
+    Takes what `launch_ros.actions.Node` takes. Name, namespace, parameters, remappings,
+    environment and arguments travel; `output` and `respawn` mean nothing there, as the
+    replicas' logs are always shown and their nodes always started again.
+
+    Raises:
+        FogftError: An argument cannot be carried to another machine.
+    """
+
+    def __init__(self, **arguments: Any) -> None:
+        for key, instead in _NOT_CARRIED.items():
+            if arguments.get(key):
+                what = arguments.get("executable", "?")
+                raise FogftError(f"cloud node `{what}`: `{key}` cannot be carried", instead)
+        self._is_path = not arguments.get("package")
+        super().__init__(**arguments)
+
+    def words(self, context: LaunchContext) -> NodeWords:
+        """Return the node as it is asked for in this context.
+
+        Raises:
+            FogftError: A parameter file cannot be read.
+        """
+        self._perform_substitutions(context)
+        name, namespace = self._given_name(context), self.expanded_node_namespace
+        specific = {"name": f"__node:={name}"} if name else {}
+        if namespace and "unspecified" not in namespace:
+            specific["ns"] = f"__ns:={namespace}"
+        context.extend_locals({"ros_specific_arguments": specific})
+        words = [perform_substitutions(context, _listed(word)) for word in self.cmd[1:]]
+        environ = {
+            perform_substitutions(context, key): perform_substitutions(context, value)
+            for key, value in self.additional_env or ()
+        }
+        files = {
+            path: _text_of(path)
+            for option, path in itertools.pairwise(words)
+            if option == "--params-file"
+        }
+        first = self.cmd[0] if self._is_path else self.node_executable
+        return NodeWords(
+            "" if self._is_path else _text(context, self.node_package),
+            _text(context, first),
+            tuple(words),
+            environ,
+            files,
+        )
+
+    def _given_name(self, context: LaunchContext) -> str:
+        name = self.node_name.rpartition("/")[2]
+        return "" if "unspecified" in name else name
+
+    def execute(self, context: LaunchContext) -> list[Action] | None:
+        """Run it here; only a fog pool that stays here lets it come to that.
+
+        Raises:
+            FogftError: It stands in no fog pool.
+        """
+        if not _stays_here(context):
+            raise FogftError(
+                "a cloud node stands in no fog pool", "put it into a `FogPool` (`fog_pool`)"
+            )
+        result: list[Action] | None = super().execute(context)
+        return result
+
+
+@expose_action("fog_pool")
+class FogPool(Action):  # type: ignore[misc]
+    """A pool of replicas that run the cloud nodes in it; its other actions start when it answers.
+
+    Texts may be substitutions; what is a list or a mapping may be given as YAML text.
+
+    Args:
+        actions: Cloud nodes, and whatever shall start here once their services answer.
+        name: The pool's name.
+        file: A pool file without `run` that supplies the rest.
+        replicas: How many.
+        resources: SkyPilot's `resources`.
+        services: As in a pool file; without them, those that the nodes offer.
+        setup: Shell text that prepares a replica.
+        workdir: A folder that travels to the replicas.
+        fogft: More keys of the pool file's `fogft` section.
+        cloud: Where; what `resources` name, else this machine.
+        on_exit: ``leave`` the pool running when the launch ends, or take it ``down``.
+        timeout: Seconds to wait for the services.
+    """
+
+    def __init__(
+        self,
+        actions: Iterable[Action] = (),
+        *,
+        name: Any = "",
+        file: Any = "",
+        replicas: Any = "",
+        resources: Any = "",
+        services: Any = "",
+        setup: Any = "",
+        workdir: Any = "",
+        fogft: Any = "",
+        cloud: Any = "",
+        on_exit: Any = "leave",
+        timeout: Any = "",
+        **rest: Any,
+    ) -> None:
+        super().__init__(**rest)
+        self._actions = list(actions)
+        self._given = {
+            "name": name, "file": file, "replicas": replicas, "resources": resources,
+            "services": services, "setup": setup, "workdir": workdir, "fogft": fogft,
+            "cloud": cloud, "on_exit": on_exit, "timeout": timeout,
+        }  # fmt: skip
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> tuple[type[FogPool], dict[str, Any]]:
+        """Read it from an XML or YAML launch file."""
+        _, arguments = super().parse(entity, parser)
+        for key in (
+            *("name", "file", "replicas", "resources", "services", "setup"),
+            *("workdir", "fogft", "cloud", "on_exit", "timeout"),
+        ):
+            value = entity.get_attr(key, optional=True)
+            if value is not None:
+                arguments[key] = parser.parse_substitution(value)
+        arguments["actions"] = [parser.parse_action(child) for child in entity.children]
+        return cls, arguments
+
+    def execute(self, context: LaunchContext) -> list[Action]:
+        """Write the pool file, hold the pool, and start the local actions when it answers.
+
+        Raises:
+            FogftError: What is asked for makes no pool file.
+        """
+        if _stays_here(context):
+            return self._actions
+        asked = {key: _evaluated(context, value) for key, value in self._given.items()}
+        if asked["on_exit"] not in ("leave", "down"):
+            raise FogftError(
+                f"fog pool: `on_exit` is `{asked['on_exit']}`", "write `leave` or `down`"
+            )
+        nodes = [action for action in self._actions if isinstance(action, CloudNode)]
+        local = [action for action in self._actions if not isinstance(action, CloudNode)]
+        chosen = [n for n in nodes if n.condition is None or n.condition.evaluate(context)]
+        tree = _tree(asked, [node.words(context) for node in chosen])
+        return _held(_written(tree), tree["name"], asked, _cloud(context) or asked["cloud"], local)
+
+
+def _tree(asked: Mapping[str, Any], nodes: Sequence[NodeWords]) -> dict[str, Any]:
+    base: Any = {}
+    if asked["file"]:
+        file = Path(asked["file"]).absolute()
+        base = yaml.safe_load(_text_of(str(file)))
+        if not isinstance(base, dict):
+            raise FogftError(f"`{file}` is not a pool file", "see `fogft init`")
+        if isinstance(base.get("workdir"), str):
+            base["workdir"] = str(file.parent / base["workdir"])
+    task = {key: asked[key] for key in ("resources", "setup") if asked[key]}
+    if asked["workdir"]:
+        task["workdir"] = str(Path(asked["workdir"]).absolute())
+    ours = dict(asked["fogft"] or {})
+    ours |= {key: asked[key] for key in ("replicas", "services") if asked[key]}
+    return pool_tree(base, name=asked["name"], run=run_text(nodes), task=task, fogft=ours)
+
+
+def _written(tree: Mapping[str, Any]) -> Path:
+    folder = home() / "launch"
+    make_folder(home())
+    make_folder(folder)
+    path = folder / f"{tree['name']}.yaml"
+    yaml.SafeDumper.add_representer(str, _as_block)
+    write_whole(path, yaml.safe_dump(dict(tree), sort_keys=False))
+    return path
+
+
+def _as_block(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    """Write texts of several lines as a person would."""
+    style = "|" if "\n" in text else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+def _held(
+    file: Path, name: str, asked: Mapping[str, Any], cloud: str, local: Sequence[Action]
+) -> list[Action]:
+    words = [sys.executable, "-m", "fogft.launch.hold", str(file), "--pool", name]
+    words += ["--cloud", cloud] if cloud else []
+    words += ["--timeout", str(asked["timeout"])] if asked["timeout"] else []
+    words += ["--down"] if asked["on_exit"] == "down" else []
+    process = ExecuteProcess(
+        cmd=words,
+        name=f"fog_{name}",
+        output="screen",
+        sigterm_timeout=str(_END_LIMIT_S),
+        sigkill_timeout=str(_END_LIMIT_S),
+    )
+    waiting = list(local)
+
+    def heard(event: Any) -> list[Action]:
+        if READY.encode() not in event.text or not waiting:
+            return []
+        begun, waiting[:] = list(waiting), []
+        return begun
+
+    def ended(event: Any, _context: LaunchContext) -> list[Action]:
+        if event.returncode == 0:
+            return []
+        return [EmitEvent(event=Shutdown(reason=f"the fog pool `{name}` did not come up"))]
+
+    return [
+        RegisterEventHandler(OnProcessIO(target_action=process, on_stdout=heard)),
+        RegisterEventHandler(OnProcessExit(target_action=process, on_exit=ended)),
+        process,
+    ]
+
+
+def _cloud(context: LaunchContext) -> str:
+    """Return what the launch argument `cloud` picks; empty for what the file says."""
+    value = str(context.launch_configurations.get("cloud", "")).lower()
+    return "" if value in ("", "true", "false") else value
+
+
+def _stays_here(context: LaunchContext) -> bool:
+    return str(context.launch_configurations.get("cloud", "")).lower() == "false"
+
+
+def _evaluated(context: LaunchContext, value: Any) -> Any:
+    """Return a value with its substitutions made; YAML text becomes what it says."""
+    if isinstance(value, (int, float, Mapping)):
+        return value
+    if isinstance(value, (list, tuple)) and any(isinstance(item, Mapping) for item in value):
+        return list(value)
+    text = perform_substitutions(context, normalize_to_list_of_substitutions(value))
+    if "\n" not in text and text[:1] not in ("{", "["):
+        return int(text) if text.isdigit() else text
+    try:
+        found = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+    return found if isinstance(found, (dict, list)) else text
+
+
+def _text(context: LaunchContext, value: Any) -> str:
+    return str(perform_substitutions(context, normalize_to_list_of_substitutions(value)))
+
+
+def _listed(word: Any) -> Any:
+    return normalize_to_list_of_substitutions(word)
+
+
+def _text_of(path: str) -> str:
+    try:
+        return Path(path).read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FogftError(f"`{path}` cannot be read: {error}") from error

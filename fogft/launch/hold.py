@@ -1,0 +1,93 @@
+"""``python -m fogft.launch.hold FILE``: what a launch file runs for a pool.
+
+Brings the pool up, says so in one line that the launch file waits for, then shows the logs
+of its replicas. On a signal it ends, and ends the pool where it is told to.
+
+Owns: that sequence. Not here: pools (all is done by the ``fogft`` command).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+from fogft.child import tied
+
+READY = "fogft: the services answer"
+
+
+class _Interrupted(Exception):
+    """A signal asked us to end."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Hold a pool until a signal comes; return the exit status."""
+    parser = argparse.ArgumentParser(prog="fogft.launch.hold")
+    parser.add_argument("file")
+    parser.add_argument("--pool", required=True)
+    parser.add_argument("--cloud")
+    parser.add_argument("--timeout")
+    parser.add_argument("--down", action="store_true", help="End the pool with us.")
+    asked = parser.parse_args(arguments)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
+    try:
+        return _hold(asked)
+    except _Interrupted:
+        status = 0
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)  # launch repeats itself; `down` takes its time
+        if asked.down:
+            ended = _fogft("down", asked.pool, "--yes").wait()
+    return ended if asked.down else status
+
+
+def _hold(asked: argparse.Namespace) -> int:
+    options = ["--yes"]
+    if asked.cloud:
+        options += ["--cloud", asked.cloud]
+    if asked.timeout:
+        options += ["--timeout", asked.timeout]
+    status = _wait(_fogft("up", asked.file, *options))
+    if status != 0:
+        return status
+    print(READY, flush=True)
+    return _wait(_fogft("logs", "--follow", "--lines", "0", "--pool", asked.pool))
+
+
+def _fogft(*words: str) -> subprocess.Popen[bytes]:
+    """Start a command in a session of its own: a terminal's Ctrl-C is ours to pass on."""
+    return subprocess.Popen(
+        tied([sys.executable, "-m", "fogft", *words]),
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+
+
+def _wait(child: subprocess.Popen[bytes]) -> int:
+    try:
+        return child.wait()
+    except _Interrupted:
+        child.send_signal(signal.SIGINT)
+        try:
+            child.wait(5)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+        raise
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
+    raise _Interrupted
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,136 @@
+"""Turn what a launch file says of nodes and their pool into a pool file. Pure.
+
+Owns: the `run` command of a replica, and how a base file and a launch file's words merge.
+Not here: substitutions and conditions (`actions`), what a pool file may say (`fogft.core`).
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from fogft.core.errors import FogftError
+
+FILE_LIMIT_BYTES = 256 << 10
+_END = "END_OF_PARAMETERS"
+
+_FIND = """\
+find_executable() {  # prints the path of an executable of a ROS package
+  local prefix
+  IFS=: read -ra prefixes <<<"${AMENT_PREFIX_PATH:-}"
+  for prefix in "${prefixes[@]}"; do
+    if [ -x "$prefix/lib/$1/$2" ]; then echo "$prefix/lib/$1/$2"; return; fi
+  done
+  echo "error: package \\`$1\\` has no executable \\`$2\\` here (AMENT_PREFIX_PATH is \\
+${AMENT_PREFIX_PATH:-empty}); build or install it in \\`setup\\`" >&2
+  return 127
+}
+"""
+
+
+@dataclass(frozen=True)
+class NodeWords:
+    """One node as its launch file asks for it, all substitutions made.
+
+    Attributes:
+        package: Its ROS package; empty when `executable` is a path or a program's name.
+        arguments: After the executable, ``--ros-args`` included.
+        environ: Set for this node besides what the replica has.
+        files: Contents of parameter files, by the argument that names each.
+    """
+
+    package: str
+    executable: str
+    arguments: Sequence[str] = ()
+    environ: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+
+
+def run_text(nodes: Sequence[NodeWords]) -> str:
+    """Return the shell text that runs these nodes on a replica, for bash.
+
+    One node replaces the shell. Of several, the end of one ends all, so that they are
+    started again together.
+
+    Raises:
+        FogftError: There is no node, or a parameter file is too large to be carried.
+    """
+    if not nodes:
+        raise FogftError("a fog pool holds no cloud node", "move a node into it as a cloud node")
+    lines: list[str] = []
+    if any(node.package for node in nodes):
+        lines.append(_FIND)
+    names: dict[str, str] = {}
+    for node in nodes:
+        for path, content in node.files.items():
+            if path not in names:
+                names[path] = f"parameters-{len(names)}.yaml"
+                lines.append(_file(names[path], path, content))
+    commands = []
+    for index, node in enumerate(nodes):
+        if node.package:
+            package, executable = shlex.quote(node.package), shlex.quote(node.executable)
+            lines.append(f"node_{index}=$(find_executable {package} {executable}) || exit")
+        commands.append(_command(node, index, names))
+    if len(commands) == 1:
+        return "\n".join([*lines, f"exec {commands[0]}"]) + "\n"
+    lines += [f"{command} &" for command in commands]
+    lines += ["wait -n", "status=$?", "kill $(jobs -p) 2>/dev/null", "wait", "exit $status"]
+    return "\n".join(lines) + "\n"
+
+
+def _command(node: NodeWords, index: int, names: Mapping[str, str]) -> str:
+    words = [names.get(word, word) for word in node.arguments]
+    first = f'"$node_{index}"' if node.package else shlex.quote(node.executable)
+    environ = [shlex.quote(f"{key}={value}") for key, value in node.environ.items()]
+    return " ".join([*(["env", *environ] if environ else []), first, *map(shlex.quote, words)])
+
+
+def _file(name: str, path: str, content: str) -> str:
+    if len(content.encode()) > FILE_LIMIT_BYTES:
+        raise FogftError(
+            f"the parameter file `{path}` is too large to travel with a launch file",
+            "put it in the pool file's `workdir` or `file_mounts` and name it there",
+        )
+    end = _END
+    while end in content:
+        end += "_"
+    newline = "" if content.endswith("\n") or not content else "\n"
+    return f"cat >{name} <<'{end}'\n{content}{newline}{end}"
+
+
+def pool_tree(
+    base: Mapping[str, Any],
+    *,
+    name: str,
+    run: str,
+    task: Mapping[str, Any],
+    fogft: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return a pool file's tree: a base file with what the launch file says laid over it.
+
+    Args:
+        base: The tree of a pool file that supplies the rest; empty for none.
+        name: The pool's name; empty for the base's.
+        run: What a replica runs.
+        task: SkyPilot's keys that the launch file sets.
+        fogft: Keys of the `fogft` section that the launch file sets.
+
+    Raises:
+        FogftError: The base runs something itself, or there is no name.
+    """
+    if base.get("run"):
+        raise FogftError(
+            "the pool file of a fog pool has a `run` of its own",
+            "remove it: what runs is what the launch file's cloud nodes say",
+        )
+    tree = {**base, **task, "run": run}
+    ours = base.get("fogft")
+    tree["fogft"] = {**(ours if isinstance(ours, Mapping) else {}), **fogft}
+    if name:
+        tree["name"] = name
+    if not tree.get("name"):
+        raise FogftError("a fog pool has no name", "give it one, such as `name: perception`")
+    return tree

@@ -1,0 +1,100 @@
+"""What a launch file runs for a pool: up, one line, the logs, and down on a signal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fogft.launch.hold import READY
+
+# Stands in for `python -m fogft`: notes its words, and behaves as FAKE_UP says.
+FAKE = """
+import os, signal, sys, time
+with open(os.environ["TRACE"], "a") as trace:
+    trace.write(" ".join(sys.argv[1:]) + "\\n")
+if sys.argv[1] == "up":
+    if os.environ["FAKE_UP"] == "slow":
+        time.sleep(60)
+    sys.exit(int(os.environ["FAKE_UP"]))
+if sys.argv[1] == "logs":
+    print("0.1 a line", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def hold(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    package = tmp_path / "site" / "fogft"
+    package.mkdir(parents=True)
+    root = Path(__file__).parents[2] / "fogft"
+    for name in ("launch", "child.py", "__init__.py"):
+        (package / name).symlink_to(root / name)
+    (package / "__main__.py").write_text(FAKE)
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*options: str, up: str = "0") -> subprocess.Popen[str]:
+        environ = {
+            **os.environ, "PYTHONPATH": str(tmp_path / "site"), "FAKE_UP": up,
+            "TRACE": str(tmp_path / "trace"),
+        }  # fmt: skip
+        words = [sys.executable, "-m", "fogft.launch.hold", "f.yaml", "--pool", "p", *options]
+        child = subprocess.Popen(
+            words, env=environ, cwd=tmp_path, stdout=subprocess.PIPE, text=True
+        )
+        started.append(child)
+        return child
+
+    yield start
+    for child in started:
+        child.kill()
+        child.wait()
+
+
+def trace(folder: Path) -> list[str]:
+    return (folder / "trace").read_text().splitlines()
+
+
+def test_up_then_one_line_then_the_logs(hold, tmp_path: Path) -> None:
+    child = hold("--cloud", "local", "--timeout", "9")
+    assert child.stdout.readline() == f"{READY}\n"
+    assert child.stdout.readline() == "0.1 a line\n"
+    child.send_signal(signal.SIGINT)
+    assert child.wait(20) == 0
+    assert trace(tmp_path) == [
+        "up f.yaml --yes --cloud local --timeout 9",
+        "logs --follow --lines 0 --pool p",
+    ]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_pool_ends_with_it_when_asked_to(hold, tmp_path: Path, number: int) -> None:
+    child = hold("--down")
+    assert child.stdout.readline() == f"{READY}\n"
+    child.stdout.readline()
+    child.send_signal(number)
+    child.send_signal(number)  # launch and the terminal both send one
+    assert child.wait(20) == 0
+    assert trace(tmp_path)[-1] == "down p --yes"
+    assert len(trace(tmp_path)) == 3
+
+
+def test_a_pool_that_does_not_come_up_is_told_by_the_status(hold, tmp_path: Path) -> None:
+    child = hold(up="3")
+    assert child.wait(20) == 3
+    assert READY not in child.stdout.read()
+    assert trace(tmp_path) == ["up f.yaml --yes"]
+
+
+def test_an_interrupt_during_up_still_ends_the_pool(hold, tmp_path: Path) -> None:
+    child = hold("--down", up="slow")
+    while not (tmp_path / "trace").exists():
+        assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    assert child.wait(20) == 0
+    assert trace(tmp_path)[-1] == "down p --yes"
