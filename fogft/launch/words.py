@@ -29,6 +29,20 @@ ${AMENT_PREFIX_PATH:-empty}); build or install it in \\`setup\\`" >&2
 }
 """
 
+# Not `wait -n`: bash forgets a child that ended before it was called.
+_WATCH = """\
+while :; do
+  for node in "${nodes[@]}"; do
+    if ! kill -0 "$node" 2>/dev/null; then
+      wait "$node"; status=$?
+      kill "${nodes[@]}" 2>/dev/null
+      wait
+      exit $status
+    fi
+  done
+  sleep 0.5
+done"""
+
 
 @dataclass(frozen=True)
 class NodeWords:
@@ -76,8 +90,8 @@ def run_text(nodes: Sequence[NodeWords]) -> str:
         commands.append(_command(node, index, names))
     if len(commands) == 1:
         return "\n".join([*lines, f"exec {commands[0]}"]) + "\n"
-    lines += [f"{command} &" for command in commands]
-    lines += ["wait -n", "status=$?", "kill $(jobs -p) 2>/dev/null", "wait", "exit $status"]
+    lines += [f"{command} & nodes[{index}]=$!" for index, command in enumerate(commands)]
+    lines.append(_WATCH)
     return "\n".join(lines) + "\n"
 
 

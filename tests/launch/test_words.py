@@ -84,8 +84,9 @@ def test_a_file_too_large_is_refused() -> None:
 
 
 def test_of_several_nodes_the_end_of_one_ends_all(tmp_path: Path) -> None:
-    script = "#!/bin/bash\ntrap 'echo ended >>trace; exit' TERM\n[ $1 = long ] || exit 7\n"
-    script += "while :; do sleep 0.05; done\n"
+    script = "#!/bin/bash\ntrap 'echo ended >>trace; exit' TERM\n"
+    script += "if [ $1 = long ]; then touch begun; while :; do sleep 0.05; done; fi\n"
+    script += "until [ -e begun ]; do sleep 0.05; done; exit 7\n"
     environ = prefix_with(tmp_path, script)
     nodes = [NodeWords("tools", "show", ("long",)), NodeWords("tools", "show", ("short",))]
     assert bash(run_text(nodes), tmp_path, environ).returncode == 7
