@@ -184,6 +184,9 @@ class Proof:
             (carried,) = (home / ".fogft/wheel").glob("fogft-*.whl")
             (made,) = (HOME / "sky/wheels").glob("*/fogft-*.whl")
             assert carried.read_bytes() == made.read_bytes()
+            # To the world: ssh, which is SkyPilot's, and the link.
+            cluster = f"fogft-{status['uid']}-{name.replace('.', '-')}"
+            assert open_ports(instance["region"], cluster) == {22, 7447}
 
     def preempted_without_notice_and_a_region_is_full(self) -> None:
         lost = next(n for n, r in self.pool.replicas().items() if region_of(r) == "us-east-1")
@@ -252,6 +255,21 @@ class Proof:
         subprocess.run(["sky", "api", "stop"], env=self.pool.environ, check=True, text=True,
                        capture_output=True)  # fmt: skip
         until("nothing of it runs here", lambda: not processes(), 60)
+
+
+def open_ports(region: str, cluster: str) -> set[int]:
+    """Return the ports of a cluster's machines that are open to the world."""
+    import boto3
+
+    named = [{"Name": "group-name", "Values": [f"sky-sg-{cluster}"]}]
+    found = boto3.client("ec2", region_name=region).describe_security_groups(Filters=named)
+    (group,) = found["SecurityGroups"]
+    return {
+        port
+        for rule in group["IpPermissions"]
+        for port in range(rule.get("FromPort", 0), rule.get("ToPort", 65535) + 1)
+        if rule["IpRanges"] or rule["Ipv6Ranges"]
+    }
 
 
 def clusters() -> set[str]:
