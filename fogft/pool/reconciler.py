@@ -141,7 +141,7 @@ class Reconciler:
             self._remember.losses(observed)
             self._ask_about_silent(observed, history)
             health = judge(identity.uid, spec, observed, history)
-            self._remember.health(health, history)
+            self._remember.health(health, history, observed.now)
         hours = (spec, intent, identity.created_at, observed.now)
         trouble += lifetime.notes(*hours)
         over = lifetime.is_over(*hours)

@@ -29,16 +29,29 @@ class Remembering:
         self._store = store
         self._clock = clock
 
-    def add(self, kind: EventKind, id: ReplicaId, *, location: str = "", detail: str = "") -> None:
-        """Add one event.
+    def add(
+        self,
+        kind: EventKind,
+        id: ReplicaId,
+        *,
+        location: str = "",
+        detail: str = "",
+        at: float | None = None,
+    ) -> None:
+        """Add one event, of now unless told.
 
         Raises:
             StateError: It cannot be written; it did not happen.
         """
-        self._store.append(Event(self._clock(), kind, id.slot, id.generation, location, detail))
+        when = self._clock() if at is None else at
+        self._store.append(Event(when, kind, id.slot, id.generation, location, detail))
 
     def losses(self, observed: Observed) -> None:
-        """Note who is no longer listed. The cloud's list must be known."""
+        """Note who is no longer listed. The cloud's list must be known.
+
+        It went when it was observed, not a moment later: the plan of the same observation must
+        not take the loss for something of the future, and go to the same place again.
+        """
         uid = self._store.identity().uid
         listed = {m.id for m in observed.machines or ()}
         for record in self._store.history().open():
@@ -46,25 +59,25 @@ class Remembering:
             if id not in listed:
                 kind = EventKind.ENDED if record.ending else EventKind.GONE
                 log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
-                self.add(kind, id)
+                self.add(kind, id, at=observed.now)
 
-    def health(self, health: Health, history: History) -> None:
-        """Note who became ready, stopped to be, or failed."""
+    def health(self, health: Health, history: History, now: float) -> None:
+        """Note who became ready, stopped to be, or failed, as observed at `now`."""
         for judged in health.replicas:
             id, machine = judged.id, judged.machine
             record = history.record(id.slot, id.generation)
             if record is None or record.closed is not None:  # the cloud's list is the record
-                self.add(EventKind.LAUNCH, id, location=machine.placement.location)
+                self.add(EventKind.LAUNCH, id, location=machine.placement.location, at=now)
                 record = history.record(id.slot, id.generation)
             if record is None:
                 continue
             up = judged.link is not None and judged.link.state is LinkState.UP
             if judged.serving and (record.first_ready_at is None or record.unready_since):
                 log.info("replica_ready replica=%s zone=%s", id.short, record.location)
-                self.add(EventKind.READY, id)
+                self.add(EventKind.READY, id, at=now)
             elif up and not judged.serving and record.first_ready_at and not record.unready_since:
                 log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
-                self.add(EventKind.UNREADY, id)
+                self.add(EventKind.UNREADY, id, at=now)
             if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
                 log.warning("replica_failed replica=%s reason=%r", id.short, judged.why)
-                self.add(EventKind.FAILED, id, detail=judged.why)
+                self.add(EventKind.FAILED, id, detail=judged.why, at=now)
