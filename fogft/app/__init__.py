@@ -33,6 +33,7 @@ from fogft.app.parts import (
     run_rendezvous,
     run_server,
 )
+from fogft.app.planning import plan
 from fogft.app.sweeping import clouds_to_sweep, end_unowned, sweep
 from fogft.app.wishes import drain, exclude, include, scale
 
@@ -62,6 +63,7 @@ __all__ = [
     "make_store",
     "manager_alive",
     "order",
+    "plan",
     "pool_name",
     "pools",
     "refresh",

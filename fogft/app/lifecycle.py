@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft import disk
 from fogft.app.clouds import LOCAL, cloud_names, cloud_of, make_cloud, make_store
+from fogft.app.planning import far
 from fogft.pool.paths import home
 
 if TYPE_CHECKING:
+    from fogft.core.model import Offer
+    from fogft.core.spec import PoolSpec
     from fogft.pool.preview import Order
 
 
@@ -46,8 +49,20 @@ def order(
     store = make_store(spec.name)
     if isinstance(concrete, Accounts):
         told("asking SkyPilot which clouds can be used, and for their prices")
+
+    def distances(spec: PoolSpec, sold: Sequence[Offer]) -> Mapping[str, float]:
+        known, _ = far(spec, sold, told=told)
+        return {region: distance.rtt_s for region, distance in known.items()}
+
     return preview.order(
-        store, concrete, spec, cloud_name=chosen, source=source, file=file, now=time.time()
+        store,
+        concrete,
+        spec,
+        cloud_name=chosen,
+        source=source,
+        file=file,
+        now=time.time(),
+        far=distances,
     )
 
 

@@ -22,6 +22,7 @@ import typer
 
 from fogft import __version__
 from fogft.cli import change, chaos, credentials, doctor, lifecycle, output, parts, sweep, watch
+from fogft.cli import plan as planning
 from fogft.cli.sections import Commands
 from fogft.core.errors import FogftError
 
@@ -45,6 +46,7 @@ app = typer.Typer(
 )
 lifecycle.register(app)
 sweep.register(app)
+planning.register(app)
 watch.register(app)
 doctor.register(app)
 change.register(app)

@@ -8,7 +8,7 @@ from typer.core import TyperCommand, TyperGroup
 
 SECTIONS = {
     "Begin and end": ("init", "up", "join", "down", "sweep"),
-    "Look": ("status", "logs", "doctor"),
+    "Look": ("plan", "status", "logs", "doctor"),
     "Change what runs": ("scale", "drain", "exclude", "include", "credentials"),
     "Try what happens when": ("chaos",),
     "Run one part by hand": ("proxy", "serve", "manager", "rendezvous"),

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import NamedTuple
 
 from fogft.core.model import Offer, Placement
@@ -25,6 +26,7 @@ from fogft.core.score import Scale
 EPSILON_USD = 1e-9
 
 Rank = tuple[bool, int, int, int]
+_WITHOUT_OFFER = itemgetter(slice(0, 7))
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,10 @@ class Market:
         self._resting = resting or {}
         self._avoid = frozenset(avoid)
         possible = [o for o in offers if is_possible(o)]
-        allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
-        rows = sorted((self._row(offer) for offer in allowed), key=lambda row: row[:-1])
+        allowed = possible
+        if excluded:
+            allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
+        rows = sorted(_rows(allowed, self.scale), key=_WITHOUT_OFFER)
         self.rows = [row for row in rows if row.location not in self._resting]
         self._clouds = {row.cloud for row in self.rows}
         self._nothing = ""
@@ -157,15 +161,22 @@ class Market:
             )
         return Choice(best.offer, rank=best_rank)
 
-    def _row(self, offer: Offer) -> Row:
+
+def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:
+    """Yield the rows of offers. There may be thousands: what is equal is worked out once."""
+    regions: dict[tuple[str, str], tuple[str, float]] = {}
+    for offer in offers:
         place = offer.placement
-        cloud, region, location = domains(place)
-        return Row(
-            self.scale.score(offer),
+        key = (place.cloud, place.region)
+        if key not in regions:
+            regions[key] = domains(place)[1], scale.of_distance(scale.latency(place))
+        region, far = regions[key]
+        yield Row(
+            scale.of_price(offer.usd_per_hour) + far,
             offer.usd_per_hour,
-            cloud,
+            place.cloud,
             region,
-            location,
+            f"{region}/{place.zone}",
             place.instance,
             place.spot,
             offer,

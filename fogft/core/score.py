@@ -59,10 +59,16 @@ class Scale:
 
     def score_of(self, usd_per_hour: float, rtt_s: float | None) -> float:
         """Return the score of a price and a round trip (None: not known)."""
+        return self.of_price(usd_per_hour) + self.of_distance(rtt_s)
+
+    def of_price(self, usd_per_hour: float) -> float:
+        """Return a price's part of the score."""
+        return self.weights.price * math.log(max(usd_per_hour, PRICE_FLOOR_USD))
+
+    def of_distance(self, rtt_s: float | None) -> float:
+        """Return a round trip's part of the score."""
         known = UNKNOWN_RTT_S if rtt_s is None else rtt_s
-        return self.weights.price * math.log(
-            max(usd_per_hour, PRICE_FLOOR_USD)
-        ) + self.weights.latency * math.log(max(known, LATENCY_FLOOR_S))
+        return self.weights.latency * math.log(max(known, LATENCY_FLOOR_S))
 
 
 def gain(before: float, after: float) -> float:

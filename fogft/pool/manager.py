@@ -26,8 +26,10 @@ from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
 from fogft.pool import configuration, farewell, proxy_report, shutdown, status
+from fogft.pool.latency import Distances, Latencies
 from fogft.pool.lease import Lease
 from fogft.pool.ledger import Ledger
+from fogft.pool.paths import latency_file
 from fogft.pool.proxy_supervisor import ProxySupervisor
 from fogft.pool.reconciler import Reconciler, Tick
 from fogft.pool.store import Identity, PoolStore
@@ -38,6 +40,11 @@ TICK_S = 1.0
 WATCH_S = 0.05
 CERTIFY_EVERY_S = 3600.0
 LEAVE_LIMIT_S = 60.0  # then it is tried again in the next round
+
+
+def on_thread(run: Callable[[], object]) -> None:
+    """Run a function on a thread that does not keep the process alive."""
+    threading.Thread(target=run, daemon=True).start()
 
 
 class Manager:
@@ -77,10 +84,11 @@ class Manager:
             clock=time.time,
             links=self._links,
             build_order=lambda *order: configuration.build_order(self._paths, *order),
-            submit=lambda run: threading.Thread(target=run, daemon=True).start(),
+            submit=on_thread,
             epoch=self._lease.epoch,
             revoked=self._ledger.revoked,
             on_done=self._wake.set,
+            distances=Distances(Latencies(latency_file()), on_thread),
         )
 
     def run(self, stop: threading.Event) -> None:

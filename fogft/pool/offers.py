@@ -6,16 +6,24 @@ Not here: what a cloud sells (`fogft.cloud`) and which is chosen (`fogft.core.pl
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, Protocol
 
-from fogft.cloud.port import Cloud
 from fogft.core.errors import SpecError
 from fogft.core.groups import sales
 from fogft.core.model import Offer
 from fogft.core.spec import PoolSpec
 
 
-def ask(cloud: Cloud, spec: PoolSpec) -> tuple[Offer, ...]:
+class Seller(Protocol):
+    """What has prices: a cloud, or a table of them."""
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """See `fogft.cloud.port.Cloud`."""
+
+
+def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
     """Return all offers for a pool, each with the name of the group that it is for.
 
     Raises:

@@ -20,6 +20,11 @@ def home(environ: Mapping[str, str] = os.environ) -> Path:
     return (Path(state) if state else Path.home() / ".local" / "state") / "fogft"
 
 
+def latency_file() -> Path:
+    """Return the file that keeps this machine's distances to regions."""
+    return home() / "latency.json"
+
+
 @dataclass(frozen=True)
 class PoolPaths:
     """The files of one pool; each has one writer.

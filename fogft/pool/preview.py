@@ -6,7 +6,7 @@ Not here: doing it (`startup`) and saying it (`fogft.cli`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from fogft.pool import offers
 from fogft.pool.named_clouds import clouds_named, located
 from fogft.pool.store import PoolStore
 
+Far = Callable[[PoolSpec, Sequence[Offer]], Mapping[str, float]]
 # What an age is told in: the unit, its length, and from which age on.
 _UNITS = (("days", 86400.0, 2 * 86400.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
 
@@ -92,7 +93,7 @@ def order(
     source: str,
     file: Path,
     now: float = 0.0,
-    rtt_s: Mapping[str, float] | None = None,
+    far: Far = lambda spec, sold: spec.placement.rtt_s,
 ) -> Order:
     """Return what applying a pool file would do. Changes nothing.
 
@@ -104,7 +105,7 @@ def order(
         source: The file's text.
         file: Where it is.
         now: Seconds since the epoch.
-        rtt_s: ``cloud/region`` -> round trip in seconds, where it is known.
+        far: Says how far the regions of offers are: ``cloud/region`` -> seconds.
 
     Raises:
         SpecError: The cloud can never meet the file's resources.
@@ -131,7 +132,7 @@ def order(
         raise located(error, source, file) from None
     except CloudError as error:
         notes.append(f"prices cannot be had now: {error.message}")
-    observed = Observed(now, (), None, sold, rtt_s=rtt_s or {})
+    observed = Observed(now, (), None, sold, rtt_s=far(spec, sold))
     planned = plan("0" * 16, spec, Intent(), observed, History())
     preview = Preview(
         spec,

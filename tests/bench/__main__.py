@@ -23,9 +23,12 @@ Rows = list[dict[str, Any]]
 
 def measurements() -> dict[str, Callable[..., Rows]]:
     """Return what can be measured, by name, in the order of running."""
-    from tests.bench import commands, faults, speed, tail
+    from tests.bench import commands, faults, planning, speed, tail
 
-    found: dict[str, Callable[..., Rows]] = {"commands": commands.commands}
+    found: dict[str, Callable[..., Rows]] = {
+        "commands": commands.commands,
+        "planning": planning.planning,
+    }
     for replicas in (1, 2, 3):
         found[f"overhead-{replicas}"] = functools.partial(speed.overhead, replicas=replicas)
     found["throughput"] = speed.throughput

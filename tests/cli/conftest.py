@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from fogft.pool import latency
+
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -14,6 +16,11 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir(mode=0o700)
     monkeypatch.setenv("FOGFT_HOME", str(folder))
     monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setattr(latency, "connect_time", _unreachable)  # no test asks the Internet
     for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE"):
         monkeypatch.delenv(name, raising=False)
     return folder
+
+
+def _unreachable(host: str, port: int) -> float:
+    raise OSError(f"{host} is not asked by tests")

@@ -64,6 +64,7 @@ def answer(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
 def test_a_file_that_names_clouds_is_for_sky_and_its_prices_are_told(scene, file, started, capsys):
     assert main.run(["up", str(file), "--yes"]) == 0
     said = capsys.readouterr().err.splitlines()
+    assert said.pop(1) == "measuring the way to 2 regions"
     assert said[:3] == [
         "asking SkyPilot which clouds can be used, and for their prices",
         "`aws` can be used",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from hypothesis import strategies as st
@@ -57,6 +57,7 @@ class World:
     offers: tuple[Offer, ...] = OFFERS
     ending: frozenset[ReplicaId] = frozenset()
     now: float = NOW
+    rtt_s: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def history(self) -> History:
@@ -64,7 +65,7 @@ class World:
 
     @property
     def observed(self) -> Observed:
-        return Observed(self.now, self.machines, self.links, self.offers, self.ending)
+        return Observed(self.now, self.machines, self.links, self.offers, self.ending, self.rtt_s)
 
     def plan(self) -> Plan:
         return plan(UID, self.spec, self.intent, self.observed, self.history)

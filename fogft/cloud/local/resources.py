@@ -44,8 +44,8 @@ def offers(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
         SpecError: They can never be met here; the message names the key.
     """
     best: dict[Placement, Offer] = {}
-    for where, entry in _alternatives(resources):
-        spot = _use_spot(where, entry)
+    for where, entry in alternatives(resources):
+        spot = use_spot(where, entry)
         instance = _instance(catalogue, where, entry, spot)
         for zone in _zones(catalogue, where, entry):
             price = instance.spot_usd_per_hour if spot else instance.usd_per_hour
@@ -54,7 +54,7 @@ def offers(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
     return sorted(best.values(), key=lambda offer: (offer.usd_per_hour, offer.placement))
 
 
-def _alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield each alternative, complete, with the path of its keys."""
     base = {key: value for key, value in resources.items() if key not in ("any_of", "ordered")}
     _check_keys("resources", base, ("any_of", "ordered"))
@@ -121,7 +121,8 @@ def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Z
     return found
 
 
-def _use_spot(where: str, entry: Mapping[str, Any]) -> bool:
+def use_spot(where: str, entry: Mapping[str, Any]) -> bool:
+    """Return whether an alternative asks for spot. Raises `SpecError` for what is neither."""
     spot = entry.get("use_spot")
     if spot is not None and not isinstance(spot, bool):
         what = f"{where}.use_spot: must be true or false, not {shown(spot)}"
@@ -141,7 +142,7 @@ def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: 
     for key in ("accelerators", "cpus", "memory"):
         if entry.get(key) is None:
             continue
-        kept = [i for i in fitting if _suffices(where, key, entry[key], i)]
+        kept = [i for i in fitting if suffices(where, key, entry[key], i)]
         if not kept:
             have = ", ".join(f"`{_amount_of(i, key)}`" for i in fitting)
             raise SpecError(
@@ -152,7 +153,8 @@ def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: 
     return min(fitting, key=lambda i: (i.spot_usd_per_hour if spot else i.usd_per_hour, i.name))
 
 
-def _suffices(where: str, key: str, wanted: Any, instance: Instance) -> bool:
+def suffices(where: str, key: str, wanted: Any, instance: Instance) -> bool:
+    """Return whether a machine has what a key asks for. Raises `SpecError` for no amount."""
     if key == "accelerators":
         return any(
             instance.accelerators.get(name, 0) >= count for name, count in _devices(where, wanted)

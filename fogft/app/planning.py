@@ -1,0 +1,133 @@
+"""What a pool file would cost and give, explained. Nothing is launched."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fogft.app.clouds import LOCAL, cloud_names, make_cloud, make_store
+from fogft.core.errors import CloudError, PoolNotFound, SpecError
+from fogft.pool.paths import latency_file
+
+if TYPE_CHECKING:
+    from fogft.core.explain import Explanation
+    from fogft.core.model import Offer
+    from fogft.core.spec import PoolSpec
+    from fogft.pool.latency import Distance
+    from fogft.pool.offers import Seller
+
+
+@dataclass(frozen=True)
+class PlanShown:
+    """A plan with what it rests on.
+
+    Attributes:
+        now: Seconds since the epoch.
+        cloud: The adapter or the table that the prices are from.
+        distances: ``cloud/region`` -> how far it is, and how that is known.
+        notes: What may surprise, besides the plan's own notes.
+    """
+
+    spec: PoolSpec
+    now: float
+    cloud: str
+    explanation: Explanation
+    distances: Mapping[str, Distance]
+    notes: tuple[str, ...]
+
+
+def plan(
+    file: Path,
+    cloud: str | None = None,
+    *,
+    prices: Path | None = None,
+    offline: bool = False,
+    told: Callable[[str], None] = lambda _: None,
+) -> PlanShown:
+    """Return the plan of a pool file, from nothing. Touches no cloud but for prices and distances.
+
+    Args:
+        file: The pool file.
+        cloud: Whose prices; None for what its resources name, else `local`.
+        prices: A price table instead of a cloud.
+        offline: Measure no distances; what is kept or estimated counts.
+        told: Called with what takes long, before it is done.
+
+    Raises:
+        SpecError: The first mistake in the file or in the table.
+        CloudError: Prices cannot be had.
+    """
+    from fogft.cloud.table import PriceTable
+    from fogft.core.explain import explain
+    from fogft.core.history import History
+    from fogft.core.intent import Intent
+    from fogft.core.model import Observed
+    from fogft.pool import named_clouds, offers, pool_file
+
+    source = pool_file.text(file)
+    spec = pool_file.parse(source, file=str(file), folder=file.parent)
+    seller: Seller
+    if prices is not None:
+        name, seller = str(prices), PriceTable(prices)
+    else:
+        name = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL
+        seller = make_cloud(name, file.resolve().parent)
+        if name != LOCAL:
+            told("asking for prices")
+    try:
+        sold = offers.ask(seller, spec)
+        on_demand = _on_demand(seller, spec)
+    except SpecError as error:
+        raise named_clouds.located(error, source, file) from None
+    if not sold:
+        raise CloudError("nothing is offered for these resources now", "ask for less, or elsewhere")
+    distances, notes = far(spec, sold, offline=offline, told=told)
+    try:
+        store = make_store(spec.name)
+        intent, history = store.intent(), History(store.recent(1 << 30))
+    except PoolNotFound:
+        intent, history = Intent(), History()
+    now = time.time()
+    observed = Observed(now, (), None, sold, rtt_s={r: d.rtt_s for r, d in distances.items()})
+    explained = explain(spec, intent, observed, history, on_demand)
+    return PlanShown(spec, now, name, explained, distances, tuple(notes))
+
+
+def far(
+    spec: PoolSpec,
+    sold: Sequence[Offer],
+    *,
+    offline: bool = False,
+    told: Callable[[str], None] = lambda _: None,
+) -> tuple[Mapping[str, Distance], list[str]]:
+    """Return how far the regions of offers are, and what could not be measured.
+
+    Args:
+        spec: The pool file, whose word goes first.
+        sold: The offers.
+        offline: Measure nothing.
+        told: Called before anything is measured.
+    """
+    from fogft.pool.latency import Latencies, regions_of
+
+    regions, latencies, notes = regions_of(sold), Latencies(latency_file()), []
+    if not offline and (stale := latencies.stale(regions)):
+        told(f"measuring the way to {len(stale)} regions")
+        failed = latencies.measure(stale)
+        if failed:
+            region, why = next(iter(failed.items()))
+            notes.append(f"{len(failed)} regions cannot be measured, such as `{region}`: {why}")
+    return latencies.known(regions, spec.placement, {}), notes
+
+
+def _on_demand(seller: Seller, spec: PoolSpec) -> Sequence[Offer]:
+    """Return what one on-demand machine of the pool's largest kind costs; none if not sold."""
+    from fogft.core.groups import groups_of, with_spot
+
+    try:
+        return seller.offers(with_spot(groups_of(spec)[-1].resources, False))
+    except (SpecError, CloudError):
+        return ()

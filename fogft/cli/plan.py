@@ -1,0 +1,78 @@
+"""``fogft plan``: what a pool file would launch, where, why there, and at what price."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fogft.cli import output
+from fogft.cli.lifecycle import DEFAULT_FILE
+from fogft.cli.sections import Command
+
+
+def register(app: typer.Typer) -> None:
+    """Add this command to the application."""
+    app.command("plan", cls=Command)(plan)
+
+
+def plan(  # noqa: PLR0917 - Typer reads the command line from them
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The pool file.")] = DEFAULT_FILE,
+    cloud: Annotated[
+        str | None,
+        typer.Option(
+            "--cloud",
+            metavar="NAME",
+            show_default=False,
+            help="Whose prices; what the file's resources name, else `local`.",
+        ),
+    ] = None,
+    prices: Annotated[
+        Path | None,
+        typer.Option(
+            "--prices",
+            metavar="CSV",
+            show_default=False,
+            help="A table of prices in SkyPilot's columns, in place of a cloud.",
+        ),
+    ] = None,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Measure no distances; use what is known.")
+    ] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Show every offer, not the best of each region.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            "--plot",
+            metavar="SVG",
+            show_default=False,
+            help="Draw price against distance into a file.",
+        ),
+    ] = None,
+) -> None:
+    """Show what a pool file would launch, why there, and what it costs. Launches nothing.
+
+    \b
+    Example:
+      fogft plan pool.yaml
+    """
+    import sys
+
+    from fogft import app
+    from fogft.cli import plan_plot, plan_text
+
+    shown = app.plan(file, cloud, prices=prices, offline=offline, told=output.say)
+    if json:
+        output.json_data(plan_text.to_json(shown))
+    else:
+        colour = output.coloured(sys.stdout)
+        output.data("\n".join(plan_text.lines(shown, everything=everything, colour=colour)))
+    for note in (*shown.notes, *shown.explanation.notes):
+        output.warn(note)
+    if plot is not None:
+        plan_plot.write(plot, shown)
+        output.done(f"drawn into {plot}")

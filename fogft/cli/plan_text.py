@@ -1,0 +1,205 @@
+"""How a plan looks: a table of offers, then what the pool costs and gives; or JSON.
+
+Owns: words and columns.
+Not here: the reasons (`fogft.core.explain`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from fogft.cli.table import Cell, columns
+
+if TYPE_CHECKING:
+    from fogft.app.planning import PlanShown
+    from fogft.core.cost import Cost
+    from fogft.core.explain import Considered
+    from fogft.core.model import Offer
+
+_HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST", "WHY NOT")
+
+
+def lines(shown: PlanShown, *, everything: bool = False, colour: bool = False) -> list[str]:
+    """Return the plan as lines of text."""
+    found = sorted(shown.explanation.considered, key=_order)
+    listed = found if everything else _best_of_regions(found)
+    out = columns(
+        _HEADER, [_row(shown, one) for one in listed], right=("$/H", "RTT", "LOST"), colour=colour
+    )
+    if len(listed) < len(found):
+        out.append(f"and {len(found) - len(listed)} more offers in these regions (--all)")
+    return [*out, "", *_summary(shown)]
+
+
+def to_json(shown: PlanShown) -> dict[str, Any]:
+    """Return the plan as a JSON value. Money in US dollars, times in seconds."""
+    plan = shown.explanation
+    return {
+        "pool": shown.spec.name,
+        "prices_from": shown.cloud,
+        "wanted": plan.wanted,
+        "max_usd_per_hour": plan.cap,
+        "offers": [_offer_json(shown, one) for one in plan.considered],
+        "replicas": [
+            {
+                "slot": replica.slot,
+                "group": replica.group,
+                "location": replica.offer.placement.location,
+                "instance": replica.offer.placement.instance,
+                "spot": replica.offer.placement.spot,
+                "usd_per_hour": replica.offer.usd_per_hour,
+                "rtt_s": replica.rtt_s,
+                "services": list(replica.services),
+            }
+            for replica in plan.replicas
+        ],
+        "cost": _cost_json(plan.cost),
+        "one_on_demand": None
+        if plan.single is None
+        else {
+            "location": plan.single[0].placement.location,
+            "instance": plan.single[0].placement.instance,
+            **_cost_json(plan.single[1]),
+        },
+        "availability": {
+            "target": plan.target,
+            "expected": plan.least_expected.correlated,
+            "if_independent": plan.least_expected.independent,
+            "services": {name: vars(one) for name, one in plan.expected.items()},
+            "assumed": {
+                "spot_uptime_s": plan.assumed.spot_uptime_s,
+                "on_demand_uptime_s": plan.assumed.on_demand_uptime_s,
+                "recovery_s": plan.assumed.recovery_s,
+                "correlation": vars(plan.assumed.correlation),
+            },
+        },
+        "first_response": {"round_trips_s": plan.round_trips_s},
+        "notes": [*shown.notes, *plan.notes],
+    }
+
+
+def _order(one: Considered) -> tuple[bool, tuple[int, ...], float, str]:
+    return (
+        not one.slots, one.slots, one.offer.usd_per_hour, one.offer.placement.location
+    )  # fmt: skip
+
+
+def _best_of_regions(found: Iterable[Considered]) -> list[Considered]:
+    """Return the chosen ones, and of each region and kind that got none the cheapest."""
+    out, seen = [], set()
+    for one in found:
+        place = one.offer.placement
+        key = (one.offer.group, place.cloud, place.region, place.spot)
+        if one.slots or key not in seen:
+            out.append(one)
+        seen.add(key)
+    return out
+
+
+def _row(shown: PlanShown, one: Considered) -> list[Cell]:
+    place = one.offer.placement
+    return [
+        Cell(",".join(map(str, one.slots)) or "-", "good" if one.slots else "dim"),
+        Cell(place.location.rstrip("/")),
+        Cell(place.instance),
+        Cell("spot" if place.spot else "on demand"),
+        Cell(f"{one.offer.usd_per_hour:.3f}"),
+        Cell(_price(one.offer, shown.now)),
+        Cell("?" if one.rtt_s is None else f"{one.rtt_s * 1000:.0f} ms"),
+        Cell(str(one.losses)),
+        Cell(one.why_not, "dim"),
+    ]
+
+
+def _price(offer: Offer, now: float) -> str:
+    from fogft.pool.preview import price_told
+
+    return price_told(offer, now) or "made up"
+
+
+def _summary(shown: PlanShown) -> list[str]:
+    plan = shown.explanation
+    count = len(plan.replicas)
+    out = [f"replicas      {count} of {plan.wanted} wanted"]
+    names = {service.name for service in shown.spec.services}
+    for replica in plan.replicas:
+        if set(replica.services) != names or replica.group:
+            group = f" ({replica.group})" if replica.group else ""
+            out.append(f"  slot {replica.slot}{group} carries {', '.join(replica.services)}")
+    cap = "" if plan.cap is None else f"; the cap is ${plan.cap:.2f}/h"
+    out.append(f"cost          {_money(plan.cost)}{cap}")
+    if plan.single is not None:
+        offer, alone = plan.single
+        if plan.cost.usd_per_hour:
+            ratio = alone.usd_per_hour / plan.cost.usd_per_hour
+            compared = f"; {ratio:.2f} times the pool's"
+        else:
+            compared = ""
+        place = offer.placement
+        where = f"{place.instance} at {place.location.rstrip('/')}"
+        out.append(f"  one on-demand {where}: {_money(alone)}{compared}")
+    out += _availability(shown)
+    trips = [f"{rtt_s * 1000:.0f} ms" for rtt_s in plan.round_trips_s]
+    if trips:
+        best = f"{trips[0]} and the service's own time"
+        second = f"; {trips[1]} while that replica is away" if len(trips) > 1 else ""
+        sources = sorted({distance.source for distance in shown.distances.values()})
+        out.append(f"response      {best}{second} ({', '.join(sources)})")
+    else:
+        out.append("response      unknown: no distance is known (`fogft.placement.robot_at`)")
+    return out
+
+
+def _availability(shown: PlanShown) -> list[str]:
+    plan, assumed = shown.explanation, shown.explanation.assumed
+    target = "" if plan.target is None else f", {plan.target:.6g} is asked for"
+    levels, least = assumed.correlation, plan.least_expected
+    better = [
+        f"  {name}: {one.correlated:.6f}" for name, one in plan.expected.items() if one != least
+    ]
+    return [
+        f"availability  {least.correlated:.6f} expected{target} "
+        f"({least.independent:.6f} if replicas failed independently)",
+        *better,
+        f"  assuming spot up {assumed.spot_uptime_s / 3600:.3g} h, on demand "
+        f"{assumed.on_demand_uptime_s / 3600:.4g} h, away {assumed.recovery_s / 60:.3g} min; "
+        f"correlation {levels.zone:g} in a zone, {levels.region:g} in a region, "
+        f"{levels.cloud:g} in a cloud",
+    ]
+
+
+def _money(cost: Cost) -> str:
+    egress = f", ${cost.egress:.3f}/h of it for egress" if cost.egress else ""
+    return f"${cost.usd_per_hour:.3f}/h, ${cost.usd_per_month:,.0f} a month{egress}"
+
+
+def _cost_json(cost: Cost) -> dict[str, float]:
+    return {
+        "machines_usd_per_hour": cost.machines,
+        "egress_usd_per_hour": cost.egress,
+        "usd_per_hour": cost.usd_per_hour,
+        "usd_per_month": cost.usd_per_month,
+    }
+
+
+def _offer_json(shown: PlanShown, one: Considered) -> dict[str, Any]:
+    place = one.offer.placement
+    distance = shown.distances.get(f"{place.cloud}/{place.region}")
+    slots: Sequence[int] = one.slots
+    return {
+        "cloud": place.cloud,
+        "region": place.region,
+        "zone": place.zone,
+        "instance": place.instance,
+        "spot": place.spot,
+        "group": one.offer.group,
+        "usd_per_hour": one.offer.usd_per_hour,
+        "price_source": one.offer.source,
+        "price_age_s": shown.now - one.offer.as_of if one.offer.as_of else None,
+        "rtt_s": one.rtt_s,
+        "rtt_source": None if distance is None else distance.source,
+        "recent_losses": one.losses,
+        "slots": list(slots),
+        "why_not": one.why_not,
+    }

@@ -1,0 +1,163 @@
+"""Prices from a dated table: a CSV file in the columns of SkyPilot's catalogues.
+
+``InstanceType, vCPUs, MemoryGiB, AcceleratorName, AcceleratorCount, Region,
+AvailabilityZone, Price, SpotPrice``; with ``Cloud``, ``AsOf`` (YYYY-MM-DD) and ``Source``
+where a table spans clouds or is dated. Without ``Cloud`` the file's folder names it, as in
+SkyPilot's own ``catalogs/v8/aws/vms.csv``.
+
+Owns: reading such a table, and what of it suits a task's `resources`.
+Not here: launching, which a table cannot do.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.local.catalogue import Instance
+from fogft.cloud.local.resources import alternatives, suffices, use_spot
+from fogft.core.errors import SpecError
+from fogft.core.model import Offer, Placement
+from fogft.core.spec_tree import shown
+
+_NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A machine in a place. Prices are NaN where it is not sold in that way.
+
+    Attributes:
+        as_of: When the prices were true, in seconds since the epoch; 0 for not known.
+        source: Who says so.
+    """
+
+    cloud: str
+    region: str
+    zone: str
+    instance: Instance
+    as_of: float
+    source: str
+
+
+class PriceTable:
+    """Offers from a table. Has the `offers` of `fogft.cloud.port.Cloud`, and nothing else of it.
+
+    Raises:
+        SpecError: The file cannot be read or holds something else; with its line.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._rows = list(_rows(file))
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """List of each place the cheapest machine that suits, the cheapest first.
+
+        Raises:
+            SpecError: Nothing in the table suits.
+        """
+        best: dict[tuple[str, bool], Offer] = {}
+        for where, entry in alternatives(resources):
+            spot = use_spot(where, entry)
+            for row in self._rows:
+                price = row.instance.spot_usd_per_hour if spot else row.instance.usd_per_hour
+                if math.isnan(price) or not _is_there(row, entry) or not _suits(where, row, entry):
+                    continue
+                place = Placement(row.cloud, row.region, row.zone, row.instance.name, spot)
+                offer = Offer(place, price, row.source, row.as_of)
+                key = (place.location, spot)
+                known = best.get(key)
+                if known is None or _order(offer) < _order(known):
+                    best[key] = offer
+        if not best:
+            raise SpecError(
+                f"resources: nothing in `{self._file}` suits them",
+                "ask for less, or for places that the table knows",
+            )
+        return sorted(best.values(), key=_order)
+
+
+def _order(offer: Offer) -> tuple[float, Placement]:
+    return offer.usd_per_hour, offer.placement
+
+
+def _is_there(row: Row, entry: Mapping[str, Any]) -> bool:
+    infra = entry.get("infra")
+    if infra is not None:
+        parts = [part.strip() for part in str(infra).split("/")]
+    else:
+        parts = [str(entry.get(key) or "*") for key in ("cloud", "region", "zone")]
+    has = (row.cloud, row.region, row.zone)
+    return all(asked.lower() in ("*", "", own) for asked, own in zip(parts, has, strict=False))
+
+
+def _suits(where: str, row: Row, entry: Mapping[str, Any]) -> bool:
+    if entry.get("instance_type") not in (None, row.instance.name):
+        return False
+    keys = [key for key in ("accelerators", "cpus", "memory") if entry.get(key) is not None]
+    return all(suffices(where, key, entry[key], row.instance) for key in keys)
+
+
+def _rows(file: Path) -> Iterator[Row]:
+    try:
+        with file.open(newline="", encoding="utf-8") as lines:
+            reader = csv.DictReader(line for line in lines if not line.startswith("#"))
+            missing = [key for key in _NEEDED if key not in (reader.fieldnames or ())]
+            if missing:
+                raise SpecError(
+                    f"{file}: has no column `{missing[0]}`",
+                    "write a table in the columns of SkyPilot's catalogues",
+                )
+            for number, raw in enumerate(reader, 2):
+                yield _row(file, number, raw)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SpecError(f"{file}: cannot be read: {error}") from error
+
+
+def _row(file: Path, number: int, raw: Mapping[str, str | None]) -> Row:
+    def number_in(key: str, default: float) -> float:
+        text = (raw.get(key) or "").strip()
+        try:
+            value = float(text) if text else default
+        except ValueError:
+            value = -1.0
+        if value < 0 or math.isinf(value):
+            what = f"{file}: row {number}: {key}: {shown(text)} is not a number from 0"
+            raise SpecError(what, "correct the row, or remove it")
+        return value
+
+    name = (raw.get("InstanceType") or "").strip()
+    devices = (raw.get("AcceleratorName") or "").strip()
+    return Row(
+        cloud=(raw.get("Cloud") or file.resolve().parent.name).strip().lower(),
+        region=(raw.get("Region") or "").strip().lower(),
+        zone=(raw.get("AvailabilityZone") or "").strip().lower(),
+        instance=Instance(
+            name,
+            int(number_in("vCPUs", 0)),
+            int(number_in("MemoryGiB", 0)),
+            number_in("Price", math.nan),
+            number_in("SpotPrice", math.nan),
+            {devices: number_in("AcceleratorCount", 1)} if devices else {},
+        ),
+        as_of=_moment(file, number, (raw.get("AsOf") or "").strip()),
+        source=(raw.get("Source") or "table").strip(),
+    )
+
+
+def _moment(file: Path, number: int, text: str) -> float:
+    if not text:
+        return 0.0
+    try:
+        day = datetime.date.fromisoformat(text)
+    except ValueError:
+        what = f"{file}: row {number}: AsOf: {shown(text)} is not a date"
+        raise SpecError(what, "write it as 2024-11-30") from None
+    noon = datetime.datetime.combine(day, datetime.time(12), datetime.timezone.utc)
+    return noon.timestamp()

@@ -1,0 +1,182 @@
+"""`fogft plan`: what is shown, as text, JSON and drawing; and what a mistake looks like."""
+
+from __future__ import annotations
+
+import json
+import time
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from fogft import app
+from fogft.cli import main
+from fogft.pool import startup
+from fogft.pool.paths import PoolPaths
+
+POOL = """
+name: planner
+resources: {cpus: 8+, use_spot: true}
+run: exec true
+fogft:
+  services:
+    - {name: /plan, type: nav_msgs/srv/GetPlan,
+       traffic: {requests_per_s: 10, request_bytes: 500, response_bytes: 100000}}
+  placement: {rtt_s: {local/us-west-1: 0.011, local/us-west-2: 0.023}}
+"""
+HEADER = "Cloud,Region,AvailabilityZone,InstanceType,vCPUs,MemoryGiB,Price,SpotPrice,AsOf\n"
+
+
+@pytest.fixture
+def pool(tmp_path: Path) -> Path:
+    file = tmp_path / "pool.yaml"
+    file.write_text(POOL)
+    return file
+
+
+def table(tmp_path: Path, *rows: str) -> str:
+    file = tmp_path / "prices.csv"
+    file.write_text(HEADER + "\n".join(rows) + "\n")
+    return str(file)
+
+
+def test_the_plan_is_what_up_would_launch(pool, capsys):
+    """The same planner: the places shown are those that `fogft up` announces."""
+    assert main.run(["plan", str(pool), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    announced = app.order(pool).preview.launches
+    assert [(r["slot"], r["usd_per_hour"]) for r in shown["replicas"]] == [
+        (launch.slot, launch.usd_per_hour) for launch in announced
+    ]
+    assert not PoolPaths.of("planner").folder.exists()
+
+
+def test_every_offer_is_chosen_or_says_why_not(pool, capsys):
+    assert main.run(["plan", str(pool), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert len(shown["offers"]) == 10
+    assert all(bool(o["slots"]) != bool(o["why_not"]) for o in shown["offers"])
+    assert sum(bool(o["slots"]) for o in shown["offers"]) == 2
+    by_place = {f"{o['region']}/{o['zone']}": o["why_not"] for o in shown["offers"]}
+    assert by_place["us-west-1/b"] == "dearer: $0.159/h, not $0.153/h (slot 0)"
+    assert (
+        "cheaper: $0.136/h, not $0.153/h but farther: 23 ms, not 11 ms" in by_place["us-west-2/b"]
+    )
+    assert "farther: unknown" in by_place["us-east-1/a"]
+
+
+def test_text_has_costs_availability_and_response(pool, capsys):
+    assert main.run(["plan", str(pool)]) == 0
+    out = capsys.readouterr().out
+    assert "replicas      2 of 2 wanted" in out
+    assert "a month" in out
+    assert "one on-demand cpu8" in out
+    assert "0.997401 expected (0.999527 if replicas failed independently)" in out
+    assert "spot up 15 h" in out
+    assert "response      11 ms and the service's own time; 23 ms while" in out
+    assert "(pool file)" in out
+
+
+def test_egress_is_what_leaves_every_replica(pool, tmp_path, capsys):
+    """Two replicas on AWS: 10 responses of 100 kB a second each are 7.2 GB/h, $0.09 a GB."""
+    prices = table(
+        tmp_path, "aws,us-west-1,a,m,8,32,0.4,0.1,2024-03-15", "aws,us-west-2,a,m,8,32,0.4,0.1,"
+    )
+    assert main.run(["plan", str(pool), "--prices", prices, "--offline", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["cost"]["egress_usd_per_hour"] == pytest.approx(2 * 3.6 * 0.09)
+    assert shown["one_on_demand"]["egress_usd_per_hour"] == pytest.approx(3.6 * 0.09)
+    assert shown["cost"]["usd_per_month"] == pytest.approx(730 * (0.2 + 0.648))
+    ages = [o["price_age_s"] for o in shown["offers"]]
+    assert ages[0] > 86_400
+    assert ages[1] is None
+
+
+def test_losses_of_the_pool_are_shown(pool, capsys):
+    """History of a pool that exists counts: a place that lost a replica is avoided, and says so."""
+    order = app.order(pool)
+    store = app.make_store("planner")
+    startup.write(store, order.spec, source=order.source, file=pool, cloud="local")
+    place = order.preview.launches[0].location
+    now = time.time()
+    with store.paths.history.open("a") as lines:
+        for at, event in ((now - 200, "launch"), (now - 190, "ready"), (now - 60, "gone")):
+            lines.write(
+                json.dumps(
+                    {"at": at, "event": event, "slot": 0, "generation": 1, "location": place}
+                )
+                + "\n"
+            )
+    assert main.run(["plan", str(pool), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    [lost] = [o for o in shown["offers"] if o["recent_losses"]]
+    assert f"{lost['cloud']}/{lost['region']}/{lost['zone']}" == place
+    assert "avoided for 4 min more" in lost["why_not"]
+
+
+def test_the_drawing_is_svg_with_every_offer(pool, tmp_path, capsys):
+    file = tmp_path / "plan.svg"
+    assert main.run(["plan", str(pool), "--plot", str(file)]) == 0
+    root = ET.fromstring(file.read_text())
+    circles = [e for e in root.iter() if e.tag.endswith("circle")]
+    assert len(circles) == 10
+    assert sum(c.get("fill") != "none" for c in circles) == 2
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (["aws,us-west-1,a,m,8,32,0.4,-0.1,"], "row 2: SpotPrice: `-0.1` is not a number from 0"),
+        (["aws,us-west-1,a,m,8,32,0.4,cheap,"], "SpotPrice: `cheap` is not a number"),
+        (["aws,us-west-1,a,m,8,32,0.4,0.1,yesterday"], "AsOf: `yesterday` is not a date"),
+        ([], "nothing in"),
+        (["aws,us-west-1,a,m,2,4,0.4,0.1,"], "nothing in"),
+    ],
+)
+def test_a_bad_table_is_told(pool, tmp_path, capsys, rows, message):
+    assert main.run(["plan", str(pool), "--prices", table(tmp_path, *rows), "--offline"]) == 1
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.out == ""
+
+
+def test_a_table_that_is_none_is_told(pool, tmp_path, capsys):
+    assert main.run(["plan", str(pool), "--prices", str(tmp_path / "no.csv")]) == 1
+    assert "cannot be read" in capsys.readouterr().err
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+    assert main.run(["plan", str(pool), "--prices", str(tmp_path / "x.csv")]) == 1
+    assert "has no column `InstanceType`" in capsys.readouterr().err
+
+
+def test_a_region_that_does_not_exist_is_told_with_its_line(pool, capsys):
+    pool.write_text(POOL.replace("use_spot: true", "use_spot: true, region: us-west-9"))
+    assert main.run(["plan", str(pool)]) == 1
+    err = capsys.readouterr().err
+    assert "pool.yaml:3: resources.region: the local cloud has no region `us-west-9`" in err
+
+
+def test_a_mistake_in_a_group_is_told_at_the_group(pool, capsys):
+    pool.write_text(POOL + "  groups:\n    - {name: big, resources: {cpus: 512+}}\n")
+    assert main.run(["plan", str(pool)]) == 1
+    assert ":11: fogft.groups[0].resources.cpus: the local cloud has no" in capsys.readouterr().err
+
+
+def test_a_target_out_of_reach_is_a_warning(pool, capsys):
+    pool.write_text(POOL + "  availability: 0.99999\n  max_usd_per_hour: 0.3\n")
+    assert main.run(["plan", str(pool)]) == 0
+    captured = capsys.readouterr()
+    assert "0.99999 is asked for" in captured.out
+    assert "cannot be met: 2 replicas are expected to reach 0.997401" in captured.err
+
+
+def test_regions_that_cannot_be_measured_are_told(pool, tmp_path, capsys):
+    """Without a network the plan stands all the same, on what is known."""
+    pool.write_text(POOL.replace("local/us-west-1", "aws/us-west-1"))
+    prices = table(tmp_path, "aws,us-west-1,a,m,8,32,0.4,0.1,", "aws,us-east-1,a,m,8,32,0.4,0.1,")
+    assert main.run(["plan", str(pool), "--prices", prices]) == 0
+    captured = capsys.readouterr()
+    assert "measuring the way to 2 regions" in captured.err
+    assert "2 regions cannot be measured, such as `aws/us-east-1`: " in captured.err
+    assert "response      11 ms" in captured.out
+    assert main.run(["plan", str(pool), "--prices", prices, "--offline"]) == 0
+    assert "measur" not in capsys.readouterr().err
