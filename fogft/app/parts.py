@@ -46,12 +46,18 @@ def run_server(
     domain_id: int | None = None,
     workdir: Path | None = None,
     notice_file: Path | None = None,
+    advertise: str | None = None,
 ) -> None:
     """Run a server proxy until a signal ends it."""
     from fogft.proxy import server_process
 
     server_process.run(
-        config, listen=listen, domain_id=domain_id, workdir=workdir, notice_file=notice_file
+        config,
+        listen=listen,
+        domain_id=domain_id,
+        workdir=workdir,
+        notice_file=notice_file,
+        advertise=advertise,
     )
 
 

@@ -40,6 +40,7 @@ def proxy(config: Config) -> None:
 
 def serve(
     config: Config,
+    *,
     listen: Annotated[
         str | None,
         typer.Option(
@@ -64,6 +65,14 @@ def serve(
             show_default=False,
         ),
     ] = None,
+    advertise: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Where others reach it, if it cannot know that: behind NAT.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Run a server proxy: a replica's side of a pool.
 
@@ -76,7 +85,12 @@ def serve(
     from fogft import app
 
     app.run_server(
-        config, listen=listen, domain_id=domain_id, workdir=workdir, notice_file=notice_file
+        config,
+        listen=listen,
+        domain_id=domain_id,
+        workdir=workdir,
+        notice_file=notice_file,
+        advertise=advertise,
     )
 
 

@@ -13,12 +13,29 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Mapping
+from enum import Enum
 from typing import Any
 
 from fogft.core.errors import StateError
 from fogft.core.holders import holder_of
 from fogft.core.model import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.core.names import POOL_UID_PATTERN, replica_certificate_name
+from fogft.core.spec import PoolSpec
+
+
+class Found(Enum):
+    """How a proxy finds a replica."""
+
+    BY_CLOUD = "cloud"  # at the endpoint that the cloud tells
+    BY_RECORD = "record"  # there, or where its own record says that it is
+    BY_DOOR = "door"  # it dials in
+
+    @classmethod
+    def of(cls, spec: PoolSpec) -> Found:
+        """Return how the replicas of a pool are found."""
+        if spec.dial_in:
+            return cls.BY_DOOR
+        return cls.BY_RECORD if spec.rendezvous else cls.BY_CLOUD
 
 
 def members_of(
@@ -28,16 +45,21 @@ def members_of(
     draining: Collection[ReplicaId] = (),
     ending: Collection[ReplicaId] = (),
     revoked: Collection[str] = (),
+    found: Found = Found.BY_CLOUD,
 ) -> tuple[Member, ...]:
     """Return whom a proxy should hold a link to.
 
-    Those are ours, not ending, not revoked, and have a known endpoint.
+    Those are ours, not ending, not revoked, and can be found.
     """
     return tuple(
-        Member(machine.id, machine.endpoint, machine.id in draining or machine.notice)
+        Member(
+            machine.id,
+            "" if found is Found.BY_DOOR else machine.endpoint or "",
+            machine.id in draining or machine.notice,
+        )
         for machine in sorted(machines, key=lambda m: m.id)
         if machine.id.pool_uid == pool_uid
-        and machine.endpoint is not None
+        and (machine.endpoint is not None or found is not Found.BY_CLOUD)
         and machine.phase is not MachinePhase.FAILED
         and machine.id not in ending
         and replica_certificate_name(machine.id) not in revoked

@@ -99,6 +99,8 @@ class PoolSpec:
         groups: Kinds of machines; none for one kind, the task's `resources`.
         on_demand: How spot and on-demand are mixed, where there are no groups.
         migration: When a replica moves to a better location; None for never.
+        rendezvous: ``host:port`` of each rendezvous.
+        dial_in: ``host:port`` where replicas dial the robot; empty where the robot dials them.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -115,6 +117,8 @@ class PoolSpec:
     groups: tuple[GroupSpec, ...] = ()
     schedule: ScheduleSpec | None = None
     migration: MigrationSpec | None = field(default_factory=MigrationSpec)
+    rendezvous: tuple[str, ...] = ()
+    dial_in: str = ""
     task: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -128,11 +132,13 @@ class PoolSpec:
 
     def hash_with(self, services: tuple[ServiceSpec, ...]) -> str:
         """Return the `replica_hash` of a replica that carries only these services."""
-        asked = {
+        asked: dict[str, Any] = {
             "services": sorted(_run_by_replica(s) for s in services),
             "orphan_after_s": self.health.orphan_after_s,
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
         }
+        if self.rendezvous or self.dial_in:
+            asked["connectivity"] = [self.rendezvous, self.dial_in]
         canonical = json.dumps(asked, sort_keys=True, default=str)
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 

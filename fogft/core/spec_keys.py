@@ -22,6 +22,8 @@ FOGFT_KEYS = (
     "groups",
     "schedule",
     "migration",
+    "rendezvous",
+    "dial_in",
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),

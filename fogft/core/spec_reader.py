@@ -16,6 +16,7 @@ from pathlib import PurePath
 
 from fogft.core.names import POOL_NAME_PATTERN
 from fogft.core.spec import MAX_REPLICAS, HealthSpec, PoolSpec
+from fogft.core.spec_connectivity import read_dial_in, read_rendezvous
 from fogft.core.spec_keys import DAY_S, FOGFT_KEYS, HEALTH_KEYS, LATER_KEYS, places
 from fogft.core.spec_plan import (
     read_availability,
@@ -92,6 +93,8 @@ def pool_spec(
         groups=groups,
         schedule=read_schedule(ours),
         migration=read_migration(ours),
+        rendezvous=read_rendezvous(ours),
+        dial_in=read_dial_in(ours),
         task=task,
     )
     workdir = spec.task.get("workdir")

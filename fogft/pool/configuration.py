@@ -87,6 +87,9 @@ def proxy_config(
             "key": f"{paths.credentials.name}/{stem}.key",
             "services": [to_plain(service) for service in spec.services],
             "suspect_after_s": spec.health.suspect_after_s,
+            "rendezvous": list(spec.rendezvous),
+            "records": paths.records.name,
+            "dial_in": "" if robot else spec.dial_in,  # that is where this machine is
         },
     )
 
@@ -170,6 +173,8 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "run": str(spec.task.get("run") or ""),
             "envs": {str(k): "" if v is None else str(v) for k, v in envs.items()},
             "orphan_after_s": spec.health.orphan_after_s,
+            "rendezvous": list(spec.rendezvous),
+            "dial_out": [spec.dial_in] if spec.dial_in else [],
         },
     )
 

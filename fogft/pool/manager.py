@@ -26,6 +26,7 @@ from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
 from fogft.pool import configuration, farewell, proxy_report, shutdown, status
+from fogft.pool.announcing import ManagerRecords
 from fogft.pool.latency import Distances, Latencies
 from fogft.pool.lease import Lease
 from fogft.pool.ledger import Ledger
@@ -74,6 +75,7 @@ class Manager:
         self._ledger = Ledger(self._paths.credentials)
         self._certified_at: float | None = None
         self._revoked: frozenset[str] = frozenset()
+        self._records = ManagerRecords(self._paths, self._identity.uid, self._lease.epoch)
         self._seen: dict[Path, tuple[int, int, int] | None] = {}
         self._digest: object = None
         self._trouble: list[str] = []
@@ -107,6 +109,7 @@ class Manager:
         except PoolNotFound:
             log.info("manager_stopped pool=%s reason=ended", self._identity.name)
         finally:
+            self._records.close()
             self._lease.release()
         log.info("manager_stopped pool=%s", self._identity.name)
 
@@ -123,6 +126,7 @@ class Manager:
         tick = self._attempt_tick()
         if tick is None:
             return False
+        self._attempt(lambda: self._records.look(tick.spec.rendezvous, tick.membership))
         if tick.over and tick.observed.machines == ():
             self._attempt(self._leave)
             if not self._trouble:
@@ -183,7 +187,7 @@ class Manager:
     def _write_status(self, tick: Tick, ended: str = "") -> None:
         report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
         fresh = report is not None and report.fresh(time.time())
-        notes = [*self._trouble, *([self._proxy.trouble] if self._proxy.trouble else [])]
+        notes = [*self._trouble, *filter(None, (self._proxy.trouble, self._records.trouble))]
         if (report is None or not fresh) and not tick.over:
             when = "lately" if report else "yet"
             notes.append(f"the client proxy has not reported {when}")

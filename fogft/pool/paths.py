@@ -83,6 +83,16 @@ class PoolPaths:
         return self.folder / "membership.json"
 
     @property
+    def records(self) -> Path:
+        """Records that the client proxy learned from a rendezvous."""
+        return self.folder / "records.json"
+
+    @property
+    def manager_records(self) -> Path:
+        """Records that the manager published or learned."""
+        return self.folder / "manager-records.json"
+
+    @property
     def history(self) -> Path:
         """One JSON object a line: launches, ends, refusals; the generations used."""
         return self.folder / "history.jsonl"

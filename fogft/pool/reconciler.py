@@ -22,7 +22,7 @@ from fogft.core.groups import replica_hash, sales, task_at
 from fogft.core.health import judge
 from fogft.core.history import EventKind, History
 from fogft.core.intent import Intent
-from fogft.core.membership import members_of, successor
+from fogft.core.membership import Found, members_of, successor
 from fogft.core.model import (
     LinkReport,
     Machine,
@@ -228,7 +228,7 @@ class Reconciler:
         self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan, history: History
     ) -> None:
         self._mark_draining(plan, observed, history)
-        self._publish(identity, observed, plan)
+        self._publish(identity, spec, observed, plan)
         for planned in plan.launches:
             self._launch(identity, spec, planned)
         for end in plan.terminations:
@@ -246,7 +246,7 @@ class Reconciler:
             elif record.draining_since is not None and machine.id not in ends:
                 self._remember.add(EventKind.UNDRAINED, machine.id)
 
-    def _publish(self, identity: Identity, observed: Observed, plan: Plan) -> None:
+    def _publish(self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan) -> None:
         revoked = self._revoked()
         members = members_of(
             observed.machines or (),
@@ -254,6 +254,7 @@ class Reconciler:
             draining=plan.draining,
             ending={end.id for end in plan.terminations} | observed.ending,
             revoked=revoked,
+            found=Found.of(spec),
         )
         membership = successor(
             self._membership,

@@ -11,17 +11,17 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fogft import disk
-from fogft.core import membership
 from fogft.core.errors import FogftError, PoolBusy, StateError
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.config import ClientProxyConfig, read_client
 from fogft.proxy.dispatcher import Dispatcher
+from fogft.proxy.following import Following
 from fogft.proxy.process import Watched, start_log, stop_on_signal
 from fogft.ros import environment, memory_tuning
 
@@ -84,10 +84,12 @@ def run(config_path: Path) -> None:
     node = SerialisedNode(_node_name("fogft", config.pool), config.domain_id)
     proxy = ClientProxy(config.pool_uid, node, _dialer(config, sign), make_dispatcher)
     proxy.serve(config.services)
+    following = Following(config)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
     try:
-        _loop(config_path, config, proxy, sign, stop)
+        _loop(config_path, config, _Parts(proxy, following, sign), stop)
     finally:
+        following.close()
         proxy.close()
         node.close()
         lock.release()
@@ -124,15 +126,21 @@ def make_dispatcher(
     )
 
 
+class _Parts(NamedTuple):
+    proxy: ClientProxy
+    following: Following
+    sign: ManagerSign
+
+
 def _loop(
     config_path: Path,
     config: ClientProxyConfig,
-    proxy: ClientProxy,
-    sign: ManagerSign,
+    parts: _Parts,
     stop: threading.Event,
 ) -> None:
+    proxy, following, sign = parts
     memory = memory_tuning.Trimmer()
-    watched_config, watched_members = Watched(config_path), Watched(config.membership)
+    watched_config = Watched(config_path)
     watched_config.changed()
     watched_certificate = Watched(config.credentials.certificate)  # written after its key
     watched_certificate.changed()
@@ -142,18 +150,19 @@ def _loop(
         memory.look()
         sign.look()
         if watched_config.changed():
-            _apply(functools.partial(_reconfigure, config_path, config, proxy), config_path)
-        if watched_members.changed():
-            _apply(functools.partial(_follow, config.membership, proxy), config.membership)
+            _apply(functools.partial(_reconfigure, config_path, config, parts), config_path)
+        _apply(functools.partial(_follow, following, proxy), config.membership)
         if watched_certificate.changed():
             proxy.renew()
+            following.renew()
         now = time.monotonic()
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
             reported = now
             if not config_path.parent.exists():  # the pool's folder: its end is the pool's
                 log.warning("folder_gone path=%s", config_path.parent)
                 return
-            _apply(functools.partial(_report, config, proxy, now - started), config.status)
+            report = {**proxy.report(), **following.report()}
+            _apply(functools.partial(_report, config, report, now - started), config.status)
 
 
 _troubles: dict[Path, str] = {}
@@ -171,28 +180,29 @@ def _apply(step: Callable[[], None], path: Path) -> None:
         _troubles.pop(path, None)
 
 
-def _reconfigure(path: Path, old: ClientProxyConfig, proxy: ClientProxy) -> None:
+def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
     new = read_client(path)
     if (new.pool_uid, new.domain_id) != (old.pool_uid, old.domain_id):
         raise StateError(f"`{path}`: pool_uid and domain_id cannot change while the proxy runs")
-    proxy.serve(new.services)
+    parts.proxy.serve(new.services)
+    parts.following.apply(new)
     log.info("config_applied services=%d", len(new.services))
 
 
-def _follow(path: Path, proxy: ClientProxy) -> None:
-    raw = disk.read_json(path)
-    if raw is not None:
-        proxy.follow(membership.from_dict(raw))
+def _follow(following: Following, proxy: ClientProxy) -> None:
+    membership = following.look()
+    if membership is not None:
+        proxy.follow(membership)
 
 
-def _report(config: ClientProxyConfig, proxy: ClientProxy, uptime_s: float) -> None:
+def _report(config: ClientProxyConfig, report: Mapping[str, Any], uptime_s: float) -> None:
     header = {
         "pid": os.getpid(),
         "written_at": time.time(),
         "uptime_s": uptime_s,
         "robot": config.robot,
     }
-    disk.write_json(config.status, {**header, **proxy.report()}, durable=False)
+    disk.write_json(config.status, {**header, **report}, durable=False)
 
 
 def _node_name(prefix: str, pool: str) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.notice import SOURCES as NOTICE_SOURCES
-from fogft.core import names
+from fogft.core import membership, names
 from fogft.core.errors import StateError
 from fogft.core.model import ReplicaId
 from fogft.core.service_form import from_plain, seconds
@@ -31,7 +31,14 @@ class CredentialFiles:
 
 @dataclass(frozen=True)
 class ClientProxyConfig:
-    """All that `fogft proxy` needs to know."""
+    """All that `fogft proxy` needs to know.
+
+    Attributes:
+        rendezvous: ``host:port`` of each.
+        records: File that keeps what was learned there.
+        dial_in: ``host:port`` that replicas which cannot be reached are told; empty for none.
+        dial_in_listen: Where to listen for them; empty for that port on all addresses.
+    """
 
     pool: str
     pool_uid: str
@@ -45,6 +52,10 @@ class ClientProxyConfig:
     suspect_after_s: float = 2.0
     tell_losers: bool = True
     domain_id: int | None = None
+    rendezvous: tuple[str, ...] = ()
+    records: Path | None = None
+    dial_in: str = ""
+    dial_in_listen: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,6 +63,10 @@ class ServerProxyConfig:
     """All that `fogft serve` needs to know.
 
     Attributes:
+        advertise: ``host:port`` at which this replica is reached, where it was told.
+        rendezvous: ``host:port`` of each.
+        records: File that keeps what was learned there.
+        dial_out: Doors of robots and gateways, where this replica cannot be reached.
         notice: Where preemption notices come from: ``none``, ``file:PATH`` with an absolute
             path, or a source of `fogft.cloud.notice.watch`.
     """
@@ -69,6 +84,10 @@ class ServerProxyConfig:
     notice: str = "auto"
     max_in_flight: int = 512
     log_level: str = "info"
+    advertise: str = ""
+    rendezvous: tuple[str, ...] = ()
+    records: Path | None = None
+    dial_out: tuple[str, ...] = ()
 
 
 def read_client(path: Path) -> ClientProxyConfig:
@@ -91,6 +110,10 @@ def read_client(path: Path) -> ClientProxyConfig:
             suspect_after_s=seconds((raw.get("health") or {}).get("suspect_after_s") or 2.0),
             domain_id=_optional_int(raw.get("domain_id")),
             tell_losers=bool(raw.get("tell_losers", True)),
+            rendezvous=_endpoints(raw.get("rendezvous")),
+            records=base / raw["records"] if raw.get("records") else None,
+            dial_in=_endpoint(raw.get("dial_in") or ""),
+            dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
         )
     raise AssertionError("unreachable")
 
@@ -117,6 +140,10 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
             notice=_notice(raw.get("notice"), base),
             max_in_flight=int(raw.get("max_in_flight") or 512),
             log_level=str(raw.get("log_level") or "info"),
+            advertise=_endpoint(raw.get("advertise") or ""),
+            rendezvous=_endpoints(raw.get("rendezvous")),
+            records=base / raw["records"] if raw.get("records") else None,
+            dial_out=_endpoints(raw.get("dial_out")),
         )
     raise AssertionError("unreachable")
 
@@ -148,6 +175,18 @@ class _Reading:
 
 def _credentials(raw: Mapping[str, str], base: Path) -> CredentialFiles:
     return CredentialFiles(base / raw["ca"], base / raw["certificate"], base / raw["key"])
+
+
+def _endpoints(raw: Any) -> tuple[str, ...]:
+    if raw is not None and not isinstance(raw, list):
+        raise ValueError(f"{raw!r:.40} is not a list of endpoints")
+    return tuple(_endpoint(one) for one in raw or ())
+
+
+def _endpoint(raw: Any) -> str:
+    if not isinstance(raw, str) or (raw and not membership.is_endpoint(raw)):
+        raise ValueError(f"{raw!r:.40} is not `host:port`")
+    return raw
 
 
 def _uid(raw: Any) -> str:

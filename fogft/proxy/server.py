@@ -70,6 +70,7 @@ class ServerProxy:
         self._manager_seen = clock()
         self._node: RosNode | None = None
         self._clients: dict[str, RosClient] = {}
+        self._revoked: frozenset[str] = frozenset()
         self._servers: dict[str, int] = {}
         self._draining = False
         self._at_risk = False
@@ -123,6 +124,27 @@ class ServerProxy:
         """
         before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
         return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that can answer now."""
+        return self._ready
+
+    @property
+    def draining(self) -> bool:
+        """Whether it asked to be left alone."""
+        return self._draining
+
+    @property
+    def endpoint(self) -> str:
+        """``host:port`` at which it listens."""
+        return self._listener.endpoint
+
+    def revoke(self, names: frozenset[str]) -> None:
+        """Let these holders of certificates in no more."""
+        if names - self._revoked:
+            self._revoked |= names
+            self._listener.revoke(self._revoked)
 
     @property
     def orphaned(self) -> bool:

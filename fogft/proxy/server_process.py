@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 
 from fogft.cloud import notice
+from fogft.proxy.announcing import Presence
 from fogft.proxy.config import ServerProxyConfig, read_server
 from fogft.proxy.process import start_log, stop_on_signal
 from fogft.proxy.server import ServerProxy
@@ -33,6 +34,7 @@ def run(
     domain_id: int | None = None,
     workdir: Path | None = None,
     notice_file: Path | None = None,
+    advertise: str | None = None,
 ) -> None:
     """Run until a signal ends it, or until no manager was heard of for `orphan_after_s`.
 
@@ -42,6 +44,7 @@ def run(
         domain_id: ROS domain instead of the file's.
         workdir: Folder in which `run` starts, instead of the file's.
         notice_file: File that appears when the machine is about to be preempted.
+        advertise: ``host:port`` at which this replica is reached, where it cannot know that.
 
     Raises:
         FogftError: The configuration, the credentials or ROS cannot be used.
@@ -52,6 +55,7 @@ def run(
         domain_id=domain_id,
         workdir=str(workdir.resolve()) if workdir else None,
         notice=f"file:{notice_file.resolve()}" if notice_file else None,
+        advertise=advertise,
     )
     start_log(config.log_level)
     stop = stop_on_signal()
@@ -59,10 +63,14 @@ def run(
     memory_tuning.tune()
     proxy = _make(config)
     watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
+    presence: Presence | None = None
     try:
         proxy.start()
-        _loop(config, proxy, stop)
+        presence = Presence(config, proxy.endpoint)
+        _loop(config, proxy, presence, stop)
     finally:
+        if presence is not None:
+            presence.close()
         if watching is not None:
             watching.close()
         proxy.close()
@@ -107,11 +115,16 @@ def run_environment(config: ServerProxyConfig) -> dict[str, str]:
     return environ
 
 
-def _loop(config: ServerProxyConfig, proxy: ServerProxy, stop: threading.Event) -> None:
+def _loop(
+    config: ServerProxyConfig, proxy: ServerProxy, presence: Presence, stop: threading.Event
+) -> None:
     memory = memory_tuning.Trimmer()
     while not stop.wait(_TICK_S):
         proxy.run_once()
         memory.look()
+        proxy.revoke(
+            presence.look(proxy.ready, draining=proxy.draining, in_flight=proxy.responder.in_flight)
+        )
         if proxy.orphaned:
             log.error(
                 "replica_orphaned replica=%s orphan_after_s=%.0f", config.id, config.orphan_after_s

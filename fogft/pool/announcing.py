@@ -1,0 +1,126 @@
+"""What the manager tells the rendezvous: whom it admits, and whose certificates it took back.
+
+The same membership goes to the client proxy of this machine as a file, and to everybody else
+as signed records. Without a rendezvous in the pool file nothing is done here.
+
+Owns: the manager's certificate for signing, and its record client.
+Not here: what the membership is (`reconciler`).
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+from pathlib import Path
+
+from fogft.core import names
+from fogft.core.errors import CredentialError
+from fogft.core.holders import Role
+from fogft.core.model import Membership
+from fogft.core.records import RecordKind
+from fogft.core.roster import admission_content
+from fogft.pool import credentials
+from fogft.pool.paths import PoolPaths
+from fogft.wire.rendezvous_client import RendezvousClient
+
+CERTIFICATE_DAYS = 365.0
+RENEW_BEFORE = datetime.timedelta(days=60)
+_CERTIFY_EVERY = datetime.timedelta(hours=1)
+_STEM = "manager"
+
+
+@dataclass(frozen=True)
+class _Files:
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+class ManagerRecords:
+    """Publishes one pool's membership.
+
+    Args:
+        paths: The pool's folder.
+        pool_uid: Its uid.
+        epoch: Of the manager in office.
+    """
+
+    def __init__(self, paths: PoolPaths, pool_uid: str, epoch: int) -> None:
+        self._paths = paths
+        self._pool_uid = pool_uid
+        self._epoch = epoch
+        self._endpoints: tuple[str, ...] = ()
+        self._client: RendezvousClient | None = None
+        self._certified_at: datetime.datetime | None = None
+        self._said: Membership | None = None
+
+    def look(self, endpoints: tuple[str, ...], membership: Membership | None) -> None:
+        """Publish what is new, to these rendezvous.
+
+        Raises:
+            CredentialError: The pool's CA cannot be used.
+            StateError: The manager's certificate cannot be written.
+        """
+        if endpoints != self._endpoints:
+            self.close()
+            self._endpoints, self._said = endpoints, None
+        if not endpoints:
+            return
+        self._certify(datetime.datetime.now(datetime.timezone.utc))
+        if self._client is None:
+            folder = self._paths.credentials
+            files = _Files(
+                folder / credentials.AUTHORITY_CERTIFICATE,
+                folder / f"{_STEM}.crt",
+                folder / f"{_STEM}.key",
+            )
+            self._client = RendezvousClient(
+                endpoints, files, self._pool_uid, cache=self._paths.manager_records
+            )
+            self._client.start()
+        if membership is not None and membership != self._said:
+            self._say(self._client, membership)
+            self._said = membership
+
+    def _say(self, client: RendezvousClient, membership: Membership) -> None:
+        client.publish(
+            RecordKind.ADMISSION,
+            "",
+            membership.epoch,
+            admission_content(membership),
+            sequence=membership.version,
+        )
+        names_ = {"names": sorted(membership.revoked)}
+        client.publish(RecordKind.REVOCATION, "", self._epoch, names_)
+
+    def _certify(self, now: datetime.datetime) -> None:
+        if self._certified_at is not None and abs(now - self._certified_at) < _CERTIFY_EVERY:
+            return
+        certificate = self._paths.credentials / f"{_STEM}.crt"
+        try:
+            good = not credentials.describe(certificate).problem(now + RENEW_BEFORE)
+        except CredentialError:
+            good = False  # there is none yet, or it is damaged
+        if not good:
+            name = names.manager_certificate_name(self._pool_uid)
+            issued = credentials.issue(
+                self._paths.credentials, name, role=Role.MANAGER, days=CERTIFICATE_DAYS
+            )
+            credentials.write(issued, self._paths.credentials, _STEM)
+        self._certified_at = now
+
+    @property
+    def trouble(self) -> str:
+        """Return what is wrong, in a sentence; empty when at least one rendezvous is there."""
+        if self._client is None or self._client.known.connected:
+            return ""
+        said = self._client.status()["rendezvous"]
+        return "no rendezvous can be reached: " + "; ".join(
+            f"`{one['endpoint']}`: {one['detail']}" for one in said
+        )
+
+    def close(self) -> None:
+        """Leave. Repeatable."""
+        client, self._client = self._client, None
+        if client is not None:
+            client.close()

@@ -1,0 +1,158 @@
+"""What a replica tells the rendezvous of itself, and what it learns there.
+
+Owns: the replica's record, when it is written anew, and the doors that it dials.
+Not here: what is told with each probe (`server`), records (`fogft.core.records`).
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+from fogft.core.model import ReplicaId
+from fogft.core.records import RecordError, RecordKind
+from fogft.core.roster import SlotState, dial_in
+from fogft.proxy.config import ServerProxyConfig
+from fogft.wire.dial_out import DialOut
+from fogft.wire.rendezvous_client import Known, RendezvousClient
+from fogft.wire.signing import Signer
+
+log = logging.getLogger(__name__)
+
+LOAD_EVERY_S = 5.0
+
+
+class Records(Protocol):
+    """What is needed of a record client."""
+
+    @property
+    def known(self) -> Known:
+        """What is known now."""
+
+    def publish(
+        self, kind: RecordKind, subject: str, generation: int, content: dict[str, object]
+    ) -> None:
+        """Say something of our own."""
+
+
+class Announcer:
+    """Keeps one replica's record true.
+
+    Args:
+        id: Which replica.
+        records: Where it is published.
+        endpoint: ``host:port`` as it was told; empty if it was not.
+        port: The port that it listens at.
+        dials_out: It cannot be reached.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        id: ReplicaId,
+        records: Records,
+        *,
+        endpoint: str,
+        port: int,
+        dials_out: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._id = id
+        self._records = records
+        self._fixed = SlotState(endpoint=endpoint, dials_out=dials_out)
+        self._port = port
+        self._clock = clock
+        self._said: SlotState | None = None
+        self._said_at = 0.0
+
+    def look(self, ready: frozenset[str], *, draining: bool, in_flight: int) -> bool:
+        """Publish what has changed: the load only now and then; return whether it did."""
+        seen = self._records.known.seen_host
+        host = f"[{seen}]" if ":" in seen else seen
+        state = replace(
+            self._fixed,
+            observed_endpoint=f"{host}:{self._port}" if host else "",
+            services=tuple(sorted(ready)),
+            draining=draining,
+            in_flight=in_flight,
+        )
+        said = self._said
+        if said is not None and state == said:
+            return False
+        only_load = said is not None and replace(state, in_flight=said.in_flight) == said
+        if only_load and self._clock() - self._said_at < LOAD_EVERY_S:
+            return False
+        self._said, self._said_at = state, self._clock()
+        self._records.publish(
+            RecordKind.SLOT, str(self._id.slot), self._id.generation, state.to_content()
+        )
+        return True
+
+
+class Presence:
+    """A replica at the rendezvous and at the doors of those it has to dial.
+
+    Args:
+        config: The server proxy's.
+        listening: ``host:port`` of its own listener.
+
+    Raises:
+        CredentialError: The credentials cannot be used.
+    """
+
+    def __init__(self, config: ServerProxyConfig, listening: str) -> None:
+        ours = config.credentials
+        self._own_doors = config.dial_out
+        self._seen: Known | None = None
+        self._client: RendezvousClient | None = None
+        self._announcer: Announcer | None = None
+        self._dial_out: DialOut | None = None
+        if config.rendezvous:
+            self._client = RendezvousClient(
+                config.rendezvous, ours, config.id.pool_uid, cache=config.records
+            )
+            self._announcer = Announcer(
+                config.id,
+                self._client,
+                endpoint=config.advertise,
+                port=int(listening.rpartition(":")[2]),
+                dials_out=bool(config.dial_out),
+            )
+            self._client.start()
+        if config.dial_out:
+            sign = Signer(ours.certificate, ours.key)
+            self._dial_out = DialOut(listening, config.id.pool_uid, sign)
+            self._dial_out.follow(config.dial_out)
+
+    def look(self, ready: frozenset[str], *, draining: bool, in_flight: int) -> frozenset[str]:
+        """Say what is new of us, dial new doors; return the names that are revoked."""
+        if self._client is None or self._announcer is None:
+            return frozenset()
+        self._announcer.look(ready, draining=draining, in_flight=in_flight)
+        known = self._client.known
+        if known is not self._seen:
+            self._seen = known
+            if self._dial_out is not None:
+                self._dial_out.follow((*self._own_doors, *doors(known)))
+        return known.revoked
+
+    def close(self) -> None:
+        """Leave."""
+        if self._dial_out is not None:
+            self._dial_out.close()
+        if self._client is not None:
+            self._client.close()
+
+
+def doors(known: Known) -> list[str]:
+    """Return where robots and gateways let replicas dial in."""
+    found = []
+    for record in (*known.of(RecordKind.GATEWAY), *known.of(RecordKind.ROBOT)):
+        try:
+            found.append(dial_in(record))
+        except RecordError as error:
+            log.warning("record_odd key=%s reason=%r", record.key, str(error))
+    return [door for door in found if door]

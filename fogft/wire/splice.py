@@ -1,0 +1,97 @@
+"""Join two TCP connections: what comes out of one goes into the other, without passing Python.
+
+The kernel moves the bytes (`splice`), so a tunnel costs a robot two sleeping threads.
+
+Owns: one tunnel and its two threads. Not here: who is joined (`dial_in`, `dial_out`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+from collections.abc import Callable
+
+_CHUNK = 64 << 10
+
+
+def keep_alive(link: socket.socket) -> None:
+    """Have the kernel give a connection up within seconds once its peer is gone."""
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 5000)
+
+
+def hang_up(link: socket.socket) -> None:
+    """End a connection whatever state it is in, also for a thread that waits on it."""
+    with contextlib.suppress(OSError):
+        link.shutdown(socket.SHUT_RDWR)
+    link.close()
+
+
+class Tunnel:
+    """Two connections joined. They are the tunnel's from now on.
+
+    Args:
+        one: A connected socket.
+        other: Another.
+        ended: Called once when both directions have ended.
+    """
+
+    def __init__(
+        self, one: socket.socket, other: socket.socket, ended: Callable[[Tunnel], None]
+    ) -> None:
+        self._ends = (one, other)
+        self._ended = ended
+        self._lock = threading.Lock()
+        self._open = 2
+        for link in self._ends:
+            link.setblocking(True)
+
+    def start(self) -> None:
+        """Begin to carry."""
+        one, other = self._ends
+        for source, target in ((one, other), (other, one)):
+            threading.Thread(
+                target=self._carry, args=(source, target), name="fogft-tunnel", daemon=True
+            ).start()
+
+    def _carry(self, source: socket.socket, target: socket.socket) -> None:
+        try:
+            _splice(source.fileno(), target.fileno())
+            target.shutdown(socket.SHUT_WR)  # the other direction may go on
+        except (OSError, ValueError):
+            self.close()
+        with self._lock:
+            self._open -= 1
+            last = self._open == 0
+        if last:
+            for link in self._ends:
+                link.close()
+            self._ended(self)
+
+    def close(self) -> None:
+        """End both connections. Their threads close the sockets."""
+        for link in self._ends:
+            with contextlib.suppress(OSError):
+                link.shutdown(socket.SHUT_RDWR)
+
+
+def _splice(source: int, target: int) -> None:
+    """Carry bytes until the source ends.
+
+    Raises:
+        OSError: One of both is broken.
+    """
+    take, put = os.pipe()
+    try:
+        while count := os.splice(source, put, _CHUNK):
+            while count:
+                count -= os.splice(take, target, count)
+    finally:
+        os.close(take)
+        os.close(put)
