@@ -219,8 +219,12 @@ class RendezvousClient:
         held = self._records.get(kind, subject)
         signed = self._records.signed(kind, subject)
         if held is not None and signed is not None and held.content == own.content:
-            current = signed.certificate == self._signer.certificate
-            if held.generation == own.generation and (current or own.sequence is not None):
+            if own.sequence is not None:
+                stands = held.order == (own.generation, own.sequence)
+            else:
+                renewed = signed.certificate != self._signer.certificate
+                stands = held.generation == own.generation and not renewed
+            if stands:
                 return
         sequence = own.sequence
         if sequence is None:

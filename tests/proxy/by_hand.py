@@ -80,20 +80,24 @@ class Parts:
 class Replica:
     """A server proxy with an ordinary service under it."""
 
-    def __init__(self, parts: Parts, slot: int, work_s: float, environ: Mapping[str, str]) -> None:
-        self.id = ReplicaId(UID, slot, 1)
+    def __init__(
+        self, parts: Parts, slot: int, work_s: float, environ: Mapping[str, str],
+        *, generation: int = 1, extra: str = "",
+    ) -> None:  # fmt: skip
+        self.id = ReplicaId(UID, slot, generation)
+        stem = f"r{slot}.{generation}"
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.endpoint = f"127.0.0.1:{free.getsockname()[1]}"
-        parts.issue(names.replica_certificate_name(self.id), credentials.Role.REPLICA, f"r{slot}")
-        config = parts.folder / f"replica{slot}.yaml"
+        parts.issue(names.replica_certificate_name(self.id), credentials.Role.REPLICA, stem)
+        config = parts.folder / f"replica{slot}.{generation}.yaml"
         notice = "auto" if environ else "none"
         config.write_text(
-            f'pool: p\npool_uid: "{UID}"\nslot: {slot}\ngeneration: 1\n'
+            f'pool: p\npool_uid: "{UID}"\nslot: {slot}\ngeneration: {generation}\n'
             f"listen: {self.endpoint}\nservices: {SERVICES}\ndomain_id: {parts.domain()}\n"
             f"run: exec {sys.executable} {SERVICE} {work_s}\n"
             f"notice: {notice}\n"
-            f"credentials: {{ca: ca/ca.crt, certificate: r{slot}.crt, key: r{slot}.key}}\n"
+            f"credentials: {{ca: ca/ca.crt, certificate: {stem}.crt, key: {stem}.key}}\n{extra}"
         )
         self.process = parts.start("serve", config, environ)
 
@@ -113,7 +117,9 @@ class Replica:
 class Robot:
     """A client proxy."""
 
-    def __init__(self, parts: Parts, name: str, replicas: tuple[Replica, ...]) -> None:
+    def __init__(
+        self, parts: Parts, name: str, replicas: tuple[Replica, ...], extra: str = ""
+    ) -> None:
         self._parts = parts
         self._members = parts.folder / f"{name}-members.json"
         self._status = parts.folder / f"{name}-status.json"
@@ -124,9 +130,10 @@ class Robot:
             f'pool: p\npool_uid: "{UID}"\nrobot: {name}\nmembership: {self._members.name}\n'
             f"status: {self._status.name}\nlease: lease.json\nlock: {name}.lock\n"
             f"credentials: {{ca: ca/ca.crt, certificate: {name}.crt, key: {name}.key}}\n"
-            f"services: {SERVICES}\ndomain_id: {self.domain}\n"
+            f"services: {SERVICES}\ndomain_id: {self.domain}\n{extra}"
         )
-        self.follow(*replicas)
+        if replicas:
+            self.follow(*replicas)
         self.process = parts.start("proxy", self._config)
 
     def follow(self, *replicas: Replica) -> None:
@@ -138,16 +145,22 @@ class Robot:
         os.replace(new, self._members)
 
     def restart(self) -> None:
+        self.kill()
+        self.process = self._parts.start("proxy", self._config)
+
+    def kill(self) -> None:
         self.process.kill()
         self.process.wait()
         self._status.unlink()
-        self.process = self._parts.start("proxy", self._config)
+
+    def report(self) -> dict[str, Any]:
+        try:
+            return dict(json.loads(self._status.read_text()))
+        except FileNotFoundError:
+            return {}
 
     def links(self) -> list[dict[str, Any]]:
-        try:
-            return list(json.loads(self._status.read_text())["links"])
-        except FileNotFoundError:
-            return []
+        return list(self.report().get("links", []))
 
     def ready(self) -> list[int]:
         """Return the slots that can answer now."""

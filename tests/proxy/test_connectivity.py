@@ -1,0 +1,251 @@
+"""Real proxies that find each other through a real rendezvous, while addresses and servers go."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from fogft.core import membership, names
+from fogft.core.holders import Role
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.records import RecordKind
+from fogft.core.roster import admission_content
+from fogft.ros import environment
+from fogft.wire.rendezvous_client import RendezvousClient
+from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+environment.prepare(os.environ)
+
+
+@dataclass(frozen=True)
+class Files:
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+def free_endpoint() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+class Pool(Parts):
+    """Robots and replicas that are told of nothing but a rendezvous; the test is the manager."""
+
+    def __init__(self, folder: Path, domain: Callable[[], int]) -> None:
+        super().__init__(folder, domain)
+        self.meeting = free_endpoint()
+        self.issue(names.rendezvous_certificate_name(UID, "a"), Role.RENDEZVOUS, "rendezvous")
+        self.issue(names.manager_certificate_name(UID), Role.MANAGER, "manager")
+        self._place = folder / "rendezvous.yaml"
+        self._place.write_text(
+            f'pool_uid: "{UID}"\nlisten: {self.meeting}\nrecords: place.json\n'
+            "credentials: {ca: ca/ca.crt, certificate: rendezvous.crt, key: rendezvous.key}\n"
+        )
+        self.rendezvous = self.start("rendezvous", self._place)
+        files = Files(folder / "ca/ca.crt", folder / "manager.crt", folder / "manager.key")
+        self.manager = RendezvousClient([self.meeting], files, UID)
+        self.manager.start()
+
+    def kill_rendezvous(self) -> None:
+        self.rendezvous.kill()
+        self.rendezvous.wait()
+
+    def start_rendezvous(self) -> None:
+        self.rendezvous = self.start("rendezvous", self._place)
+
+    def make_replica(self, slot: int, generation: int = 1, extra: str = "") -> Replica:
+        meeting = f"rendezvous: ['{self.meeting}']\nrecords: r{slot}.{generation}.json\n"
+        return Replica(self, slot, 0.001, {}, generation=generation, extra=meeting + extra)
+
+    def make_robot(self, name: str, *, extra: str = "") -> Robot:
+        meeting = f"rendezvous: ['{self.meeting}']\nrecords: {name}-records.json\n"
+        return Robot(self, name, (), meeting + extra)
+
+    def admit(self, *ids: tuple[int, int]) -> None:
+        version = self.next_version()
+        members = tuple(Member(ReplicaId(UID, *id), "") for id in ids)
+        content = admission_content(Membership("p", UID, 1, version, members))
+        self.manager.publish(RecordKind.ADMISSION, "", 1, content, sequence=version)
+
+    def close(self) -> None:
+        self.manager.close()
+        super().close()
+
+
+@pytest.fixture
+def pool(tmp_path: Path, ros_domains: Callable[[], int]) -> Iterator[Pool]:
+    made = Pool(tmp_path, ros_domains)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def call() -> Iterator[Callable[[Robot], Caller]]:
+    made: list[Caller] = []
+
+    def start(robot: Robot) -> Caller:
+        made.append(Caller(robot.domain))
+        made[-1].wait()
+        return made[-1]
+
+    yield start
+    for caller in made:
+        caller.close()
+
+
+def load_until(caller: Caller, condition: Callable[[], object], limit_s: float = 60.0) -> None:
+    """Ask and take answers until a condition holds."""
+    end = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end, "what was awaited under load never came"
+        caller.ask()
+        caller.spin(0.01)
+
+
+def links_by_id(robot: Robot) -> dict[tuple[int, int], str]:
+    return {(li["slot"], li["generation"]): li["state"] for li in robot.links() if li["ready"]}
+
+
+def test_a_second_robot_needs_no_manager_and_replicas_move_under_load(pool, call):
+    """Two robots learn of a replica from its own record: its address is told to nobody else.
+
+    It is launched again at another port, as the next generation; then a request that goes on
+    the whole time finds it there, and neither robot was touched.
+    """
+    old = pool.make_replica(0, extra=f"advertise: {'127.0.0.1:1'}\n")
+    pool.admit((0, 1))
+    robots = [pool.make_robot(name) for name in ("ada", "bob")]
+    wait_for(lambda: all("127.0.0.1:1" in str(r.links()) for r in robots), "the told address")
+    old.process.kill()
+    first = pool.make_replica(0, 2)  # not told its address: the rendezvous sees its host
+    pool.admit((0, 2))
+    callers = [call(robot) for robot in robots]
+    pids = [robot.process.pid for robot in robots]
+    moved = pool.make_replica(0, 3)
+    pool.admit((0, 3))
+    for robot, caller in zip(robots, callers, strict=True):
+        load_until(caller, lambda robot=robot: links_by_id(robot) == {(0, 3): "up"})
+    assert moved.endpoint != first.endpoint
+    first.process.kill()
+    for caller in callers:
+        caller.ask(50)
+        assert caller.all_answered()
+    assert [robot.process.poll() for robot in robots] == [None, None]
+    assert [robot.report()["pid"] for robot in robots] == pids
+
+
+@pytest.mark.parametrize("how", ["kill", "freeze"])
+def test_no_request_fails_while_the_rendezvous_is_away(pool, call, how):
+    """And what joins meanwhile is used once it is back, with the robot untouched."""
+    pool.make_replica(0)
+    pool.admit((0, 1))
+    robot = pool.make_robot("ada")
+    caller = call(robot)
+
+    def connected() -> bool:
+        return robot.report()["records"]["rendezvous"][0]["connected"]
+
+    if how == "kill":
+        pool.kill_rendezvous()
+    else:
+        os.kill(pool.rendezvous.pid, signal.SIGSTOP)
+    load_until(caller, lambda: not connected())
+    pool.make_replica(1)
+    pool.admit((0, 1), (1, 1))
+    caller.ask(100)
+    assert caller.all_answered()
+    assert links_by_id(robot) == {(0, 1): "up"}
+    if how == "kill":
+        pool.start_rendezvous()
+    else:
+        os.kill(pool.rendezvous.pid, signal.SIGCONT)
+    load_until(caller, lambda: links_by_id(robot) == {(0, 1): "up", (1, 1): "up"})
+    assert caller.all_answered()
+
+
+def test_a_robot_starts_again_while_the_rendezvous_is_away(pool, call):
+    """From the records on its own disk; and so does a replica's server proxy."""
+    pool.make_replica(0)
+    pool.admit((0, 1))
+    robot = pool.make_robot("ada")
+    caller = call(robot)
+    cache = pool.folder / "ada-records.json"
+    wait_for(lambda: cache.exists() and '\\"slot\\"' in cache.read_text(), "the cache")
+    pool.kill_rendezvous()
+    robot.restart()
+    wait_for(robot.ready, "the replica")
+    caller.wait()
+    caller.ask(50)
+    assert caller.all_answered()
+
+
+def test_the_managers_file_and_the_records_go_together(pool, call):
+    """The later of both counts: a file of an older epoch or version moves nobody."""
+    pool.make_replica(0)
+    for _ in range(5):
+        pool.admit((0, 1))
+    robot = pool.make_robot("ada")
+    caller = call(robot)
+    file = pool.folder / "ada-members.json"
+    file.write_text(json.dumps(membership.to_dict(Membership("p", UID, 1, 2, ()))))
+    caller.ask(20)
+    assert caller.all_answered()
+    assert robot.ready() == [0]
+    file.write_text(json.dumps(membership.to_dict(Membership("p", UID, 2, 1, ()))))
+    wait_for(lambda: not robot.links(), "the later membership of the file")
+
+
+def test_a_replica_that_cannot_be_reached_dials_out_to_the_robot(pool, call):
+    """It listens on its own loopback only; its connections and its process die and come back."""
+    pool.admit((0, 1))
+    door = free_endpoint()
+    robot = pool.make_robot("ada", extra=f"dial_in: {door}\ndial_in_listen: {door}\n")
+    replica = pool.make_replica(0, extra=f"dial_out: ['{door}']\n")
+    caller = call(robot)
+    caller.ask(100)
+    assert caller.all_answered()
+    assert robot.report()["door"]["tunnels"] >= 1
+    replica.process.kill()
+    caller.ask(5)
+    pool.admit((0, 2))
+    pool.make_replica(0, 2, extra=f"dial_out: ['{door}']\n")
+    assert caller.all_answered()
+
+
+def test_a_replica_learns_of_further_robots_from_their_records(pool, call):
+    """It was told of no door at all but that it has to dial: a robot's own record tells it."""
+    doors = [free_endpoint(), free_endpoint()]
+    pool.admit((0, 1))
+    pool.make_replica(0, extra=f"dial_out: ['{doors[0]}']\n")
+    robot = pool.make_robot("bob", extra=f"dial_in: {doors[1]}\ndial_in_listen: {doors[1]}\n")
+    caller = call(robot)
+    caller.ask(20)
+    assert caller.all_answered()
+
+
+def test_one_robot_and_its_manager_need_no_rendezvous_for_a_dialling_replica(
+    tmp_path, ros_domains, call
+):
+    """The manager's file admits a replica without endpoint; replica and robot know the door."""
+    parts = Parts(tmp_path, ros_domains)
+    try:
+        door = free_endpoint()
+        replica = Replica(parts, 0, 0.001, {}, extra=f"dial_out: ['{door}']\n")
+        replica.endpoint = ""
+        robot = Robot(parts, "ada", (replica,), f"dial_in: {door}\ndial_in_listen: {door}\n")
+        caller = call(robot)
+        caller.ask(50)
+        assert caller.all_answered()
+    finally:
+        parts.close()
