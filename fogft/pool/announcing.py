@@ -15,11 +15,12 @@ from pathlib import Path
 
 from fogft.core import names
 from fogft.core.errors import CredentialError
-from fogft.core.holders import Role
+from fogft.core.holders import holder_of
 from fogft.core.model import Membership
 from fogft.core.records import RecordKind
 from fogft.core.roster import admission_content
 from fogft.pool import credentials
+from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.wire.rendezvous_client import RendezvousClient
 
@@ -102,10 +103,8 @@ class ManagerRecords:
         except CredentialError:
             good = False  # there is none yet, or it is damaged
         if not good:
-            name = names.manager_certificate_name(self._pool_uid)
-            issued = credentials.issue(
-                self._paths.credentials, name, role=Role.MANAGER, days=CERTIFICATE_DAYS
-            )
+            holder = holder_of(names.manager_certificate_name(self._pool_uid))
+            issued = Ledger(self._paths.credentials).issue(holder, days=CERTIFICATE_DAYS)
             credentials.write(issued, self._paths.credentials, _STEM)
         self._certified_at = now
 
@@ -115,9 +114,7 @@ class ManagerRecords:
         if self._client is None or self._client.known.connected:
             return ""
         said = self._client.status()["rendezvous"]
-        return "no rendezvous can be reached: " + "; ".join(
-            f"`{one['endpoint']}`: {one['detail']}" for one in said
-        )
+        return "no rendezvous can be reached: " + "; ".join(str(one["detail"]) for one in said)
 
     def close(self) -> None:
         """Leave. Repeatable."""

@@ -10,6 +10,7 @@ Owns: TCP, TLS and the greeting. Not here: what is exchanged then (`record_excha
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 import ssl
 from typing import Any
@@ -99,6 +100,10 @@ class Caller:
         except asyncio.TimeoutError:
             raw.close()
             raise WireError(f"`{self._endpoint}` does not answer") from None
+        except OSError as error:
+            raw.close()
+            words = os.strerror(error.errno).lower() if error.errno else str(error)
+            raise WireError(f"`{self._endpoint}`: {words}") from error
         except BaseException:
             raw.close()
             raise
