@@ -113,7 +113,7 @@ def join(file: Path, passphrase: str, root: Path, now: float) -> Joined:
     """
     data = read(file)
     label, content = bundle.open_sealed(data, passphrase, now)
-    files = _checked(content)
+    files = checked_files(content)
     disk.make_folder(root / "joined")
     used = root / "joined" / "used.json"
     with disk.locked(root / "joined" / "used.lock"):
@@ -152,7 +152,12 @@ def read(file: Path) -> bytes:
         ) from None
 
 
-def _checked(content: dict[str, Any]) -> dict[str, str]:
+def checked_files(content: dict[str, Any]) -> dict[str, str]:
+    """Return the files that a bundle brings, once their names are found to be harmless.
+
+    Raises:
+        CredentialError: One is not.
+    """
     files = content.get("files")
     if not isinstance(files, dict) or not files:
         raise CredentialError("the bundle holds no files")

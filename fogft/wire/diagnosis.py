@@ -7,13 +7,17 @@ way to an answer; `fogft doctor` may call it too.
 from __future__ import annotations
 
 import contextlib
+import datetime
 import socket
 import ssl
 
 from fogft.core.errors import CredentialError
+from fogft.wire.clocks import judged_here, judged_there, validity_of
 from fogft.wire.config import CredentialPaths
 from fogft.wire.port import Peer
 
+# OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
+_OUT_OF_TIME = (9, 10)
 _ALERTS = {
     "unknown ca": "our certificate is of another CA than the replica's",
     "decrypt error": "our certificate is of another CA than the replica's",
@@ -43,7 +47,7 @@ def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
             with context.wrap_socket(raw) as link:
                 return _after_handshake(link, peer)
     except ssl.SSLError as error:
-        return _tls_words(error)
+        return _clock_words(error, peer, credentials, timeout_s) or _tls_words(error)
     except TimeoutError:
         return f"`{peer.endpoint}` does not answer: frozen, blackholed or overloaded"
     except (OSError, ValueError) as error:
@@ -91,6 +95,38 @@ def _common_name(link: ssl.SSLSocket) -> str | None:
             if isinstance(entry, tuple) and entry[0] == "commonName":
                 return str(entry[1])
     return None
+
+
+def _clock_words(
+    error: ssl.SSLError, peer: Peer, credentials: CredentialPaths, timeout_s: float
+) -> str:
+    """Return whose clock is wrong where a certificate was refused for its time, else nothing."""
+    now = datetime.datetime.now(datetime.timezone.utc)
+    if isinstance(error, ssl.SSLCertVerificationError):
+        if error.verify_code not in _OUT_OF_TIME:
+            return ""
+        validity = validity_of(_certificate_of(peer, credentials, timeout_s))
+        why = judged_here(validity, now) if validity is not None else ""
+        return f"the replica's certificate is refused: {why}" if why else ""
+    if "certificate expired" not in str(error).lower():
+        return ""
+    with contextlib.suppress(OSError):
+        validity = validity_of(credentials.certificate.read_bytes())
+        if validity is not None:
+            return judged_there(validity, now)
+    return ""
+
+
+def _certificate_of(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> bytes:
+    """Return the certificate (DER) that stands at an endpoint, whoever's it is; to look at only."""
+    host, _, port = peer.endpoint.rpartition(":")
+    context = _context(credentials)
+    context.verify_mode = ssl.CERT_NONE
+    with contextlib.suppress(OSError, ValueError):
+        with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as raw:
+            with context.wrap_socket(raw) as link:
+                return link.getpeercert(binary_form=True) or b""
+    return b""
 
 
 def _tls_words(error: ssl.SSLError) -> str:

@@ -43,7 +43,11 @@ def check_script(words: list[str]) -> None:
     assert script.stat().st_mode & 0o111
     source = script.read_text() + "".join(
         path.read_text()
-        for path in (ROOT / "scripts/quickstart_demo.py", ROOT / "tests/bench/__main__.py")
+        for path in (
+            ROOT / "scripts/quickstart_demo.py",
+            ROOT / "tests/bench/__main__.py",
+            ROOT / "tests/fuzz/__main__.py",
+        )
     )
     for option in words[1:]:
         if option.startswith("--") and words[0] != "scripts/test":

@@ -111,7 +111,9 @@ def test_no_certificate_is_refused(
     assert _heard_nothing(replica)
 
 
-@pytest.mark.parametrize(("begin", "end", "words"), [(1, 2, "not yet valid"), (-2, -1, "expired")])
+@pytest.mark.parametrize(
+    ("begin", "end", "words"), [(1, 2, "not yet valid"), (-2, -1, "expired at")]
+)
 def test_a_replica_out_of_its_time_is_refused(
     authority: Authority,
     start_replica: Callable[..., ReplicaProcess],
@@ -126,7 +128,32 @@ def test_a_replica_out_of_its_time_is_refused(
     monkeypatch.setattr(credentials, "BACKDATE", -begin * day)
     name = names.replica_certificate_name(peer("").id)
     replica = start_replica(files=authority.issue(name, Role.REPLICA, days=end))
-    _refused(dial(replica.endpoint), words)
+    link = dial(replica.endpoint)
+    _refused(link, words)
+    assert "this machine's clock says" in link.status().detail
+    assert _heard_nothing(replica)
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "words"),
+    [(2, 3, "our certificate has not begun"), (-2, -1, "our certificate has expired")],
+)
+def test_a_robot_out_of_its_time_is_told_whose_clock_it_is(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    monkeypatch: pytest.MonkeyPatch,
+    begin: int,
+    end: int,
+    words: str,
+) -> None:
+    """The replica refuses it; by our own clock we see why."""
+    replica = start_replica()
+    monkeypatch.setattr(credentials, "BACKDATE", -begin * datetime.timedelta(days=1))
+    name = names.robot_certificate_name(POOL_UID, "robot")
+    link = dial(replica.endpoint, files=authority.issue(name, Role.ROBOT, days=end))
+    _refused(link, words)
+    assert "this machine's clock says" in link.status().detail
     assert _heard_nothing(replica)
 
 

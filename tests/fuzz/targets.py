@@ -1,0 +1,215 @@
+"""Every decoder of bytes that somebody else wrote, with what it may raise and what it takes.
+
+A target takes any bytes. It returns, or raises what is listed; anything else is a finding.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+from fogft.core import holders, membership, records
+from fogft.core.errors import CredentialError, StateError
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.record_set import RecordSet
+from fogft.core.records import RecordError, RecordKind, SignedRecord
+from fogft.pool import bundle, credentials, joining
+from fogft.wire import frame, record_frames
+from fogft.wire.frame import FrameError, Greeting
+from fogft.wire.guests import Guests, NotAdmittedError
+from fogft.wire.port import Probe, ProbeAnswer
+from fogft.wire.signing import Signer, Verifier
+
+UID = "0123456789abcdef"
+ROBOT = f"robot.ada.1.{UID}"
+REPLICA = f"replica.0.1.{UID}"
+MANAGER = f"manager.manager.1.{UID}"
+ID, TOKEN = bytes(range(16)), bytes(8)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A decoder.
+
+    Attributes:
+        decode: Takes bytes.
+        refusals: What it may raise.
+        seeds: Inputs that it accepts, to begin from.
+    """
+
+    decode: Callable[[bytes], Any]
+    refusals: tuple[type[Exception], ...]
+    seeds: tuple[bytes, ...]
+
+    def run(self, data: bytes) -> bool:
+        """Decode; return whether it was accepted. Raises what is a finding."""
+        try:
+            self.decode(data)
+        except self.refusals:
+            return False
+        return True
+
+
+@lru_cache(maxsize=1)
+def _signers() -> tuple[Path, Callable[[str], Signer]]:
+    folder = Path(tempfile.mkdtemp(prefix="fogft-fuzz-"))
+    credentials.create_authority(folder, UID)
+
+    @cache
+    def signer(common_name: str) -> Signer:
+        role = holders.holder_of(common_name).role
+        issued = credentials.issue(folder, common_name, role=role)
+        credentials.write(issued, folder, common_name)
+        return Signer(folder / f"{common_name}.crt", folder / f"{common_name}.key")
+
+    return folder / "ca.crt", signer
+
+
+def _record(kind: RecordKind, subject: str, writer: str, content: dict[str, Any]) -> SignedRecord:
+    record = records.Record(UID, kind, subject, 1, 1, content)
+    return records.sign_record(record, _signers()[1](writer))
+
+
+def _records() -> list[SignedRecord]:
+    slot = {
+        "endpoint": "10.0.0.1:7447",
+        "observed_endpoint": "",
+        "dials_out": False,
+        "services": ["/s"],
+        "draining": False,
+        "in_flight": 0,
+    }
+    member = {"slot": 0, "generation": 1, "endpoint": "h:1", "draining": False}
+    return [
+        _record(RecordKind.SLOT, "0", REPLICA, slot),
+        _record(RecordKind.ADMISSION, "", MANAGER, {"name": "p", "members": [member]}),
+        _record(RecordKind.REVOCATION, "", MANAGER, {"names": [f"robot.eve.1.{UID}"]}),
+    ]
+
+
+def _offer(data: bytes) -> None:
+    """Offer a signed record, as JSON, to a set; it judges without raising."""
+    records_ = RecordSet(UID, _verifier())
+    records_.offer(records.from_plain(_json(data)))
+    assert len(records_) == sum(records_.counts[v] for v in ("accepted",))
+
+
+@lru_cache(maxsize=1)
+def _verifier() -> Verifier:
+    return Verifier(_signers()[0])
+
+
+@lru_cache(maxsize=1)
+def _guests() -> Guests:
+    return Guests(UID, REPLICA, _verifier())
+
+
+def _stream(data: bytes) -> None:
+    """Read a rendezvous's stream, cut in two, and each message as every kind."""
+    unframer = record_frames.Unframer()
+    half = len(data) // 2
+    for part in (data[:half], data[half:]):
+        for message in unframer.feed(part):
+            for read in (
+                record_frames.read_challenge,
+                record_frames.read_greeting,
+                record_frames.read_have,
+                record_frames.read_records,
+            ):
+                with contextlib.suppress(RecordError):
+                    read(message)
+
+
+def _judge_greeting(data: bytes) -> None:
+    greeting = frame.decode_greeting(data)
+    _guests().greet(greeting)
+    good = {ROBOT}
+    assert set(_guests().names) <= good, "somebody was let in who holds no certificate"
+
+
+def _greeting() -> bytes:
+    certificate, signature = _signers()[1](ROBOT)(frame.greeted_bytes(TOKEN, REPLICA))
+    return frame.encode_greeting(Greeting(TOKEN, certificate, signature))
+
+
+def _json(data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError):
+        raise RecordError("malformed", "no JSON") from None
+
+
+def _bundle() -> bytes:
+    label = bundle.Label("id", "pool", ROBOT, 1.0, 2.0)
+    return bundle.seal(label, {"files": {"a/b": "c"}}, "a passphrase of mine")
+
+
+def targets() -> dict[str, Target]:
+    """Return all decoders by name."""
+    framed, recorded = (FrameError,), (RecordError,)
+    answer = ProbeAnswer(0, 1, "x", frozenset({"/s"}), detail="why")
+    plain = [json.dumps(records.to_plain(one)).encode() for one in _records()]
+    known = Membership("p", UID, 1, 2, (Member(ReplicaId(UID, 0, 1), "h:1"),), frozenset({ROBOT}))
+    greeting = _greeting()
+    stream = b"".join(
+        [
+            record_frames.ping(),
+            record_frames.have({("slot", "0"): (1, 1)}),
+            *record_frames.records(_records()),
+        ]
+    )
+    return {
+        "request": Target(
+            frame.decode_request,
+            framed,
+            (frame.encode_request(ID, 1.5, frame.origin("ada", TOKEN)),),
+        ),
+        "answer": Target(frame.decode_answer, framed, (frame.encode_answer(ID),)),
+        "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(ID, "lost"),)),
+        "cancel": Target(frame.decode_cancel, framed, (frame.encode_cancel([ID, ID]),)),
+        "probe": Target(frame.decode_probe, framed, (frame.encode_probe(Probe("ada", 1.0)),)),
+        "probe answer": Target(
+            frame.decode_probe_answer, framed, (frame.encode_probe_answer(answer),)
+        ),
+        "greeting": Target(
+            frame.decode_greeting, framed, (greeting, frame.encode_greeting(Greeting(TOKEN)))
+        ),
+        "greeting, judged": Target(_judge_greeting, (FrameError, NotAdmittedError), (greeting,)),
+        "common name": Target(
+            lambda data: holders.holder_of(data.decode("latin-1")),
+            (ValueError,),
+            (ROBOT.encode(), REPLICA.encode()),
+        ),
+        "membership": Target(
+            lambda data: membership.from_dict(_json(data)),
+            (StateError, RecordError),
+            (json.dumps(membership.to_dict(known)).encode(),),
+        ),
+        "record": Target(
+            lambda data: records.read_body(SignedRecord(data, b"", b"")),
+            recorded,
+            tuple(one.body for one in _records()),
+        ),
+        "record, judged": Target(_offer, recorded, tuple(plain)),
+        "certificate": Target(
+            lambda data: _verifier()(data, b"", b""), recorded, (_records()[0].certificate,)
+        ),
+        "record stream": Target(_stream, recorded, (stream,)),
+        "bundle": Target(bundle.read_label, (CredentialError,), (_bundle(),)),
+        "bundle's files": Target(
+            lambda data: joining.checked_files(_object(data)),
+            (CredentialError, RecordError),
+            (b'{"files": {"a/b": "c"}}',),
+        ),
+    }
+
+
+def _object(data: bytes) -> dict[str, Any]:
+    value = _json(data)
+    return value if isinstance(value, dict) else {}
