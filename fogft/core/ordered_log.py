@@ -1,0 +1,105 @@
+"""The numbered requests that a replica may still need, and the snapshot before them. Pure.
+
+Owns: entries from `start` + 1 to `last`, their bounds, and the checkpoint.
+Not here: who needs them (`sequencer`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A service's own snapshot, taken after the request `index`."""
+
+    index: int
+    state: bytes
+
+
+class OrderedLog:
+    """Requests by number, consecutive, bounded by count and bytes.
+
+    Args:
+        start: The number after which it begins: all before is part of a state.
+        entries_limit: The most entries; one more is refused.
+        bytes_limit: Their bytes together; a larger single entry still gets in alone.
+    """
+
+    def __init__(
+        self, start: int, *, entries_limit: int = 8192, bytes_limit: int = 64 << 20
+    ) -> None:
+        self.start = start
+        self.checkpoint: Checkpoint | None = None
+        self._entries: deque[bytes] = deque()
+        self._bytes = 0
+        self._entries_limit = entries_limit
+        self._bytes_limit = bytes_limit
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @property
+    def last(self) -> int:
+        """The highest number given."""
+        return self.start + len(self._entries)
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of all entries, without the checkpoint."""
+        return self._bytes
+
+    @property
+    def half_full(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return 2 * len(self._entries) >= self._entries_limit or 2 * self._bytes >= self._bytes_limit
+
+    def has_room(self, size: int) -> bool:
+        """Whether a request of this size can be appended."""
+        if not self._entries:
+            return True
+        within = self._bytes + size <= self._bytes_limit
+        return within and len(self._entries) < self._entries_limit
+
+    def append(self, payload: bytes) -> int:
+        """Number a request; ask `has_room` before.
+
+        Raises:
+            ValueError: There is no room.
+        """
+        if not self.has_room(len(payload)):
+            raise ValueError("the log is full")
+        self._entries.append(payload)
+        self._bytes += len(payload)
+        return self.last
+
+    def get(self, index: int) -> bytes:
+        """Return a request.
+
+        Raises:
+            IndexError: It is not in the log.
+        """
+        if not self.start < index <= self.last:
+            raise IndexError(f"the log has no number {index}")
+        return self._entries[index - self.start - 1]
+
+    def covers(self, index: int) -> bool:
+        """Whether a replica at this index can be brought up to date from the log alone."""
+        return self.start <= index <= self.last
+
+    def keep(self, checkpoint: Checkpoint) -> None:
+        """Take a newer snapshot, and drop what it covers. An older one is ignored."""
+        old = self.checkpoint
+        if not self.covers(checkpoint.index) or (old and old.index >= checkpoint.index):
+            return
+        self.checkpoint = checkpoint
+        self.drop(checkpoint.index)
+
+    def drop(self, index: int) -> None:
+        """Drop everything up to a number. A checkpoint before it is of no use any more."""
+        while self._entries and self.start < index:
+            self._bytes -= len(self._entries.popleft())
+            self.start += 1
+        if self.checkpoint is not None and self.checkpoint.index < self.start:
+            self.checkpoint = None

@@ -1,0 +1,187 @@
+"""The orders between a sequencer and the replicas of a stateful service. Pure values.
+
+An order travels as an ordinary request whose 16-byte id is the order itself: operation,
+epoch and index. So a request needs no envelope, and its bytes are never copied for it.
+An answer is the payload that belongs to the operation, or a refusal.
+
+Owns: epochs, positions, orders, and their bytes.
+Not here: who sends which order (`sequencer`) and what becomes of it (`ordered_replica`).
+Protocol: docs/design/state.md.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+_ID = struct.Struct(">QQ")
+_POSITION = struct.Struct(">QQ")
+_PROMISE = struct.Struct(">QQB")
+_INDEX = struct.Struct(">Q")
+INDEX_LIMIT = 1 << 56
+_EPOCH_LIMIT = 1 << 64
+
+NOT_JOINED = "not-joined"  # it obeys this term, and has not been brought to its state
+_GAP, _FENCED, _HELD = "gap:", "fenced:", "held:"
+
+
+class OrderError(ValueError):
+    """These bytes are no order, or not the answer to one."""
+
+
+class Op(IntEnum):
+    """What a sequencer may order."""
+
+    CLAIM = 1
+    JOIN = 2
+    RESTORE = 3
+    SNAPSHOT = 4
+    APPLY = 5
+    RECALL = 6  # give the answer to a number that was applied; never applies it
+
+
+@dataclass(frozen=True, order=True)
+class Position:
+    """A state: all requests up to `index`, in the order of the term `epoch`.
+
+    The default is the state in which a service starts.
+    """
+
+    epoch: int = 0
+    index: int = 0
+
+
+START = Position()
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a replica says of itself when it is claimed.
+
+    Attributes:
+        sound: Whether its state is that of `position`; a restore that failed leaves it unsound.
+    """
+
+    position: Position
+    sound: bool
+
+
+def next_epoch(after: int, nonce: int) -> int:
+    """Return an epoch above another one, made unique by 32 random bits.
+
+    Raises:
+        ValueError: The nonce is out of range, or there are no epochs left.
+    """
+    epoch = ((after >> 32) + 1) << 32 | nonce
+    if not 0 <= nonce < 1 << 32 or epoch >= _EPOCH_LIMIT:
+        raise ValueError("no such epoch")
+    return epoch
+
+
+def encode(op: Op, epoch: int, index: int) -> bytes:
+    """Return an order as a request id."""
+    return _ID.pack(epoch, op << 56 | index)
+
+
+def decode(id: bytes) -> tuple[Op, int, int]:
+    """Return operation, epoch and index of an order.
+
+    Raises:
+        OrderError: It is not one.
+    """
+    try:
+        epoch, rest = _ID.unpack(id)
+        return Op(rest >> 56), epoch, rest & (INDEX_LIMIT - 1)
+    except (struct.error, ValueError) as error:
+        raise OrderError(f"no order: {id.hex()}") from error
+
+
+def encode_position(position: Position) -> bytes:
+    """Return a position as bytes."""
+    return _POSITION.pack(position.epoch, position.index)
+
+
+def decode_position(payload: bytes) -> Position:
+    """Read a position. Raises OrderError."""
+    return Position(*_unpack(_POSITION, payload))
+
+
+def encode_promise(promise: Promise) -> bytes:
+    """Return a promise as bytes."""
+    return _PROMISE.pack(promise.position.epoch, promise.position.index, promise.sound)
+
+
+def decode_promise(payload: bytes) -> Promise:
+    """Read a promise. Raises OrderError."""
+    epoch, index, sound = _unpack(_PROMISE, payload)
+    return Promise(Position(epoch, index), bool(sound))
+
+
+def encode_index(index: int) -> bytes:
+    """Return an index as bytes."""
+    return _INDEX.pack(index)
+
+
+def decode_index(payload: bytes) -> int:
+    """Read an index. Raises OrderError."""
+    (index,) = _unpack(_INDEX, payload)
+    return int(index)
+
+
+def encode_snapshot(index: int, state: bytes) -> bytes:
+    """Return a snapshot: the index it stands for, and the state's own bytes."""
+    return _INDEX.pack(index) + state
+
+
+def decode_snapshot(payload: bytes) -> tuple[int, bytes]:
+    """Read a snapshot. Raises OrderError."""
+    return decode_index(payload[: _INDEX.size]), payload[_INDEX.size :]
+
+
+def _unpack(layout: struct.Struct, payload: bytes) -> tuple[int, ...]:
+    try:
+        return layout.unpack(payload)
+    except struct.error as error:
+        raise OrderError(f"an answer of {len(payload)} bytes") from error
+
+
+def gap(expected: int) -> str:
+    """Return the refusal of a number that is too high: which one is expected."""
+    return f"{_GAP}{expected}"
+
+
+def fenced(epoch: int) -> str:
+    """Return the refusal of an order of a term that has ended: the term that is obeyed."""
+    return f"{_FENCED}{epoch:x}"
+
+
+def held(robot: str) -> str:
+    """Return the refusal of another robot's claim: whose order is obeyed."""
+    ascii_name = robot.encode("ascii", "replace").decode()
+    return f"{_HELD}{ascii_name[:48]}"
+
+
+def read_gap(reason: str) -> int | None:
+    """Return the expected number, if the refusal is a gap."""
+    return _number(reason, _GAP, 10)
+
+
+def read_fenced(reason: str) -> int | None:
+    """Return the epoch that is obeyed, if the refusal says so."""
+    return _number(reason, _FENCED, 16)
+
+
+def read_held(reason: str) -> str | None:
+    """Return the robot that is obeyed, if the refusal says so."""
+    return reason.removeprefix(_HELD) if reason.startswith(_HELD) else None
+
+
+def _number(reason: str, prefix: str, base: int) -> int | None:
+    if not reason.startswith(prefix):
+        return None
+    try:
+        number = int(reason.removeprefix(prefix), base)
+    except ValueError:
+        return None
+    return number if 0 <= number < _EPOCH_LIMIT else None

@@ -1,0 +1,379 @@
+"""Number the requests of a stateful service and bring every replica through them. Pure.
+
+One `Sequencer` is one term: it claims the replicas, begins from the state of one of them
+(never from one before the mark), and from then on gives out numbers. It holds what each
+replica still needs. What is to be sent collects until `take`; the owner sends it and
+reports each order's end, once, by `replied`, `refused` or `declined`.
+
+Owns: one term's numbers, its log, and what each replica is to be sent.
+Not here: callers and deadlines (`fogft.proxy.ordered_dispatcher`), bytes on the wire.
+Protocol and its argument: docs/design/state.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+
+from fogft.core import ordering
+from fogft.core.ordered_log import Checkpoint, OrderedLog
+from fogft.core.ordering import START, Op, Position, Promise
+
+RETRY_FIRST_S = 0.02
+RETRY_LIMIT_S = 0.5
+CHECKPOINT_RETRY_S = 1.0
+WINDOW = 256
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to send to a replica: an operation of this term, with its bytes."""
+
+    replica: int
+    op: Op
+    index: int
+    payload: bytes = b""
+
+
+class Phase(Enum):
+    """How far a replica has come in this term."""
+
+    UNCLAIMED = "unclaimed"  # it is to be claimed, at once or after a pause
+    ASKED = "asked"  # an order is on its way that changes its phase
+    CLAIMED = "claimed"  # it obeys, and waits for a state that it can take
+    JOINED = "joined"  # it applies what is sent to it
+
+
+@dataclass
+class _Peer:
+    """A replica as this term knows it."""
+
+    phase: Phase = Phase.UNCLAIMED
+    promise: Promise | None = None
+    next: int = 0  # the number to send next
+    rewind: int | None = None  # go back to it once nothing is on its way
+    open: set[int] = field(default_factory=set)
+    acked: int = 0
+    won: int = 0
+    wait_s: float = RETRY_FIRST_S / 2
+    retry_at: float = 0.0
+
+
+class Sequencer:
+    """One term of a sequencer.
+
+    Args:
+        epoch: This term, above every earlier one.
+        mark: The position of the last answer that was returned, in whatever term.
+        log_entries: Requests kept at most.
+        log_bytes: Their bytes at most.
+    """
+
+    def __init__(
+        self,
+        epoch: int,
+        *,
+        mark: Position = START,
+        log_entries: int = 8192,
+        log_bytes: int = 64 << 20,
+    ) -> None:
+        self.epoch = epoch
+        self.mark = mark
+        self.base: Position | None = None  # None until the term has begun
+        self.log: OrderedLog | None = None
+        self.deposed_by: int | None = None
+        self.held_by = ""  # another robot whose order the replicas obey
+        self._bounds = (log_entries, log_bytes)
+        self._peers: dict[int, _Peer] = {}
+        self._out: list[Order] = []
+        self._unanswered: dict[int, None] = {}
+        self._serial = 0
+        self._asked_for_checkpoint: int | None = None
+        self._checkpoint_at = 0.0
+
+    # -- what the owner asks --------------------------------------------------------------
+
+    @property
+    def ready(self) -> bool:
+        """Whether a number given now is sent to somebody at once."""
+        return any(peer.phase is Phase.JOINED for peer in self._peers.values())
+
+    @property
+    def joined(self) -> list[int]:
+        """The replicas that apply what is sent to them."""
+        return [replica for replica, peer in self._peers.items() if peer.phase is Phase.JOINED]
+
+    @property
+    def stranded(self) -> bool:
+        """Whether replicas answer, and none of them can be brought to the present state."""
+        waiting = [p for p in self._peers.values() if p.phase is Phase.CLAIMED]
+        return bool(waiting) and not self.ready and not self._coming()
+
+    def _coming(self) -> bool:
+        return any(peer.phase is Phase.ASKED for peer in self._peers.values())
+
+    def take(self) -> list[Order]:
+        """Return the orders to send, in this order, and forget them."""
+        out, self._out = self._out, []
+        return out
+
+    def submit(self, payload: bytes) -> int | None:
+        """Number a request and order it applied; None while the term has not begun or is full."""
+        log = self.log
+        if log is None or self.deposed_by is not None:
+            return None
+        if not log.has_room(len(payload)) and not self._make_room(len(payload)):
+            return None
+        index = log.append(payload)
+        self._unanswered[index] = None
+        for replica, peer in self._peers.items():
+            if peer.phase is not Phase.JOINED:
+                continue
+            if peer.next == index and peer.rewind is None and len(peer.open) < WINDOW:
+                peer.next = index + 1
+                peer.open.add(index)
+                self._out.append(Order(replica, Op.APPLY, index, payload))
+        return index
+
+    def abandon(self, index: int) -> None:
+        """Nobody waits for the answer to this number any more. It is applied all the same."""
+        self._unanswered.pop(index, None)
+
+    def reach(self, replicas: Iterable[int], now: float) -> None:
+        """Set which replicas can be sent to; new ones are claimed at once."""
+        wanted = set(replicas)
+        for replica in [r for r in self._peers if r not in wanted]:
+            self._drop(replica)
+        for replica in sorted(wanted - self._peers.keys()):
+            self._peers[replica] = _Peer()
+        self.tick(now)
+
+    def _drop(self, replica: int) -> None:
+        del self._peers[replica]
+        if self._asked_for_checkpoint == replica:
+            self._asked_for_checkpoint = None
+
+    def tick(self, now: float) -> None:
+        """Do what is due: claim again, send what is missing, ask for a checkpoint."""
+        if self.deposed_by is not None:
+            return
+        for replica, peer in self._peers.items():
+            if peer.phase is Phase.UNCLAIMED and peer.retry_at <= now:
+                peer.phase = Phase.ASKED
+                self._serial += 1
+                self._out.append(Order(replica, Op.CLAIM, self._serial))
+            elif peer.phase is Phase.CLAIMED:
+                self._bring(replica, peer)
+            elif peer.phase is Phase.JOINED:
+                self._feed(replica, peer)
+        self._see_to_checkpoint(now)
+
+    # -- what replicas say ----------------------------------------------------------------
+
+    def replied(self, replica: int, op: Op, index: int, payload: bytes) -> bool:
+        """Take a reply. Return whether it is the first answer to a number: return it, after
+        having written down `mark`.
+
+        Raises:
+            OrderError: The bytes are not what this operation is answered with.
+        """
+        peer = self._peers.get(replica)
+        if op in (Op.APPLY, Op.RECALL):
+            return self._applied(peer, replica, index)
+        if op is Op.SNAPSHOT:
+            if self._asked_for_checkpoint == replica:
+                self._asked_for_checkpoint = None
+            self._take_checkpoint(*ordering.decode_snapshot(payload))
+            return False
+        if peer is None:
+            return False
+        if op is Op.CLAIM:
+            self._promised(replica, peer, ordering.decode_promise(payload))
+        else:
+            self._has_joined(replica, peer, ordering.decode_index(payload))
+        return False
+
+    def _applied(self, peer: _Peer | None, replica: int, index: int) -> bool:
+        first = index in self._unanswered
+        if first:
+            del self._unanswered[index]
+            # Answers to later numbers imply all earlier ones; a mark never goes back.
+            self.mark = max(self.mark, Position(self.epoch, index))
+        if peer is not None:
+            peer.open.discard(index)
+            peer.acked = max(peer.acked, index)
+            peer.won += first
+            if peer.phase is Phase.JOINED:
+                self._feed(replica, peer)
+        return first
+
+    def _promised(self, replica: int, peer: _Peer, promise: Promise) -> None:
+        if peer.phase is not Phase.ASKED:
+            return
+        peer.phase = Phase.CLAIMED
+        peer.promise = promise
+        self.held_by = ""
+        if self.base is None and promise.sound and promise.position >= self.mark:
+            self.base = promise.position
+            entries, size = self._bounds
+            self.log = OrderedLog(promise.position.index, entries_limit=entries, bytes_limit=size)
+            for other, known in self._peers.items():
+                if known.phase is Phase.CLAIMED:
+                    self._bring(other, known)
+        else:
+            self._bring(replica, peer)
+
+    def _bring(self, replica: int, peer: _Peer) -> None:
+        """Let a claimed replica join, from its own state or from the checkpoint."""
+        log, promise = self.log, peer.promise
+        if log is None or promise is None or peer.open:
+            return
+        at = promise.position
+        ours = at == self.base or at.epoch == self.epoch
+        if promise.sound and ours and log.covers(at.index):
+            peer.phase = Phase.ASKED
+            payload = ordering.encode_position(at)
+            self._out.append(Order(replica, Op.JOIN, at.index, payload))
+        elif log.checkpoint is not None:
+            peer.phase = Phase.ASKED
+            kept = log.checkpoint
+            self._out.append(Order(replica, Op.RESTORE, kept.index, kept.state))
+
+    def _has_joined(self, replica: int, peer: _Peer, expected: int) -> None:
+        log = self.log
+        if peer.phase is not Phase.ASKED or log is None:
+            return
+        if not log.covers(expected - 1):  # the log has moved on meanwhile
+            peer.phase = Phase.UNCLAIMED
+            return
+        peer.phase = Phase.JOINED
+        peer.wait_s = RETRY_FIRST_S / 2
+        peer.rewind = None
+        peer.next = expected
+        peer.acked = max(peer.acked, expected - 1)
+        # Applied there, and the answer never came: it is kept, and is asked for again.
+        for index in self._unanswered:
+            if index < expected and index not in peer.open:
+                peer.open.add(index)
+                self._out.append(Order(replica, Op.RECALL, index))
+        self._feed(replica, peer)
+
+    def _feed(self, replica: int, peer: _Peer) -> None:
+        log = self.log
+        assert log is not None
+        if peer.rewind is not None:
+            if peer.open:
+                return
+            peer.next, peer.rewind = peer.rewind, None
+        if not log.covers(peer.next - 1):
+            self._pause(peer, 0.0)
+            return
+        while peer.next <= log.last and len(peer.open) < WINDOW:
+            index = peer.next
+            peer.next += 1
+            if index not in peer.open:
+                peer.open.add(index)
+                self._out.append(Order(replica, Op.APPLY, index, log.get(index)))
+
+    # -- what does not succeed ------------------------------------------------------------
+
+    def refused(self, replica: int, op: Op, index: int, reason: str, now: float) -> None:
+        """Take a refusal, or the loss of an order: the replica may or may not have obeyed it."""
+        epoch = ordering.read_fenced(reason)
+        if epoch is not None and epoch > self.epoch:
+            self.deposed_by = max(epoch, self.deposed_by or 0)
+            self._out.clear()
+            return
+        self.held_by = ordering.read_held(reason) or self.held_by
+        peer = self._peers.get(replica)
+        if op is Op.SNAPSHOT:
+            if self._asked_for_checkpoint == replica:
+                self._asked_for_checkpoint = None
+            return
+        if peer is None:
+            return
+        if op in (Op.APPLY, Op.RECALL):
+            peer.open.discard(index)
+            expected = ordering.read_gap(reason)
+            if expected is not None:
+                self._go_back(peer, expected)
+                return
+        self._pause(peer, now)
+
+    def _go_back(self, peer: _Peer, expected: int) -> None:
+        """Send again from a number, once what is on its way has been answered."""
+        if peer.phase is Phase.JOINED and expected <= peer.next:
+            peer.rewind = expected if peer.rewind is None else min(peer.rewind, expected)
+
+    def skipped(self, replica: int, index: int) -> None:
+        """A replica has this number behind it, and has no answer (any more) to give."""
+        peer = self._peers.get(replica)
+        if peer is not None:
+            peer.open.discard(index)
+            peer.acked = max(peer.acked, index)
+
+    def declined(self, replica: int, op: Op, index: int, now: float) -> None:
+        """An order was not taken by the link: it was not sent."""
+        peer = self._peers.get(replica)
+        if op is Op.SNAPSHOT:
+            if self._asked_for_checkpoint == replica:
+                self._asked_for_checkpoint = None
+        elif peer is None:
+            return
+        elif op is Op.APPLY:
+            peer.open.discard(index)
+            self._go_back(peer, index)
+        else:
+            peer.open.discard(index)
+            self._pause(peer, now)
+
+    def _pause(self, peer: _Peer, now: float) -> None:
+        """Claim a replica anew after a moment, longer each time: that tells where it stands."""
+        if peer.phase is Phase.UNCLAIMED:
+            return
+        peer.phase = Phase.UNCLAIMED
+        peer.rewind = None
+        peer.wait_s = min(peer.wait_s * 2, RETRY_LIMIT_S)
+        peer.retry_at = now + peer.wait_s
+
+    # -- the log's bounds -----------------------------------------------------------------
+
+    def _see_to_checkpoint(self, now: float) -> None:
+        log = self.log
+        if log is None or self._asked_for_checkpoint is not None or now < self._checkpoint_at:
+            return
+        kept = log.checkpoint
+        # A log that begins with the service's first state needs none; nor does one just taken.
+        waits = any(p.phase is Phase.CLAIMED for p in self._peers.values())
+        needed = kept is None and (log.start > 0 or waits)
+        if not needed and not log.half_full:
+            return
+        joined = [(p.won, r) for r, p in self._peers.items() if p.phase is Phase.JOINED]
+        if not joined:
+            return
+        _, replica = min(joined)  # one that seldom answers first: it pauses for the snapshot
+        self._asked_for_checkpoint = replica
+        self._checkpoint_at = now + CHECKPOINT_RETRY_S
+        self._serial += 1
+        self._out.append(Order(replica, Op.SNAPSHOT, self._serial))
+
+    def _take_checkpoint(self, index: int, state: bytes) -> None:
+        if self.log is not None and self.deposed_by is None:
+            self.log.keep(Checkpoint(index, state))
+            self._checkpoint_at = 0.0
+
+    def _make_room(self, size: int) -> bool:
+        """Drop what every joined replica has applied; then who lags is restored later."""
+        log = self.log
+        assert log is not None
+        joined = [p for p in self._peers.values() if p.phase is Phase.JOINED]
+        if not joined:
+            return False
+        log.drop(min(p.acked for p in joined))
+        if not log.has_room(size):
+            log.drop(max(p.acked for p in joined))
+            for peer in joined:
+                if not log.covers(peer.next - 1 if peer.rewind is None else peer.rewind - 1):
+                    self._pause(peer, 0.0)
+        return log.has_room(size)

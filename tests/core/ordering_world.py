@@ -1,0 +1,266 @@
+"""A sequencer, replicas with services, and a network that loses, repeats and reorders. No time
+passes by itself: each step does one thing, chosen by whoever drives the world.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from fogft.core import ordering
+from fogft.core.ordered_replica import Begin, OrderedReplica, Refuse, Reply
+from fogft.core.ordering import START, Op
+from fogft.core.sequencer import Order, Sequencer
+from tests.linearizability import Call
+
+LOST = "lost"
+
+
+@dataclass(eq=False)
+class Sent:
+    """An order on its way to a replica, until it ends: exactly once."""
+
+    term: int
+    order: Order
+    open: bool = True
+
+
+@dataclass(eq=False)
+class Letter:
+    """Something in the network: an order (to a replica), or its end (to the sequencer)."""
+
+    sent: Sent
+    to_replica: bool
+    payload: bytes | None = None
+    reason: str = ""
+
+
+@dataclass
+class Asked:
+    """A call under way."""
+
+    began: float
+    asked: Any
+    client: int
+
+
+@dataclass
+class Host:
+    """A replica: the machine in the middle, its service at the bottom."""
+
+    machine: OrderedReplica[Sent] = field(default_factory=OrderedReplica)
+    state: Any = None
+    work: Begin | None = None
+    applied: list[Any] = field(default_factory=list)
+
+
+class World:
+    """The whole of it, with a history of what callers saw.
+
+    Args:
+        step: The service: state and question in, next state and answer out.
+        start: The service's first state.
+        log_entries: Of the sequencer.
+    """
+
+    def __init__(self, step: Any, start: Any, *, replicas: int = 3, log_entries: int = 16) -> None:
+        self.step, self.start = step, start
+        self.now = 0.0
+        self.hosts: dict[int, Host] = {}
+        self.letters: list[Letter] = []
+        self.history: list[Call] = []
+        self.pending: dict[int, Asked] = {}  # by number
+        self.questions: dict[bytes, Any] = {}
+        self.waiting: list[tuple[int, Asked]] = []
+        self.mark = START  # on the robot's disk
+        self.epoch = 0  # likewise
+        self.log_entries = log_entries
+        self.next_replica = 0
+        self.restored = 0
+        for _ in range(replicas):
+            self.add_replica()
+        self.sequencer = self.new_term()
+
+    # -- faults and events ----------------------------------------------------------------
+
+    def new_term(self) -> Sequencer:
+        """The client proxy was killed and is back: only epoch and mark are left."""
+        self.epoch = ordering.next_epoch(self.epoch, nonce=7)
+        for asked in self.pending.values():
+            self.history.append(Call(asked.began, asked.asked))
+        self.pending.clear()
+        self.waiting.clear()
+        self.sequencer = Sequencer(self.epoch, mark=self.mark, log_entries=self.log_entries)
+        self.reach()
+        return self.sequencer
+
+    def add_replica(self) -> int:
+        replica, self.next_replica = self.next_replica, self.next_replica + 1
+        self.hosts[replica] = Host(state=self.start)
+        self.hosts[replica].machine.serving = True
+        if replica >= 3 or hasattr(self, "sequencer"):
+            self.reach()
+        return replica
+
+    def remove_replica(self, replica: int) -> None:
+        """The machine is gone for good."""
+        del self.hosts[replica]
+        for letter in self.letters:
+            if letter.sent.order.replica == replica:
+                self.end(letter.sent, None, LOST)
+        self.reach()
+
+    def crash_service(self, replica: int) -> None:
+        """The service dies and starts anew, in its first state."""
+        host = self.hosts[replica]
+        host.work, host.state, host.applied = None, self.start, []
+        self.effects(replica, host.machine.lost())
+        host.machine.serving = True
+
+    def reach(self) -> None:
+        self.sequencer.reach(self.hosts, self.now)
+        self.send()
+
+    def ask(self, client: int, asked: Any) -> None:
+        self.tell(Asked(self.now, asked, client))
+
+    def tell(self, asked: Asked) -> None:
+        payload = repr(asked.asked).encode()
+        self.questions[payload] = asked.asked
+        index = self.sequencer.submit(payload) if self.sequencer.ready else None
+        if index is None:
+            self.waiting.append((asked.client, asked))
+        else:
+            self.pending[index] = asked
+        self.send()
+
+    def busy(self) -> set[int]:
+        """Clients that wait for an answer."""
+        return {a.client for a in self.pending.values()} | {client for client, _ in self.waiting}
+
+    def give_up(self, client: int) -> None:
+        """A caller's deadline has come."""
+        for index, asked in list(self.pending.items()):
+            if asked.client == client:
+                del self.pending[index]
+                self.sequencer.abandon(index)
+                self.history.append(Call(asked.began, asked.asked))
+        self.waiting = [(c, a) for c, a in self.waiting if c != client]
+
+    def tick(self, seconds: float = 0.1) -> None:
+        self.now += seconds
+        self.sequencer.tick(self.now)
+        if self.sequencer.ready:
+            waiting, self.waiting = self.waiting, []
+            for _, asked in waiting:
+                self.tell(asked)
+        self.send()
+
+    # -- network --------------------------------------------------------------------------
+
+    def send(self) -> None:
+        for order in self.sequencer.take():
+            self.letters.append(Letter(Sent(self.sequencer.epoch, order), to_replica=True))
+
+    def deliver(self, at: int, *, keep: bool = False) -> None:
+        """Let a letter arrive; with `keep` it will arrive once more."""
+        letter = self.letters[at]
+        if not keep:
+            self.letters[at] = self.letters[-1]
+            self.letters.pop()
+        if letter.to_replica:
+            self.arrive(letter.sent)
+        else:
+            self.end(letter.sent, letter.payload, letter.reason)
+
+    def lose(self, at: int) -> None:
+        """The sender is told that a letter was lost: it may arrive all the same."""
+        self.end(self.letters[at].sent, None, LOST)
+
+    def arrive(self, sent: Sent) -> None:
+        host = self.hosts.get(sent.order.replica)
+        if host is None:
+            self.end(sent, None, LOST)
+            return
+        order = sent.order
+        id = ordering.encode(order.op, sent.term, order.index)
+        op, epoch, index = ordering.decode(id)
+        effects = host.machine.order(op, epoch, index, order.payload, robot="r", to=sent)
+        self.effects(order.replica, effects)
+
+    def effects(self, replica: int, effects: list[Any]) -> None:
+        host = self.hosts[replica]
+        for effect in effects:
+            if isinstance(effect, Reply):
+                self.letters.append(Letter(effect.to, False, effect.payload))
+            elif isinstance(effect, Refuse):
+                self.letters.append(Letter(effect.to, False, None, effect.reason))
+            else:
+                assert host.work is None, "the service was given two things at once"
+                host.work = effect
+
+    def end(self, sent: Sent, payload: bytes | None, reason: str) -> None:
+        if not sent.open:
+            return
+        sent.open = False
+        order = sent.order
+        if sent.term != self.sequencer.epoch:
+            return  # an answer to a proxy that was killed
+        if payload is None:
+            self.sequencer.refused(order.replica, order.op, order.index, reason, self.now)
+        else:
+            first = self.sequencer.replied(order.replica, order.op, order.index, payload)
+            if first:
+                self.mark = self.sequencer.mark
+                asked = self.pending.pop(order.index, None)
+                if asked is not None:
+                    answer = eval(payload.decode())
+                    self.history.append(Call(asked.began, asked.asked, self.now, answer))
+        assert self.sequencer.deposed_by is None
+        self.send()
+
+    # -- services -------------------------------------------------------------------------
+
+    def work(self, replica: int) -> None:
+        """The service ends what it does."""
+        host = self.hosts[replica]
+        begun, host.work = host.work, None
+        assert begun is not None
+        answer: bytes | None
+        if begun.op is Op.APPLY:
+            question = self.questions[begun.payload]
+            host.state, result = self.step(host.state, question)
+            host.applied.append(question)
+            answer = repr(result).encode()
+        elif begun.op is Op.SNAPSHOT:
+            answer = repr((host.state, host.applied)).encode()
+        else:
+            self.restored += 1
+            host.state, host.applied = eval(begun.payload.decode())
+            answer = b""
+        self.effects(replica, host.machine.done(begun.serial, answer))
+
+    # -- the end --------------------------------------------------------------------------
+
+    def settle(self, limit: int = 20_000) -> None:
+        """No more faults: let everything come to rest."""
+        for _ in range(limit):
+            self.now += 0.001
+            working = [r for r, host in self.hosts.items() if host.work is not None]
+            if self.letters:
+                self.deliver(0)
+            elif working:
+                self.work(working[0])
+            elif self.at_rest():
+                break
+            else:
+                self.tick(1.0)
+        for asked in self.pending.values():
+            self.history.append(Call(asked.began, asked.asked, math.inf))
+
+    def at_rest(self) -> bool:
+        machines = [host.machine for host in self.hosts.values()]
+        places = {m.position for m in machines}
+        joined = all(m.joined for m in machines) and len(places) == 1
+        return joined and not self.pending and not self.waiting
