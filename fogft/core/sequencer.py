@@ -23,6 +23,7 @@ from fogft.core.ordering import START, Op, Position, Promise
 RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.5
 CHECKPOINT_RETRY_S = 1.0
+CHECK_EVERY_S = 1.0
 WINDOW = 256
 
 
@@ -55,9 +56,11 @@ class _Peer:
     rewind: int | None = None  # go back to it once nothing is on its way
     open: set[int] = field(default_factory=set)
     acked: int = 0
+    member: bool = False  # it joined this term, and as far as is known its state is still there
     won: int = 0
     wait_s: float = RETRY_FIRST_S / 2
     retry_at: float = 0.0
+    checked_at: float = 0.0
 
 
 class Sequencer:
@@ -167,7 +170,15 @@ class Sequencer:
                 self._bring(replica, peer)
             elif peer.phase is Phase.JOINED:
                 self._feed(replica, peer)
+                self._check(replica, peer, now)
         self._see_to_checkpoint(now)
+
+    def _check(self, replica: int, peer: _Peer, now: float) -> None:
+        """Ask an idle replica where it stands: no request would tell that its service died."""
+        if peer.phase is Phase.JOINED and not peer.open and now - peer.checked_at > CHECK_EVERY_S:
+            peer.checked_at = now
+            self._serial += 1
+            self._out.append(Order(replica, Op.CLAIM, self._serial))
 
     # -- what replicas say ----------------------------------------------------------------
 
@@ -209,6 +220,10 @@ class Sequencer:
         return first
 
     def _promised(self, replica: int, peer: _Peer, promise: Promise) -> None:
+        if promise.position.epoch != self.epoch:
+            peer.member = False
+            if peer.phase is Phase.JOINED:
+                peer.phase = Phase.UNCLAIMED
         if peer.phase is not Phase.ASKED:
             return
         peer.phase = Phase.CLAIMED
@@ -248,10 +263,11 @@ class Sequencer:
             peer.phase = Phase.UNCLAIMED
             return
         peer.phase = Phase.JOINED
+        peer.member = True
         peer.wait_s = RETRY_FIRST_S / 2
         peer.rewind = None
         peer.next = expected
-        peer.acked = max(peer.acked, expected - 1)
+        peer.acked = expected - 1
         # Applied there, and the answer never came: it is kept, and is asked for again.
         for index in self._unanswered:
             if index < expected and index not in peer.open:
@@ -364,16 +380,13 @@ class Sequencer:
             self._checkpoint_at = 0.0
 
     def _make_room(self, size: int) -> bool:
-        """Drop what every joined replica has applied; then who lags is restored later."""
+        """No checkpoint came in time: drop what every member has applied, and no more.
+
+        Each of them alone can then go on; only if all are lost at once, the state is.
+        """
         log = self.log
         assert log is not None
-        joined = [p for p in self._peers.values() if p.phase is Phase.JOINED]
-        if not joined:
-            return False
-        log.drop(min(p.acked for p in joined))
-        if not log.has_room(size):
-            log.drop(max(p.acked for p in joined))
-            for peer in joined:
-                if not log.covers(peer.next - 1 if peer.rewind is None else peer.rewind - 1):
-                    self._pause(peer, 0.0)
+        members = [p.acked for p in self._peers.values() if p.member]
+        if members:
+            log.drop(min(members))
         return log.has_room(size)

@@ -69,7 +69,7 @@ def check(world: World, step, start) -> None:
         assert len(states) == 1
 
 
-@pytest.mark.parametrize("seed", range(150))
+@pytest.mark.parametrize("seed", range(40))
 @pytest.mark.parametrize(
     ("questions", "step", "start"),
     [(ask_counter, counter, 0), (ask_key_value, key_value, ())],
@@ -84,7 +84,7 @@ def test_histories_are_linearizable_under_faults(seed, questions, step, start):
     check(world, step, start)
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(25))
 def test_without_losing_every_copy_all_recover_and_agree(seed):
     """While one replica and its service stay, all others come to its state and all is answered."""
     source = random.Random(seed)
@@ -111,6 +111,7 @@ def test_all_replicas_lost_while_the_proxy_lives_loses_nothing():
     world = World(counter, 0, log_entries=8)
     for _ in range(30):
         world.ask(0, ("add", 1))
+        world.tick()
         world.settle()
     for replica in list(world.hosts):
         world.remove_replica(replica)
@@ -163,6 +164,7 @@ def test_the_newest_replica_dies_during_its_restore():
     world = World(counter, 0, replicas=1, log_entries=4)
     for _ in range(9):
         world.ask(0, ("add", 1))
+        world.tick()
         world.settle()
     newest = world.add_replica()
     while world.hosts[newest].work is None:
