@@ -16,12 +16,11 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from fogft.core import ordering
-from fogft.core.ordering import NOT_JOINED, START, Op, Position, Promise
+from fogft.core.ordering import FORGOTTEN, MALFORMED, NOT_JOINED, START, Op, Position, Promise
 
 T = TypeVar("T")
 
-NOT_READY, CRASHED, FORGOTTEN = "not-ready", "crashed", "forgotten"
-MALFORMED, OVERLOADED = "malformed", "overloaded"
+NOT_READY, CRASHED = "not-ready", "crashed"
 
 
 @dataclass(frozen=True)

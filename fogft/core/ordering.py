@@ -23,6 +23,8 @@ INDEX_LIMIT = 1 << 56
 _EPOCH_LIMIT = 1 << 64
 
 NOT_JOINED = "not-joined"  # it obeys this term, and has not been brought to its state
+FORGOTTEN = "forgotten"  # it was applied, and its answer is no longer kept
+MALFORMED = "malformed"  # it was applied, to no effect: its bytes are no request
 _GAP, _FENCED, _HELD = "gap:", "fenced:", "held:"
 
 

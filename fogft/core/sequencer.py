@@ -103,6 +103,11 @@ class Sequencer:
         return any(peer.phase is Phase.JOINED for peer in self._peers.values())
 
     @property
+    def sends(self) -> bool:
+        """Whether `take` has something to send."""
+        return bool(self._out)
+
+    @property
     def joined(self) -> list[int]:
         """The replicas that apply what is sent to them."""
         return [replica for replica, peer in self._peers.items() if peer.phase is Phase.JOINED]
@@ -311,6 +316,9 @@ class Sequencer:
             return
         if op in (Op.APPLY, Op.RECALL):
             peer.open.discard(index)
+            if reason in (ordering.FORGOTTEN, ordering.MALFORMED):
+                peer.acked = max(peer.acked, index)
+                return
             expected = ordering.read_gap(reason)
             if expected is not None:
                 self._go_back(peer, expected)
@@ -321,13 +329,6 @@ class Sequencer:
         """Send again from a number, once what is on its way has been answered."""
         if peer.phase is Phase.JOINED and expected <= peer.next:
             peer.rewind = expected if peer.rewind is None else min(peer.rewind, expected)
-
-    def skipped(self, replica: int, index: int) -> None:
-        """A replica has this number behind it, and has no answer (any more) to give."""
-        peer = self._peers.get(replica)
-        if peer is not None:
-            peer.open.discard(index)
-            peer.acked = max(peer.acked, index)
 
     def declined(self, replica: int, op: Op, index: int, now: float) -> None:
         """An order was not taken by the link: it was not sent."""

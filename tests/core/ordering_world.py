@@ -258,9 +258,16 @@ class World:
                 self.tick(1.0)
         for asked in self.pending.values():
             self.history.append(Call(asked.began, asked.asked, math.inf))
+        self.pending.clear()
 
     def at_rest(self) -> bool:
         machines = [host.machine for host in self.hosts.values()]
         places = {m.position for m in machines}
         joined = all(m.joined for m in machines) and len(places) == 1
-        return joined and not self.pending and not self.waiting
+        return joined and not self.letters and not self.waiting and not self.awaited()
+
+    def awaited(self) -> bool:
+        """Whether an answer is still to come: one that a replica keeps, or will have."""
+        kept = [host.machine._kept for host in self.hosts.values()]
+        last = max(host.machine.position.index for host in self.hosts.values())
+        return any(index > last or any(index in k for k in kept) for index in self.pending)
