@@ -14,11 +14,12 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from fogft.core import spec_state
 from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
 
 LONGEST_S = 1e7  # what a request's header can carry
 # What a replica must know; the rest is the robot's.
-REPLICA_KEYS = ("name", "type", "concurrency", "cancel")
+REPLICA_KEYS = ("name", "type", "concurrency", "cancel", "state")
 _NOT_THE_PROXIES = ("replicas", "traffic")
 _ALWAYS = ("name", "type", "timeout_s")
 
@@ -32,6 +33,8 @@ def to_plain(service: ServiceSpec, keys: tuple[str, ...] = ()) -> dict[str, Any]
             continue
         if value != field.default or field.name in _ALWAYS:
             written[field.name] = getattr(value, "value", value)
+    if service.state is not None and "state" in written:
+        written["state"] = service.state.to_plain()
     return written
 
 
@@ -53,6 +56,7 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         hedging_budget=_share(raw.get("hedging_budget") or ServiceSpec.hedging_budget),
         concurrency=int(raw.get("concurrency") or 0),
         cancel=str(raw.get("cancel") or ""),
+        state=spec_state.from_plain(raw.get("state")),
     )
 
 

@@ -18,6 +18,7 @@ from fogft.core.spec_choices import (
     ScheduleSpec,
     TrafficSpec,
 )
+from fogft.core.spec_state import StateSpec
 
 MAX_REPLICAS = 16
 
@@ -50,6 +51,7 @@ class ServiceSpec:
         traffic: What is asked of it, for costs.
         concurrency: Requests that a replica gives the service at once; 0 to learn it.
         cancel: Name of the service's cancel service (`std_srvs/srv/Trigger`); empty for none.
+        state: How its state is taken and given; None for a service that keeps none.
     """
 
     name: str
@@ -63,6 +65,7 @@ class ServiceSpec:
     traffic: TrafficSpec = field(default_factory=TrafficSpec)
     concurrency: int = 0
     cancel: str = ""
+    state: StateSpec | None = None
 
 
 @dataclass(frozen=True)
@@ -146,4 +149,5 @@ class PoolSpec:
 def _run_by_replica(service: ServiceSpec) -> tuple[str, ...]:
     """Return what of a service concerns its replicas; no more than was always there if unset."""
     policy = (str(service.concurrency), service.cancel)
-    return (service.name, service.type, *(policy if policy != ("0", "") else ()))
+    state = () if service.state is None else (str(service.state),)
+    return (service.name, service.type, *(policy if policy != ("0", "") else ()), *state)

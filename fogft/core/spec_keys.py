@@ -28,7 +28,7 @@ FOGFT_KEYS = (
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
     *("hedging", "hedging_budget", "concurrency", "cancel"),
-    *("replicas", "traffic"),
+    *("replicas", "traffic", "state"),
 )
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
 AVAILABILITY_KEYS = (
@@ -72,7 +72,6 @@ REFUSED_TASK_KEYS = {
 # Designed, not built. Ignoring one would promise what nobody does.
 LATER_KEYS = {
     "topology": "remove it; every replica is linked to the robot directly",
-    "state": "remove it; the services must be stateless",
     "quorum": "remove it; the first successful response is returned",
 }
 

@@ -6,6 +6,7 @@ from fogft.core import ros_names
 from fogft.core.spec import MAX_REPLICAS, HedgingMode, ServiceSpec
 from fogft.core.spec_keys import CONCURRENCY_LIMIT, DAY_S, LATER_KEYS, SERVICE_KEYS, places
 from fogft.core.spec_plan import read_traffic
+from fogft.core.spec_state import read_state
 from fogft.core.spec_tree import Section, shown
 
 _SERVICES_HINT = "write a list, such as `services: [{name: /detect, type: my_msgs/srv/Detect}]`"
@@ -44,6 +45,7 @@ def _service(section: Section) -> ServiceSpec:
     if ok_field and not ros_names.is_field_name(ok_field):
         what = f"{shown(ok_field)} is not the name of a field"
         raise section.error("ok_field", what, "name a boolean field, such as `success`")
+    _check_stateful(section)
     return ServiceSpec(
         name=name,
         type=_type(section),
@@ -56,6 +58,7 @@ def _service(section: Section) -> ServiceSpec:
         traffic=read_traffic(section),
         concurrency=_concurrency(section),
         cancel=_other_service(section, "cancel", name, "the name of its cancel service"),
+        state=read_state(section),
     )
 
 
@@ -83,6 +86,16 @@ def _other_service(section: Section, key: str, of: str, what: str) -> str:
     if name == of:
         raise section.error(key, "is the service itself", hint)
     return name
+
+
+def _check_stateful(section: Section) -> None:
+    """A stateful service is asked of every replica, and its first answer is the answer."""
+    if not section.has("state"):
+        return
+    for key in ("ok_field", "hedging", "concurrency", "cancel"):
+        if section.has(key) and section.children[key].value != HedgingMode.ALL.value:
+            what = "does not go with `state`: every replica applies every request"
+            raise section.error(key, what, "remove it")
 
 
 def _hedging_budget(section: Section) -> float:

@@ -21,6 +21,7 @@ from fogft.core.hedging import NEVER
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.spec import ServiceSpec
 from fogft.proxy.dispatcher import Dispatcher
+from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.ros.port import RosNode, RosServer
 from fogft.wire.port import Answer, Dialer, Link, Peer
 
@@ -37,18 +38,25 @@ class MakeDispatcher(Protocol):
         spec: ServiceSpec,
         respond: Callable[[Any, bytes], None],
         wake: Callable[[], None],
-    ) -> Dispatcher:
+    ) -> Dispatcher | OrderedDispatcher:
         """Make it, given how to respond and how to have `tick` called soon."""
 
 
 class _Service:
     """A service, its dispatcher, and its ROS server once advertised."""
 
-    def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher) -> None:
+    def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher | OrderedDispatcher) -> None:
         self.spec = spec
         self.dispatcher = dispatcher
         self.server: RosServer | None = None
         self.trouble = ""  # why it cannot be advertised; empty when it can
+
+    def close(self) -> None:
+        """Withdraw it, and let go of what its dispatcher holds."""
+        if self.server is not None:
+            self.server.close()
+        if isinstance(self.dispatcher, OrderedDispatcher):
+            self.dispatcher.close()
 
 
 class ClientProxy:
@@ -96,18 +104,16 @@ class ClientProxy:
         with self._lock:
             wanted = {spec.name: spec for spec in specs}
             for name in [n for n in self._services if n not in wanted]:
-                gone = self._services.pop(name)
-                if gone.server is not None:
-                    gone.server.close()
+                self._services.pop(name).close()
             keys_changed = False
             for spec in wanted.values():
                 old = self._services.get(spec.name)
-                if old is not None and old.spec.type == spec.type:
+                if old is not None and (old.spec.type, old.spec.state) == (spec.type, spec.state):
                     old.spec = spec
                     old.dispatcher.adopt(spec)
                     continue
-                if old is not None and old.server is not None:
-                    old.server.close()
+                if old is not None:
+                    old.close()
                 self._services[spec.name] = self._new_service(spec)
                 keys_changed = True
             if keys_changed:
@@ -228,19 +234,30 @@ class ClientProxy:
             for link in self._links.values():
                 link.flush()
             looks = [service.dispatcher.tick() for service in self._services.values()]
+            for service in self._services.values():
+                dispatcher = service.dispatcher
+                if isinstance(dispatcher, OrderedDispatcher) and dispatcher.able:
+                    self._advertise(service)
         self._next_look = min(looks, default=NEVER)
         return changed
 
     def _route(self) -> None:
         for service in self._services.values():
             name = service.spec.name
+            if isinstance(service.dispatcher, OrderedDispatcher):
+                # It brings replicas to readiness itself, and needs those that are not.
+                usable = [link for link in self._links.values() if link.usable]
+                service.dispatcher.route(usable)
+                continue
             able = [link for link in self._links.values() if name in link.ready]
             fresh = [link for link in able if not self._draining(link)]
-            if able and service.server is None:
+            if able:
                 self._advertise(service)
             service.dispatcher.route(fresh or able)
 
     def _advertise(self, service: _Service) -> None:
+        if service.server is not None:
+            return
         spec = service.spec
         try:
             service.server = self._node.serve(spec.name, spec.type, service.dispatcher.submit)

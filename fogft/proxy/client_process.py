@@ -16,12 +16,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fogft import disk
+from fogft.core import names
 from fogft.core.errors import FogftError, PoolBusy, StateError
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.config import ClientProxyConfig, read_client
 from fogft.proxy.dispatcher import Dispatcher
 from fogft.proxy.following import Following
+from fogft.proxy.mark import MarkFile
+from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.process import Watched, start_log, stop_on_signal
 from fogft.ros import environment, memory_tuning
 
@@ -82,7 +85,10 @@ def run(config_path: Path) -> None:
     memory_tuning.tune()
     sign = ManagerSign(config.lease)
     node = SerialisedNode(_node_name("fogft", config.pool), config.domain_id)
-    proxy = ClientProxy(config.pool_uid, node, _dialer(config, sign), make_dispatcher)
+    make = functools.partial(
+        make_dispatcher, marks=config.status.with_suffix(".marks"), pool_uid=config.pool_uid
+    )
+    proxy = ClientProxy(config.pool_uid, node, _dialer(config, sign), make)
     proxy.serve(config.services)
     following = Following(config)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
@@ -110,11 +116,30 @@ def _dialer(config: ClientProxyConfig, sign: ManagerSign) -> Any:
 
 
 def make_dispatcher(
-    spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
-) -> Dispatcher:
-    """Make the dispatcher of a service, with what its policy needs of its ROS type."""
+    spec: ServiceSpec,
+    respond: Callable[[Any, bytes], None],
+    wake: Callable[[], None],
+    *,
+    marks: Path,
+    pool_uid: str,
+) -> Dispatcher | OrderedDispatcher:
+    """Make the dispatcher of a service, with what its policy needs of its ROS type.
+
+    Args:
+        spec: The service.
+        respond: Sends a response to the caller of a handle.
+        wake: Has the dispatcher's `tick` called soon.
+        marks: Folder of the stateful services' marks.
+        pool_uid: Whose marks they are.
+    """
     from fogft.ros import types
 
+    if spec.state is not None:
+        mark = MarkFile(
+            marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}", pool_uid
+        )
+        empty = types.default_response(spec.type) if spec.on_timeout is OnTimeout.EMPTY else None
+        return OrderedDispatcher(spec, respond, mark, empty_response=empty, wake=wake)
     return Dispatcher(
         spec,
         respond,

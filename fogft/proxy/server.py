@@ -23,7 +23,9 @@ from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.core import names
 from fogft.core.model import ReplicaId
 from fogft.core.spec import ServiceSpec
+from fogft.core.spec_state import StateSpec
 from fogft.proxy.interruption import CANCEL_TYPE
+from fogft.proxy.ordered_responder import Clients, OrderedResponder, StateBytes
 from fogft.proxy.responder import Responder
 from fogft.proxy.supervisor import Supervisor
 from fogft.ros.port import RosClient, RosNode
@@ -41,6 +43,7 @@ class ServerProxy:
         listener: Its end of the wire; `serve` is called here.
         make_node: Joins ROS; called again after each death of the command.
         supervisor: The user's command.
+        make_state: Says how the state of a stateful service travels.
         max_in_flight: Requests held at once.
         orphan_after_s: With no sign of the pool's manager for so long, `orphaned` is true.
         clock: Monotonic seconds.
@@ -54,6 +57,7 @@ class ServerProxy:
         make_node: Callable[[], RosNode],
         supervisor: Supervisor,
         *,
+        make_state: Callable[[StateSpec], StateBytes] | None = None,
         max_in_flight: int = 512,
         orphan_after_s: float = 3600.0,
         clock: Callable[[], float] = time.monotonic,
@@ -72,6 +76,11 @@ class ServerProxy:
         self._clients: dict[str, RosClient] = {}
         self._revoked: frozenset[str] = frozenset()
         self._servers: dict[str, int] = {}
+        self._ordered: dict[str, OrderedResponder] = {}
+        for service in services:
+            if service.state is not None and make_state is not None:
+                state = make_state(service.state)
+                self._ordered[service.name] = OrderedResponder(service.name, state, clock)
         self._draining = False
         self._at_risk = False
         self.responder = Responder(
@@ -88,7 +97,9 @@ class ServerProxy:
             for s in self._services
         }
         self._join_ros()
-        self._listener.serve(keys, self._request, self._probe, self.responder.cancel)
+        # Where no service is stateful there is nothing to choose, and nothing to pay.
+        request = self._request if self._ordered else self.responder.request
+        self._listener.serve(keys, request, self._probe, self.responder.cancel)
         self._supervisor.poll()
         log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
 
@@ -97,11 +108,18 @@ class ServerProxy:
         died = self._supervisor.poll()
         if died or self._node is None or not self._node.alive:
             self._ready = frozenset()
-            self.responder.crashed()
+            self._crashed()
             self._leave_ros()
             self._join_ros()
         self._look_for_services()
         self.responder.tick()
+        for ordered in self._ordered.values():
+            ordered.tick(self._supervisor.alive)
+
+    def _crashed(self) -> None:
+        self.responder.crashed()
+        for ordered in self._ordered.values():
+            ordered.crashed()
 
     def _look_for_services(self) -> None:
         ready = frozenset(
@@ -115,7 +133,10 @@ class ServerProxy:
             self._ready = ready
         for name in gone | self._replaced():
             log.warning("service_lost replica=%s service=%s", self._id, name)
-            self.responder.crashed(name)
+            if name in self._ordered and self._supervisor.alive:
+                self._supervisor.restart()  # what state it is in, nobody knows
+            else:
+                self.responder.crashed(name)
 
     def _replaced(self) -> set[str]:
         """Return the services that have one more server than before.
@@ -170,15 +191,30 @@ class ServerProxy:
             s.name: self._node.client(s.cancel, CANCEL_TYPE) for s in self._services if s.cancel
         }
         self.responder.use(self._clients, cancels)
+        for service in self._services:
+            if service.name in self._ordered and service.state is not None:
+                ends = (service.state.snapshot, service.state.restore)
+                snapshot, restore = (self._node.client(end.name, end.type) for end in ends)
+                clients = Clients(self._clients[service.name], snapshot, restore)
+                self._ordered[service.name].use(clients)
 
     def _leave_ros(self) -> None:
         node, self._node, self._clients = self._node, None, {}
         self.responder.use({})
+        for ordered in self._ordered.values():
+            ordered.use(None)
         if node is not None:
             node.close()
 
     def _request(self, incoming: Incoming) -> None:
-        self.responder.request(incoming)
+        (self._ordered.get(incoming.service) or self.responder).request(incoming)
+
+    def _answering(self) -> frozenset[str]:
+        """Return the services that can answer: found, and in the present state."""
+        if not self._ordered:
+            return self._ready
+        behind = {name for name, ordered in self._ordered.items() if not ordered.ready}
+        return self._ready - behind
 
     def _probe(self, probe: Probe) -> ProbeAnswer:
         if probe.manager_age_s is not None:
@@ -188,18 +224,19 @@ class ServerProxy:
             slot=self._id.slot,
             generation=self._id.generation,
             incarnation=self._incarnation,
-            ready=self._ready,
+            ready=self._answering(),
             draining=self._draining,
             at_risk=self._at_risk,
             restarts=max(self._supervisor.restarts, 0),
-            in_flight=self.responder.in_flight,
+            in_flight=self.responder.in_flight
+            + sum(ordered.in_flight for ordered in self._ordered.values()),
             detail=self._detail(),
             work=self.responder.report(),
         )
 
     def _detail(self) -> str:
         if len(self._ready) == len(self._services):
-            return ""
+            return self._state_detail()
         if not self._supervisor.alive:
             if not self._supervisor.last_exit:
                 return "`run` has not started"
@@ -207,11 +244,17 @@ class ServerProxy:
         missing = sorted({s.name for s in self._services} - self._ready)
         return f"`run` does not offer {', '.join(missing)} yet"
 
+    def _state_detail(self) -> str:
+        for name, ordered in self._ordered.items():
+            if not ordered.ready:
+                return ordered.detail or f"`{name}` does not have the present state yet"
+        return ""
+
     def close(self) -> None:
         """Stop the command, leave the wire and ROS."""
         self._ready = frozenset()
         self._supervisor.stop()
-        self.responder.crashed()
+        self._crashed()
         self._listener.close()
         self._leave_ros()
 

@@ -79,6 +79,7 @@ def run(
 
 def _make(config: ServerProxyConfig) -> ServerProxy:
     from fogft.ros.node import SerialisedNode
+    from fogft.ros.state_bytes import StateBytes
     from fogft.wire.handshakes import HandshakeLog
     from fogft.wire.zenoh_listener import ZenohListener
 
@@ -93,6 +94,7 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
         ZenohListener(config.listen, config.credentials, config.id, handshakes=handshakes),
         make_node,
         Supervisor(config.run, config.workdir, environ, stdout=handshakes.stdout),
+        make_state=StateBytes,
         max_in_flight=config.max_in_flight,
         orphan_after_s=config.orphan_after_s,
     )

@@ -116,6 +116,11 @@ class Supervisor:
             return
         log.info("run_started pid=%d command=%r", self._child.pid, self._command)
 
+    def restart(self) -> None:
+        """End the command at once; `poll` notes its death and starts it again."""
+        if self._child is not None:
+            self._kill_group(self._child.pid)
+
     def stop(self, grace_s: float = 3.0) -> None:
         """End the command: SIGINT as ROS nodes expect, then SIGKILL. Repeatable."""
         child, self._child = self._child, None

@@ -1,0 +1,140 @@
+"""A service's state as bytes, through whatever service types carry it.
+
+The state sits in one text or byte field of a response (snapshot) and of a request (restore).
+Where the response has a boolean `success`, false is a failure. These calls are rare, so
+Python messages are built here, as nowhere else in a proxy.
+
+Owns: reading and writing that field. Not here: when (`fogft.proxy.ordered_responder`).
+"""
+
+from __future__ import annotations
+
+import array
+import re
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.core.spec_state import StateService, StateSpec
+from fogft.ros.types import load_service_type
+
+_SEQUENCE = re.compile(r"sequence<(octet|uint8|int8|char)(?:, \d+)?>")
+_TEXT = re.compile(r"string(?:<\d+>)?")
+
+
+class StateBytes:
+    """How one service's state travels.
+
+    Raises:
+        RosError: A type cannot be loaded, or has no such field.
+    """
+
+    def __init__(self, spec: StateSpec) -> None:
+        from rclpy.serialization import deserialize_message, serialize_message
+
+        self._read, self._write = deserialize_message, serialize_message
+        self._snapshot = load_service_type(spec.snapshot.type)
+        self._restore = load_service_type(spec.restore.type)
+        self._out = _Field(self._snapshot.Response, spec.snapshot, "response")
+        self._in = _Field(self._restore.Request, spec.restore, "request")
+        if self._out.is_text != self._in.is_text:
+            raise RosError(
+                f"of `{spec.snapshot.field}` and `{spec.restore.field}` one is text, one bytes",
+                "name two fields that hold the same",
+            )
+
+    def snapshot_request(self) -> bytes:
+        """Return the serialised request of the snapshot service."""
+        return bytes(self._write(self._snapshot.Request()))
+
+    def read_snapshot(self, response: bytes) -> bytes:
+        """Return the state in a response of the snapshot service. Raises RosError."""
+        message = self._response(response, self._snapshot.Response)
+        _check_success(message)
+        return self._out.get(message)
+
+    def restore_request(self, state: bytes) -> bytes:
+        """Return the serialised request that restores a state. Raises RosError."""
+        message = self._restore.Request()
+        try:
+            self._in.set(message, state)
+            return bytes(self._write(message))
+        except Exception as error:  # what a message's setter raises is its own affair
+            raise RosError(f"a state of {len(state)} bytes does not fit: {error}") from error
+
+    def check_restored(self, response: bytes) -> None:
+        """Raise RosError where a response of the restore service says that it failed."""
+        _check_success(self._response(response, self._restore.Response))
+
+    def _response(self, payload: bytes, kind: Any) -> Any:
+        try:
+            return self._read(payload, kind)
+        except Exception as error:  # rclpy's own error types are private and vary by release
+            raise RosError(f"{len(payload)} bytes are not a {kind.__name__}") from error
+
+
+def _check_success(message: Any) -> None:
+    if message.get_fields_and_field_types().get("success") == "boolean" and not message.success:
+        why = str(getattr(message, "message", "") or "no reason was given")
+        raise RosError(f"the service says `success: false`: {why}")
+
+
+class _Field:
+    """A text or byte field, by its path from the message."""
+
+    def __init__(self, message_type: Any, where: StateService, part: str) -> None:
+        *self._parents, self._name = where.field.split(".")
+        message = message_type()
+        for i, parent in enumerate(self._parents):
+            message = getattr(message, parent, None)
+            if not hasattr(message, "get_fields_and_field_types"):
+                raise _no_field(where, part, ".".join(self._parents[: i + 1]))
+        kind = str(message.get_fields_and_field_types().get(self._name, ""))
+        sequence = _SEQUENCE.fullmatch(kind)
+        self.is_text = bool(_TEXT.fullmatch(kind))
+        self._element = sequence[1] if sequence else ""
+        if not self.is_text and not self._element:
+            raise _no_field(where, part, where.field)
+
+    def _parent(self, message: Any) -> Any:
+        for parent in self._parents:
+            message = getattr(message, parent)
+        return message
+
+    def get(self, message: Any) -> bytes:
+        """Return what the field holds."""
+        value = getattr(self._parent(message), self._name)
+        if self.is_text:
+            return str(value).encode()
+        if self._element == "octet":  # rclpy has these as a list of single bytes
+            return b"".join(value)
+        return bytes(value.tobytes())
+
+    def set(self, message: Any, state: bytes) -> None:
+        """Let the field hold a state."""
+        value: Any
+        if self.is_text:
+            value = state.decode()
+        elif self._element == "octet":
+            value = [state[i : i + 1] for i in range(len(state))]
+        else:
+            value = array.array("b" if self._element == "int8" else "B")
+            value.frombytes(state)
+        setattr(self._parent(message), self._name, value)
+
+
+def _no_field(where: StateService, part: str, path: str) -> RosError:
+    return RosError(
+        f"the {part} of `{where.type}` has no text or byte field `{path}`",
+        "name a field of type `string`, `uint8[]`, `int8[]`, `char[]` or `byte[]`",
+    )
+
+
+def check_state(spec: StateSpec) -> str | None:
+    """Return why a service's state cannot travel so, with what to do; None if it can."""
+    try:
+        StateBytes(spec)
+    except RosError as error:
+        return f"{error.message}; {error.hint}" if error.hint else error.message
+    except ImportError as error:
+        return f"ROS 2 is not usable here: {error}; source a ROS 2 installation"
+    return None
