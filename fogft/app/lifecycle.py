@@ -34,6 +34,7 @@ def order(
     """
     from fogft.cloud.port import Accounts
     from fogft.pool import named_clouds, pool_file, preview
+    from fogft.ros.state_bytes import check_state
     from fogft.ros.types import check_ok_field, check_service_type
 
     source = pool_file.text(file)
@@ -42,6 +43,7 @@ def order(
         file=str(file),
         check_types=check_service_type,
         check_fields=check_ok_field,
+        check_states=check_state,
         folder=file.parent,
     )
     chosen = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL

@@ -27,6 +27,7 @@ from fogft.core.spec_plan import (
     read_schedule,
 )
 from fogft.core.spec_services import read_services
+from fogft.core.spec_state import StateSpec
 from fogft.core.spec_task import check_task
 from fogft.core.spec_tree import Node, Section, plain, shown
 
@@ -34,6 +35,7 @@ from fogft.core.spec_tree import Node, Section, plain, shown
 # do about it may follow after "; ".
 TypeCheck = Callable[[str], str | None]  # of a service type
 FieldCheck = Callable[[str, str], str | None]  # of a service type and a boolean response field
+StateCheck = Callable[[StateSpec], str | None]  # of a service's `state`
 FolderCheck = Callable[[str], str | None]  # of `workdir`
 
 MAX_SURGE = 4
@@ -46,6 +48,7 @@ def pool_spec(
     *,
     check_types: TypeCheck | None = None,
     check_fields: FieldCheck | None = None,
+    check_states: StateCheck | None = None,
     check_workdir: FolderCheck | None = None,
 ) -> PoolSpec:
     """Return what a pool file asks for.
@@ -57,6 +60,7 @@ def pool_spec(
         check_types: Says why a service type cannot be loaded here. Asked last, once a
             service, when all else is right.
         check_fields: Says why a type's response has no boolean field of that name.
+        check_states: Says why a service's state cannot travel by the services that `state` names.
         check_workdir: Says why a `workdir` cannot be used here.
 
     Raises:
@@ -105,6 +109,8 @@ def pool_spec(
             _judge(section, "type", check_types(service.type))
         if service.ok_field and check_fields is not None:
             _judge(section, "ok_field", check_fields(service.type, service.ok_field))
+        if service.state is not None and check_states is not None:
+            _judge(section, "state", check_states(service.state))
     return spec
 
 

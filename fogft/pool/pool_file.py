@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fogft.core.errors import SpecError
 from fogft.core.spec import PoolSpec
-from fogft.core.spec_reader import FieldCheck, TypeCheck, pool_spec
+from fogft.core.spec_reader import FieldCheck, StateCheck, TypeCheck, pool_spec
 from fogft.pool import yaml_tree
 
 MAX_BYTES = 1 << 20
@@ -21,6 +21,7 @@ def read(
     *,
     check_types: TypeCheck | None = None,
     check_fields: FieldCheck | None = None,
+    check_states: StateCheck | None = None,
 ) -> PoolSpec:
     """Return what a pool file asks for.
 
@@ -30,6 +31,7 @@ def read(
             if it can. Without it the types are not looked up.
         check_fields: Returns why a service type's response has no such boolean field, for
             `ok_field`.
+        check_states: Returns why a service's state cannot travel as `state` says, or None.
 
     Raises:
         SpecError: The file cannot be read, or its first mistake: ``file:line: key: what``.
@@ -39,6 +41,7 @@ def read(
         file=str(path),
         check_types=check_types,
         check_fields=check_fields,
+        check_states=check_states,
         folder=Path(path).parent,
     )
 
@@ -49,6 +52,7 @@ def parse(
     file: str,
     check_types: TypeCheck | None = None,
     check_fields: FieldCheck | None = None,
+    check_states: StateCheck | None = None,
     folder: Path | None = None,
 ) -> PoolSpec:
     """Return what the text of a pool file asks for.
@@ -58,6 +62,7 @@ def parse(
         file: Its name, for messages; its stem names the pool where the text does not.
         check_types: As for `read`.
         check_fields: As for `read`.
+        check_states: As for `read`.
         folder: Where `workdir` is looked for; None to leave it unjudged.
 
     Raises:
@@ -70,6 +75,7 @@ def parse(
         file,
         check_types=check_types,
         check_fields=check_fields,
+        check_states=check_states,
         check_workdir=None if folder is None else lambda workdir: _no_folder(folder, workdir),
     )
 

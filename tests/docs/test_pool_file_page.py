@@ -21,6 +21,7 @@ from fogft.core.spec_keys import (
     SERVICE_KEYS,
     TASK_KEYS,
 )
+from fogft.core.spec_state import STATE_KEYS
 from fogft.pool import pool_file
 
 PAGE = (Path(__file__).parents[2] / "docs" / "pool-file.md").read_text()
@@ -41,6 +42,7 @@ def rows(title):
 
 
 TABLES = {"Under `fogft`": FOGFT_KEYS, "Each of `services`": SERVICE_KEYS, "`health`": HEALTH_KEYS}
+STATE_TABLE = "`state`"
 
 
 MORE_TABLES = {
@@ -59,6 +61,10 @@ MORE_TABLES = {
 @pytest.mark.parametrize("title", [*TABLES, *MORE_TABLES])
 def test_every_key_has_its_row(title):
     assert [key.strip("`") for key in rows(title)] == list({**TABLES, **MORE_TABLES}[title])
+
+
+def test_every_state_key_has_its_row():
+    assert [key.strip("`") for key in rows(STATE_TABLE)] == list(STATE_KEYS)
 
 
 def test_every_task_key_has_its_row():

@@ -33,17 +33,30 @@ def wait_for(condition: Callable[[], Any], what: str, limit_s: float = LIMIT_S) 
 
 
 class Parts:
-    """A pool without a manager: its folder, its certificates and its processes."""
+    """A pool without a manager: its folder, its certificates and its processes.
 
-    def __init__(self, folder: Path, domain: Callable[[], int]) -> None:
+    Args:
+        services: As a configuration file has them.
+        node: What a replica runs, with an argument.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: Callable[[], int],
+        *,
+        services: str = SERVICES,
+        node: Path = SERVICE,
+    ) -> None:
+        self.services, self.node = services, node
         self.folder = folder
         self._domain = domain
         self._processes: list[subprocess.Popen[bytes]] = []
         self._version = 0
         credentials.create_authority(folder / "ca", UID)
 
-    def replica(self, slot: int, work_s: float = 0.001, **environ: str) -> Replica:
-        return Replica(self, slot, work_s, environ)
+    def replica(self, slot: int, argument: float | str = 0.001, **environ: str) -> Replica:
+        return Replica(self, slot, argument, environ)
 
     def robot(self, name: str, *replicas: Replica) -> Robot:
         return Robot(self, name, replicas)
@@ -81,11 +94,13 @@ class Replica:
     """A server proxy with an ordinary service under it."""
 
     def __init__(
-        self, parts: Parts, slot: int, work_s: float, environ: Mapping[str, str],
+        self, parts: Parts, slot: int, argument: float | str, environ: Mapping[str, str],
         *, generation: int = 1, extra: str = "",
     ) -> None:  # fmt: skip
         self.id = ReplicaId(UID, slot, generation)
         stem = f"r{slot}.{generation}"
+        self._node = parts.node
+        self.domain = parts.domain()
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.endpoint = f"127.0.0.1:{free.getsockname()[1]}"
@@ -94,12 +109,18 @@ class Replica:
         notice = "auto" if environ else "none"
         config.write_text(
             f'pool: p\npool_uid: "{UID}"\nslot: {slot}\ngeneration: {generation}\n'
-            f"listen: {self.endpoint}\nservices: {SERVICES}\ndomain_id: {parts.domain()}\n"
-            f"run: exec {sys.executable} {SERVICE} {work_s}\n"
+            f"listen: {self.endpoint}\nservices: {parts.services}\ndomain_id: {self.domain}\n"
+            f"run: exec {sys.executable} {parts.node} {argument}\n"
             f"notice: {notice}\n"
             f"credentials: {{ca: ca/ca.crt, certificate: {stem}.crt, key: {stem}.key}}\n{extra}"
         )
-        self.process = parts.start("serve", config, environ)
+        self._start = lambda: parts.start("serve", config, environ)
+        self.process = self._start()
+
+    def start_again(self) -> None:
+        """Start a killed one anew, as the same replica."""
+        self.process.wait()
+        self.process = self._start()
 
     def run_pid(self) -> int:
         """Return the process id of the user's command."""
@@ -107,7 +128,7 @@ class Replica:
         def find() -> int:
             children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
             for pid in children.read_text().split():
-                if SERVICE.name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes():
+                if self._node.name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes():
                     return int(pid)
             return 0
 
@@ -130,7 +151,7 @@ class Robot:
             f'pool: p\npool_uid: "{UID}"\nrobot: {name}\nmembership: {self._members.name}\n'
             f"status: {self._status.name}\nlease: lease.json\nlock: {name}.lock\n"
             f"credentials: {{ca: ca/ca.crt, certificate: {name}.crt, key: {name}.key}}\n"
-            f"services: {SERVICES}\ndomain_id: {self.domain}\n{extra}"
+            f"services: {parts.services}\ndomain_id: {self.domain}\n{extra}"
         )
         if replicas:
             self.follow(*replicas)

@@ -71,7 +71,7 @@ def test_a_frozen_robot_does_not_hold_up_a_live_one(parts, call):
 
 def test_what_a_dying_command_worked_on_is_answered_by_the_next(parts, call):
     """With one replica there is nobody else: the requests wait for the command's restart."""
-    replica = parts.replica(0, work_s=0.02)
+    replica = parts.replica(0, 0.02)
     robot = parts.robot("robot", replica)
     caller = call(robot)
     caller.ask(30)

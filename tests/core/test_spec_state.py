@@ -1,0 +1,102 @@
+"""`state` in a pool file: what it means, what it becomes, and how mistakes are told."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.core import service_form
+from fogft.core.errors import SpecError
+from fogft.core.spec_state import StateService, StateSpec
+from fogft.pool import pool_file
+
+FILE = """
+name: p
+run: exec serve
+fogft:
+  services:
+    - name: /count
+      type: std_srvs/srv/SetBool
+"""
+SHORT = "{snapshot: /count/get_state, restore: count/set_state}"
+LONG = (
+    "{snapshot: {name: /a, type: my_msgs/srv/GetState, field: state.data},"
+    " restore: {name: /b, type: my_msgs/srv/SetState, field: data}}"
+)
+
+
+def parse(state: str, more: str = "", **checks):
+    return pool_file.parse(f"{FILE}      state: {state}\n{more}", file="p.yaml", **checks)
+
+
+def test_names_alone_stand_for_the_types_of_the_helpers():
+    (service,) = parse(SHORT).services
+    assert service.state == StateSpec(
+        StateService("/count/get_state", "nav_msgs/srv/GetMap", "map.data"),
+        StateService("/count/set_state", "nav_msgs/srv/SetMap", "map.data"),
+    )
+
+
+def test_any_types_and_fields_can_be_named():
+    (service,) = parse(LONG).services
+    assert service.state == StateSpec(
+        StateService("/a", "my_msgs/srv/GetState", "state.data"),
+        StateService("/b", "my_msgs/srv/SetState", "data"),
+    )
+
+
+@pytest.mark.parametrize("state", [SHORT, LONG])
+def test_both_proxies_read_what_is_written(state):
+    (service,) = parse(state).services
+    assert service_form.from_plain(service_form.to_plain(service)) == service
+    for_replica = service_form.to_plain(service, service_form.REPLICA_KEYS)
+    assert service_form.from_plain(for_replica).state == service.state
+
+
+def test_running_replicas_are_replaced_when_a_service_becomes_stateful():
+    plain = pool_file.parse(FILE, file="p.yaml")
+    assert plain.replica_hash != parse(SHORT).replica_hash != parse(LONG).replica_hash
+
+
+@pytest.mark.parametrize(
+    ("state", "key", "what", "hint"),
+    [
+        ("[]", "state", "must be a map", "get_state"),
+        ("{snapshot: /a}", "state.restore", "is missing", "set_state"),
+        ("{snapshot: /a, restor: /b}", "state.restor", "unknown key", "restore"),
+        ("{snapshot: /a b, restore: /b}", "state.snapshot", "is not a service name", "/svc"),
+        ("{snapshot: 3, restore: /b}", "state.snapshot", "must be text", "quotes"),
+        ("{snapshot: {name: /a, type: x/srv/A}, restore: /b}", "field", "is missing", "type"),
+        ("{snapshot: {name: /a, field: x}, restore: /b}", "type", "is missing", "type"),
+        (
+            "{snapshot: {name: /a, type: x.A, field: d}, restore: /b}",
+            "snapshot.type",
+            "is not a service type",
+            "x/srv/A",
+        ),
+        (
+            "{snapshot: {name: /a, type: x/srv/A, field: a..b}, restore: /b}",
+            "snapshot.field",
+            "is not the path of a field",
+            "map.data",
+        ),
+    ],
+)
+def test_mistakes_name_line_key_and_remedy(state, key, what, hint):
+    with pytest.raises(SpecError) as caught:
+        parse(state)
+    message = caught.value.message
+    assert message.startswith("p.yaml:8: ")
+    assert key in message
+    assert what in message
+    assert hint in caught.value.hint
+
+
+@pytest.mark.parametrize("line", ["ok_field: success", "hedging: adaptive"])
+def test_what_does_not_go_with_state_is_refused(line):
+    with pytest.raises(SpecError, match="does not go with `state`"):
+        parse(SHORT, f"      {line}\n")
+
+
+def test_types_are_judged_where_they_can_be():
+    with pytest.raises(SpecError, match=r"p.yaml:8: fogft.services\[0\].state: no such field"):
+        parse(SHORT, check_states=lambda state: "no such field; name another")

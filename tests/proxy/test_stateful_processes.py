@@ -1,0 +1,279 @@
+"""Stateful services on real proxies: kills of every kind, histories checked, states compared."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fogft.ros import environment
+from tests.linearizability import Call, counter, key_value, linearizable
+from tests.proxy.by_hand import LIMIT_S, ROOT, Parts, Replica, Robot, wait_for
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
+environment.prepare(os.environ)
+
+GIVE_UP_S = 3.0  # a caller, after the proxy has
+NODE = ROOT / "tests/proxy/nodes/stateful_node.py"
+_END = "type: nav_msgs/srv/{}Map, field: map.data"
+
+
+def _stateful(name: str, type_name: str) -> str:
+    ends = ", ".join(
+        f"{end}: {{name: {name}/{verb}_state, {_END.format(verb.title())}}}"
+        for end, verb in (("snapshot", "get"), ("restore", "set"))
+    )
+    return f"{{name: {name}, type: {type_name}, timeout_s: 2.5, state: {{{ends}}}}}"
+
+
+TYPES = {"/count": "std_srvs/srv/SetBool", "/store": "nav_msgs/srv/LoadMap"}
+SERVICES = f"[{', '.join(_stateful(*entry) for entry in TYPES.items())}]"
+
+
+class Client:
+    """Asks one question after another, on a thread of its own, and writes down what it saw."""
+
+    def __init__(self, domain: int, name: str, question: Callable[[], Any]) -> None:
+        from nav_msgs.srv import LoadMap
+        from rclpy.serialization import deserialize_message, serialize_message
+        from std_srvs.srv import SetBool
+
+        from fogft.ros.node import SerialisedNode
+
+        self.history: list[Call] = []
+        self.answered = 0
+        self._types = {"/count": SetBool, "/store": LoadMap}
+        self._read, self._write = deserialize_message, serialize_message
+        self._name, self._question = name, question
+        self._node = SerialisedNode("client", domain)
+        self._client = self._node.client(name, TYPES[name])
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> Client:
+        wait_for(self._client.available, f"{self._name} to be found")
+        self._thread.start()
+        return self
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self.ask(self._question())
+
+    def ask(self, asked: Any, limit_s: float = GIVE_UP_S) -> Any:
+        """Ask once; None if no answer came in time."""
+        came, answer = threading.Event(), []
+
+        def on_response(payload: bytes) -> None:
+            answer.append((time.monotonic(), payload))
+            came.set()
+
+        began = time.monotonic()
+        ticket = self._client.call(bytes(self._write(self._request(asked))), on_response)
+        # A proxy that was killed answers nothing: the caller does not wait for it in vain.
+        if not came.wait(limit_s):
+            self._client.forget(ticket)
+            self.history.append(Call(began, asked))
+            return None
+        ended, payload = answer[0]
+        value = self._value(self._read(payload, self._types[self._name].Response))
+        self.history.append(Call(began, asked, ended, value))
+        self.answered += 1
+        return value
+
+    def _request(self, asked: Any) -> Any:
+        if self._name == "/count":
+            return self._types[self._name].Request(data=asked[0] == "add")
+        return self._types[self._name].Request(map_url=" ".join(map(str, asked)))
+
+    def _value(self, response: Any) -> int:
+        return int(response.message if self._name == "/count" else response.map.header.frame_id)
+
+    def stop(self) -> None:
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(LIMIT_S)
+
+    def close(self) -> None:
+        self.stop()
+        self._node.close()
+
+
+def state_of(replica: Replica) -> tuple[bytes, bytes]:
+    """Ask a replica's own services for their states, past every proxy."""
+    from nav_msgs.srv import GetMap
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    from fogft.ros.node import SerialisedNode
+
+    node = SerialisedNode("looking", replica.domain)
+    states = []
+    try:
+        for name in ("/count", "/store"):
+            client = node.client(f"{name}/get_state", "nav_msgs/srv/GetMap")
+            wait_for(client.available, f"{name}/get_state")
+            came, answer = threading.Event(), []
+            client.call(
+                bytes(serialize_message(GetMap.Request())),
+                lambda payload, a=answer, c=came: (a.append(payload), c.set()),
+            )
+            assert came.wait(LIMIT_S)
+            states.append(deserialize_message(answer[0], GetMap.Response).map.data.tobytes())
+    finally:
+        node.close()
+    return states[0], states[1]
+
+
+@pytest.fixture
+def parts(tmp_path: Path, ros_domains: Callable[[], int]) -> Iterator[Parts]:
+    made = Parts(tmp_path, ros_domains, services=SERVICES, node=NODE)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def clients() -> Iterator[Callable[[Robot, str, Callable[[], Any]], Client]]:
+    made: list[Client] = []
+
+    def start(robot: Robot, name: str, question: Callable[[], Any]) -> Client:
+        made.append(Client(robot.domain, name, question))
+        return made[-1].start()
+
+    yield start
+    for client in made:
+        client.close()
+
+
+def fully_ready(robot: Robot) -> list[int]:
+    return sorted(link["slot"] for link in robot.links() if len(link["ready"]) == 2)
+
+
+def settled(robot: Robot, *replicas: Replica) -> None:
+    """Wait until these replicas are ready and have applied the same, then compare their states."""
+    slots = sorted(r.id.slot for r in replicas)
+    wait_for(lambda: fully_ready(robot) == slots, f"replicas {slots} to be ready")
+    wait_for(
+        lambda: all(
+            s["order"]["joined"] == len(slots) for s in robot.status()["services"].values()
+        ),
+        "all to have joined",
+    )
+    wait_for(lambda: len({state_of(r) for r in replicas}) == 1, "equal states")
+
+
+def test_kills_of_every_kind_leave_one_history_and_one_state(parts, clients):
+    """The proxy, a `run`, the newest replica in its restore, all but one: one service is seen."""
+    source = random.Random(1)
+    first, second = parts.replica(0), parts.replica(1)
+    robot = parts.robot("robot", first, second)
+    counters = [
+        clients(robot, "/count", lambda: (("add", 1), ("get", 0))[source.random() < 0.3])
+        for _ in range(2)
+    ]
+    stores = [
+        clients(
+            robot,
+            "/store",
+            lambda: (
+                ("put", source.choice("ab"), source.randint(0, 999))
+                if source.random() < 0.6
+                else ("get", source.choice("ab"))
+            ),
+        )
+        for _ in range(2)
+    ]
+
+    def answered_more(count: int = 30) -> None:
+        before = [c.answered for c in (*counters, *stores)]
+        wait_for(
+            lambda: all(
+                c.answered >= b + count for c, b in zip((*counters, *stores), before, strict=True)
+            ),
+            "answers",
+        )
+
+    def restarted() -> tuple[float, float]:
+        """Kill the sequencer; return when, and when all were answered again."""
+        killed = time.monotonic()
+        robot.restart()
+        answered_more()
+        return killed, time.monotonic()
+
+    answered_more()
+    os.kill(first.run_pid(), 9)  # its state is gone: it is restored
+    answered_more()
+    restarts = [restarted()]
+
+    began = parts.folder / "restore-began"
+    newest = parts.replica(2, f"2.0 {began}")  # its restore takes two seconds
+    robot.follow(first, second, newest)
+    wait_for(began.exists, "the newest replica's restore to begin")
+    newest.process.kill()
+    answered_more()
+
+    third = parts.replica(3)
+    robot.follow(first, second, third)
+    wait_for(lambda: 3 in fully_ready(robot), "the third replica")
+    first.process.kill()  # all but one, and that is not the one which began
+    second.process.kill()
+    answered_more()
+    restarts.append(restarted())
+    for client in (*counters, *stores):
+        client.stop()
+    first.start_again()
+    robot.follow(first, third)
+    settled(robot, first, third)
+    count_history = [call for c in counters for call in c.history]
+    store_history = [call for c in stores for call in c.history]
+    assert linearizable(count_history, counter, 0)
+    for key in "ab":  # each key is a service of its own: checked apart
+        assert linearizable([c for c in store_history if c.asked[1] == key], key_value, ())
+    total, values = state_of(third)
+    assert b'"total": 0' not in total
+    assert values != b"{}"
+    for call in (*count_history, *store_history):
+        # Only what a killed proxy had taken, or what was asked while there was none, is lost.
+        assert call.answered or any(
+            killed - GIVE_UP_S <= call.began <= back for killed, back in restarts
+        )
+
+
+def test_all_replicas_lost_while_the_proxy_lives(parts, clients):
+    """Every machine is killed; new ones are given the state by the robot's proxy."""
+    old = parts.replica(0)
+    robot = parts.robot("robot", old)
+    client = clients(robot, "/count", lambda: ("add", 1))
+    wait_for(lambda: client.answered >= 20, "answers")
+    client.stop()
+    old.process.kill()
+    new = parts.replica(1)
+    robot.follow(new)
+    wait_for(lambda: fully_ready(robot) == [1], "the new replica")
+    added = client.answered
+    assert client.ask(("get", 0), LIMIT_S) == added
+    assert linearizable(client.history, counter, 0)
+
+
+def test_another_robot_is_refused_and_told_so(parts, clients):
+    """Two robots cannot order against each other: the second says who has the service."""
+    replica = parts.replica(0)
+    robot = parts.robot("one", replica)
+    client = clients(robot, "/count", lambda: ("add", 1))
+    wait_for(lambda: client.answered >= 5, "answers")
+    other = parts.robot("two", replica)
+
+    def trouble() -> str:
+        with contextlib.suppress(KeyError):
+            return str(other.status()["services"]["/count"]["order"]["trouble"])
+        return ""
+
+    assert "`one`" in wait_for(trouble, "the second robot to be told")
+    before = client.answered
+    wait_for(lambda: client.answered > before + 5, "the first robot to go on")
+    assert linearizable(client.history, counter, 0)
