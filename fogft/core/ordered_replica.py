@@ -96,6 +96,7 @@ class OrderedReplica(Generic[T]):
         self.serving = False  # whether the service and its two state services are there
         self.promised = 0
         self.robot = ""
+        self.goal = 0  # with this number it has caught up with the time when it joined
         self.applied = 0  # how many requests were applied here
         self._limits = (queue_limit, queue_bytes, kept, kept_bytes)
         self._serial = 0
@@ -107,6 +108,11 @@ class OrderedReplica(Generic[T]):
         self._restore: tuple[int, bytes, T] | None = None
         self._kept: OrderedDict[int, bytes | None] = OrderedDict()
         self._kept_size = 0
+
+    @property
+    def current(self) -> bool:
+        """Whether it has the present state: it joined, and has caught up since."""
+        return self.joined and self.serving and self.position.index >= self.goal
 
     @property
     def busy(self) -> bool:
@@ -170,10 +176,10 @@ class OrderedReplica(Generic[T]):
 
     def _join(self, payload: bytes, to: T) -> list[Effect[T]]:
         if not self.joined:
-            at = ordering.decode_position(payload)
+            at, goal = ordering.decode_join(payload)
             if not self.sound or self.busy or at != self.position:
                 return [Refuse(to, NOT_JOINED)]
-            self.joined = True
+            self.joined, self.goal = True, goal
             if at.epoch != self.promised:
                 self._forget_answers()
                 self.position = Position(self.promised, at.index)
@@ -182,11 +188,12 @@ class OrderedReplica(Generic[T]):
     def _take_restore(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
         if self.joined and index < self._expected:  # it is behind us: a copy, or not needed
             return [Reply(to, ordering.encode_index(self._expected))]
+        goal, state = ordering.decode_snapshot(payload)
         out: list[Effect[T]] = self._give_up(NOT_JOINED) if self.joined else []
         self.joined = False
         if self._restore is not None:
             out.append(Refuse(self._restore[2], NOT_JOINED))
-        self._restore = (index, payload, to)
+        self._restore, self.goal = (index, state, to), goal
         return [*out, *self._go_on()]
 
     def _recall(self, index: int, to: T) -> list[Effect[T]] | None:

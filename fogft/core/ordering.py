@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 _ID = struct.Struct(">QQ")
-_POSITION = struct.Struct(">QQ")
+_JOIN = struct.Struct(">QQQ")
 _PROMISE = struct.Struct(">QQB")
 _INDEX = struct.Struct(">Q")
 INDEX_LIMIT = 1 << 56
@@ -99,14 +99,15 @@ def decode(id: bytes) -> tuple[Op, int, int]:
         raise OrderError(f"no order: {id.hex()}") from error
 
 
-def encode_position(position: Position) -> bytes:
-    """Return a position as bytes."""
-    return _POSITION.pack(position.epoch, position.index)
+def encode_join(at: Position, last: int) -> bytes:
+    """Return where a replica must be to join, and the last number given until now."""
+    return _JOIN.pack(at.epoch, at.index, last)
 
 
-def decode_position(payload: bytes) -> Position:
-    """Read a position. Raises OrderError."""
-    return Position(*_unpack(_POSITION, payload))
+def decode_join(payload: bytes) -> tuple[Position, int]:
+    """Read what `encode_join` wrote. Raises OrderError."""
+    epoch, index, last = _unpack(_JOIN, payload)
+    return Position(epoch, index), last
 
 
 def encode_promise(promise: Promise) -> bytes:
@@ -132,12 +133,14 @@ def decode_index(payload: bytes) -> int:
 
 
 def encode_snapshot(index: int, state: bytes) -> bytes:
-    """Return a snapshot: the index it stands for, and the state's own bytes."""
+    """Return a state's own bytes after an index: in a snapshot the one that it stands for, in a
+    restore the last number given until now.
+    """
     return _INDEX.pack(index) + state
 
 
 def decode_snapshot(payload: bytes) -> tuple[int, bytes]:
-    """Read a snapshot. Raises OrderError."""
+    """Read what `encode_snapshot` wrote. Raises OrderError."""
     return decode_index(payload[: _INDEX.size]), payload[_INDEX.size :]
 
 

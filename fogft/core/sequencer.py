@@ -25,6 +25,8 @@ RETRY_LIMIT_S = 0.5
 CHECKPOINT_RETRY_S = 1.0
 CHECK_EVERY_S = 1.0
 WINDOW = 256
+# Further behind than this, a replica is given a new snapshot rather than every request since.
+REPLAY_LIMIT = 256
 
 
 @dataclass(frozen=True)
@@ -244,21 +246,34 @@ class Sequencer:
         else:
             self._bring(replica, peer)
 
-    def _bring(self, replica: int, peer: _Peer) -> None:
-        """Let a claimed replica join, from its own state or from the checkpoint."""
+    def _bring(self, replica: int, peer: _Peer, *, waited: bool = False) -> None:
+        """Let a claimed replica join, from its own state or from the checkpoint.
+
+        Where both are long ago it waits for a new checkpoint, if there is whom to ask; `waited`
+        says that it has.
+        """
         log, promise = self.log, peer.promise
         if log is None or promise is None or peer.open:
             return
-        at = promise.position
+        at, kept = promise.position, log.checkpoint
         ours = at == self.base or at.epoch == self.epoch
-        if promise.sound and ours and log.covers(at.index):
+        may_join = promise.sound and ours and log.covers(at.index)
+        from_index = max(at.index if may_join else -1, kept.index if kept else -1)
+        if log.last - from_index > REPLAY_LIMIT and self.ready and not waited:
+            return
+        if may_join and from_index == at.index:
             peer.phase = Phase.ASKED
-            payload = ordering.encode_position(at)
+            payload = ordering.encode_join(at, log.last)
             self._out.append(Order(replica, Op.JOIN, at.index, payload))
-        elif log.checkpoint is not None:
+        elif kept is not None:
             peer.phase = Phase.ASKED
-            kept = log.checkpoint
-            self._out.append(Order(replica, Op.RESTORE, kept.index, kept.state))
+            payload = ordering.encode_snapshot(log.last, kept.state)
+            self._out.append(Order(replica, Op.RESTORE, kept.index, payload))
+
+    def _bring_those_who_waited(self) -> None:
+        for replica, peer in self._peers.items():
+            if peer.phase is Phase.CLAIMED:
+                self._bring(replica, peer, waited=True)
 
     def _has_joined(self, replica: int, peer: _Peer, expected: int) -> None:
         log = self.log
@@ -311,6 +326,7 @@ class Sequencer:
         if op is Op.SNAPSHOT:
             if self._asked_for_checkpoint == replica:
                 self._asked_for_checkpoint = None
+            self._bring_those_who_waited()
             return
         if peer is None:
             return
@@ -363,7 +379,7 @@ class Sequencer:
         kept = log.checkpoint
         # A log that begins with the service's first state needs none; nor does one just taken.
         waits = any(p.phase is Phase.CLAIMED for p in self._peers.values())
-        needed = kept is None and (log.start > 0 or waits)
+        needed = waits or (kept is None and log.start > 0)
         if not needed and not log.half_full:
             return
         joined = [(p.won, r) for r, p in self._peers.items() if p.phase is Phase.JOINED]
@@ -379,6 +395,7 @@ class Sequencer:
         if self.log is not None and self.deposed_by is None:
             self.log.keep(Checkpoint(index, state))
             self._checkpoint_at = 0.0
+            self._bring_those_who_waited()
 
     def _make_room(self, size: int) -> bool:
         """No checkpoint came in time: drop what every member has applied, and no more.

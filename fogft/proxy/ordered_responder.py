@@ -84,7 +84,7 @@ class OrderedResponder:
     @property
     def ready(self) -> bool:
         """Whether it has the present state and applies what comes."""
-        return self._machine.joined and self._machine.serving
+        return self._machine.current
 
     @property
     def in_flight(self) -> int:

@@ -6,6 +6,7 @@ import random
 
 import pytest
 
+from fogft.core.sequencer import REPLAY_LIMIT
 from tests.core.ordering_world import World
 from tests.linearizability import Call, counter, key_value, linearizable
 
@@ -185,6 +186,40 @@ def test_the_newest_replica_dies_during_its_restore():
     world.ask(0, ("add", 1))
     world.settle()
     assert world.hosts[again].state == world.history[-1].answer == 11
+
+
+def busy_world(requests: int) -> World:
+    world = World(counter, 0, replicas=1, log_entries=4000)
+    world.settle()
+    for _ in range(requests):
+        world.ask(0, ("add", 1))
+        world.settle()
+    return world
+
+
+def test_a_new_replica_gets_a_fresh_snapshot_rather_than_hundreds_of_requests():
+    """The log would do, and the checkpoint too; both would keep it from being ready for long."""
+    world = busy_world(REPLAY_LIMIT + 10)
+    newest = world.add_replica()
+    world.settle()
+    assert world.restored == 1
+    assert world.hosts[newest].machine.applied == 0
+    assert world.hosts[newest].machine.current
+
+
+def test_a_replica_is_current_only_when_it_has_caught_up_with_the_time_of_its_joining():
+    """It has joined, and still has requests to apply that were answered before it came."""
+    world = busy_world(20)
+    newest = world.add_replica()
+    machine = world.hosts[newest].machine
+    while not machine.joined:
+        world.deliver(0) if world.letters else world.tick()
+    for _ in range(20):
+        assert not machine.current
+        while world.hosts[newest].work is None:
+            world.deliver(0) if world.letters else world.tick()
+        world.work(newest)
+    assert machine.current
 
 
 def test_the_checker_would_notice():
