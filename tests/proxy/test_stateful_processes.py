@@ -160,7 +160,7 @@ def settled(robot: Robot, *replicas: Replica) -> None:
     wait_for(lambda: fully_ready(robot) == slots, f"replicas {slots} to be ready")
     wait_for(
         lambda: all(
-            s["order"]["joined"] == len(slots) for s in robot.status()["services"].values()
+            s["order"]["joined"] == len(slots) for s in robot.report().get("services", {}).values()
         ),
         "all to have joined",
     )
@@ -273,7 +273,7 @@ def test_another_robot_is_refused_and_told_so(parts, clients):
 
     def trouble() -> str:
         with contextlib.suppress(KeyError):
-            return str(other.status()["services"]["/count"]["order"]["trouble"])
+            return str(other.report()["services"]["/count"]["order"]["trouble"])
         return ""
 
     assert "`one`" in wait_for(trouble, "the second robot to be told")
