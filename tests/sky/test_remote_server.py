@@ -155,9 +155,7 @@ class World:
         found = []
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
-                if self.folder in (where := Path(os.readlink(entry / "cwd"))).parents or (
-                    where == self.folder
-                ):
+                if Path(os.readlink(entry / "cwd")).is_relative_to(self.folder):
                     found.append(int(entry.name))
         return found
 
