@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 _PROBE_EVERY_S = 1.0
 _FIRST_PROBES_EVERY_S = 0.1
+_UNREADY_PROBES_EVERY_S = 0.25  # a replica that is there gets requests soon after it is ready
 _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
 _EXPLAIN_EVERY_S = 5.0
 _EXPLAIN_TIMEOUT_S = 0.5
@@ -283,7 +284,7 @@ class ZenohLink:
             if now >= next_probe:
                 connection.sweep()
                 self._probe(connection, now)
-                next_probe = now + (self._probe_every_s if up else _FIRST_PROBES_EVERY_S)
+                next_probe = now + self._next_probe_in_s(up=up)
             left_s = self._suspect_after_s - self._asked.for_s(now)
             if left_s <= 0:
                 connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
@@ -294,6 +295,13 @@ class ZenohLink:
             except WireError as error:
                 connection.lost_because = error.message
         return up
+
+    def _next_probe_in_s(self, *, up: bool) -> float:
+        if not up:
+            return _FIRST_PROBES_EVERY_S
+        if self._services.keys() <= self._ready:
+            return self._probe_every_s
+        return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
 
     def _renewal_due(self, now: float) -> bool:
         if self._renew_at is not None and now >= self._renew_at:

@@ -33,6 +33,7 @@ from fogft.wire import record_frames as frames
 from fogft.wire.rendezvous_dialling import Caller
 from fogft.wire.rendezvous_server import PURPOSE, binding_of
 from fogft.wire.signing import Signer
+from tests.wire import fuzz_records
 from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
 from tests.wire.wire_pool import POOL_UID, Authority, Files, wait_for
 
@@ -384,3 +385,11 @@ def test_large_sets_travel_in_small_frames(authority):
         for message in unframer.feed(data):
             found += frames.read_records(message)
     assert found == all
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_damaged_bytes_break_no_reader(seed):
+    """A short run of what `fuzz_records` does by the million; good inputs come through it too."""
+    outcomes = fuzz_records.run(3000, seed)
+    assert sum(outcomes.values()) == 3000
+    assert {"plain read", "stream read", "plain malformed", "stream malformed"} <= set(outcomes)

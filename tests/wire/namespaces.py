@@ -1,0 +1,85 @@
+"""Network namespaces of a test's own: made by it, joined by it, gone with it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import subprocess
+from collections.abc import Iterator
+
+_CLONE_NEWNET = 0x40000000
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def _run(*words: str) -> None:
+    subprocess.run(words, check=True, capture_output=True, text=True)
+
+
+def why_not() -> str:
+    """Return why no namespace can be made here; empty where one can."""
+    if os.geteuid() != 0:
+        return "needs root: network namespaces"
+    name = f"fogft-try-{os.getpid()}"
+    try:
+        _run("ip", "netns", "add", name)
+        _run("ip", "netns", "del", name)
+    except (OSError, subprocess.CalledProcessError) as error:
+        return f"no network namespace can be made: {error}"
+    return ""
+
+
+class Namespaces:
+    """A few namespaces, joined by pairs of virtual cables."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._cables = 0
+
+    def add(self, short: str) -> str:
+        name = f"fogft-{short}-{os.getpid()}"
+        _run("ip", "netns", "add", name)
+        self._names.append(name)
+        _run("ip", "-n", name, "link", "set", "lo", "up")
+        return name
+
+    def join(self, one: str, address: str, other: str, far_address: str) -> None:
+        """Lay a cable; both addresses lie in one /24."""
+        self._cables += 1
+        near, far = f"ft{self._cables}a", f"ft{self._cables}b"
+        _run("ip", "-n", one, "link", "add", near, "type", "veth", "peer", "name", far,
+             "netns", other)  # fmt: skip
+        for name, cable, where in ((one, near, address), (other, far, far_address)):
+            _run("ip", "-n", name, "addr", "add", f"{where}/24", "dev", cable)
+            _run("ip", "-n", name, "link", "set", cable, "up")
+
+    def blackhole(self, where: str, address: str) -> None:
+        """Let nothing that `where` sends reach an address; nobody is told."""
+        _run("ip", "-n", where, "route", "add", "blackhole", f"{address}/32")
+
+    def restore(self, where: str, address: str) -> None:
+        _run("ip", "-n", where, "route", "del", "blackhole", f"{address}/32")
+
+    def readdress(self, where: str, cable: str, old: str, new: str) -> None:
+        _run("ip", "-n", where, "addr", "del", f"{old}/24", "dev", cable)
+        _run("ip", "-n", where, "addr", "add", f"{new}/24", "dev", cable)
+
+    def close(self) -> None:
+        for name in self._names:
+            _run("ip", "netns", "del", name)
+
+
+@contextlib.contextmanager
+def inside(name: str) -> Iterator[None]:
+    """Have this thread make its sockets in a namespace, and what it starts live there."""
+    with open("/proc/thread-self/ns/net") as own, open(f"/var/run/netns/{name}") as there:
+        _enter(there.fileno())
+        try:
+            yield
+        finally:
+            _enter(own.fileno())
+
+
+def _enter(descriptor: int) -> None:
+    if _libc.setns(descriptor, _CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), "setns")
