@@ -240,15 +240,20 @@ class Adaptive:
         if answered:
             self._heard(known, now - begun, now)
 
-    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
-        """A deadline came: these would have taken longer than until now."""
+    def stopped(self, request: bytes, open: Mapping[int, float], now: float) -> None:
+        """Learn that these would have taken longer than until now."""
         for replica, begun in open.items():
             self._probes.pop((request, replica), None)
             known = self._of(replica)
             known.ended()
             self._overtaken(known, now - begun, now)
-            if known.answered_at < begun:
-                known.doubted = True
+
+    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
+        """Learn the same, and doubt who has answered nothing else meanwhile."""
+        self.stopped(request, open, now)
+        for replica, begun in open.items():
+            known = self._of(replica)
+            known.doubted = known.doubted or known.answered_at < begun
 
     def report(self) -> dict[str, Any]:
         """Return counts, the budget, and each replica's estimate by ``slot.generation``."""

@@ -54,6 +54,9 @@ class Hedging(Protocol):
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
         """An attempt ended after its request had: with an answer, or without one."""
 
+    def stopped(self, request: bytes, open: Mapping[int, float], now: float) -> None:
+        """A request was answered by somebody else than a replica; these stop."""
+
     def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
         """A request's deadline came while these worked on it; they stop."""
 
@@ -96,6 +99,9 @@ class All:
         return False
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
+        """Learn nothing."""
+
+    def stopped(self, request: bytes, open: Mapping[int, float], now: float) -> None:
         """Learn nothing."""
 
     def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:

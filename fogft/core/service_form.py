@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 from fogft.core import spec_state
 from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
+from fogft.core.spec_choices import FallbackSpec
 
 LONGEST_S = 1e7  # what a request's header can carry
 # What a replica must know; the rest is the robot's.
@@ -32,7 +33,8 @@ def to_plain(service: ServiceSpec, keys: tuple[str, ...] = ()) -> dict[str, Any]
         if field.name in _NOT_THE_PROXIES or (keys and field.name not in keys):
             continue
         if value != field.default or field.name in _ALWAYS:
-            written[field.name] = getattr(value, "value", value)
+            is_map = isinstance(value, FallbackSpec)
+            written[field.name] = asdict(value) if is_map else getattr(value, "value", value)
     if service.state is not None and "state" in written:
         written["state"] = service.state.to_plain()
     return written
@@ -57,6 +59,20 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         concurrency=int(raw.get("concurrency") or 0),
         cancel=str(raw.get("cancel") or ""),
         state=spec_state.from_plain(raw.get("state")),
+        fallback=_fallback(raw.get("fallback")),
+        trace=bool(raw.get("trace")),
+    )
+
+
+def _fallback(raw: Mapping[str, Any] | None) -> FallbackSpec | None:
+    if raw is None:
+        return None
+    after_s = raw.get("after_s")
+    return FallbackSpec(
+        service=str(raw["service"]),
+        after_s=None if after_s is None else seconds(after_s),
+        while_none_ready=bool(raw.get("while_none_ready")),
+        limit_s=seconds(raw.get("limit_s") or FallbackSpec.limit_s),
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from fogft.core.spec_choices import (
     AvailabilitySpec,
+    FallbackSpec,
     GroupSpec,
     MigrationSpec,
     OnDemandSpec,
@@ -28,6 +29,7 @@ class OnTimeout(str, Enum):
 
     SILENT = "silent"  # no response: an empty list of obstacles is never mistaken for a clear road
     EMPTY = "empty"  # a default-constructed response, as in the paper
+    FALLBACK = "fallback"  # the response of another service, on the robot
 
 
 class HedgingMode(str, Enum):
@@ -50,6 +52,8 @@ class ServiceSpec:
         replicas: At least so many carry it; 0 for as many as the pool has.
         traffic: What is asked of it, for costs.
         concurrency: Requests that a replica gives the service at once; 0 to learn it.
+        fallback: Who answers at the deadline, or before; only with `on_timeout: fallback`.
+        trace: Whether each request leaves a line in the client proxy's `trace.jsonl`.
         cancel: Name of the service's cancel service (`std_srvs/srv/Trigger`); empty for none.
         state: How its state is taken and given; None for a service that keeps none.
     """
@@ -66,6 +70,8 @@ class ServiceSpec:
     concurrency: int = 0
     cancel: str = ""
     state: StateSpec | None = None
+    fallback: FallbackSpec | None = None
+    trace: bool = False
 
 
 @dataclass(frozen=True)

@@ -121,3 +121,21 @@ class TrafficSpec:
     requests_per_s: float = 0.0
     request_bytes: float = 0.0
     response_bytes: float = 0.0
+
+
+@dataclass(frozen=True)
+class FallbackSpec:
+    """The service on the robot that answers when the replicas do not.
+
+    Attributes:
+        service: Its name; of the same type.
+        after_s: Ask it so long after the request came, beside the replicas; None for not
+            before the deadline.
+        while_none_ready: Ask it at once while no replica is ready.
+        limit_s: How long its answer is awaited past the deadline.
+    """
+
+    service: str
+    after_s: float | None = None
+    while_none_ready: bool = False
+    limit_s: float = 1.0

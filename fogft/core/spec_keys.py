@@ -28,8 +28,10 @@ FOGFT_KEYS = (
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
     *("hedging", "hedging_budget", "concurrency", "cancel"),
+    *("fallback", "trace"),
     *("replicas", "traffic", "state"),
 )
+FALLBACK_KEYS = ("service", "after_s", "while_none_ready", "limit_s")
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
 AVAILABILITY_KEYS = (
     "target",

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from fogft.core import ros_names
-from fogft.core.spec import MAX_REPLICAS, HedgingMode, ServiceSpec
-from fogft.core.spec_keys import CONCURRENCY_LIMIT, DAY_S, LATER_KEYS, SERVICE_KEYS, places
+from fogft.core.spec import MAX_REPLICAS, HedgingMode, OnTimeout, ServiceSpec
+from fogft.core.spec_choices import FallbackSpec
+from fogft.core.spec_keys import (
+    CONCURRENCY_LIMIT,
+    DAY_S,
+    FALLBACK_KEYS,
+    LATER_KEYS,
+    SERVICE_KEYS,
+    places,
+)
 from fogft.core.spec_plan import read_traffic
 from fogft.core.spec_state import read_state
 from fogft.core.spec_tree import Section, shown
@@ -59,7 +67,56 @@ def _service(section: Section) -> ServiceSpec:
         concurrency=_concurrency(section),
         cancel=_other_service(section, "cancel", name, "the name of its cancel service"),
         state=read_state(section),
+        fallback=_fallback(section, name),
+        trace=_trace(section),
     )
+
+
+def _fallback(section: Section, name: str) -> FallbackSpec | None:
+    """Return the fallback, which `on_timeout: fallback` needs and nothing else may have."""
+    wanted = section.choice("on_timeout", ServiceSpec.on_timeout) is OnTimeout.FALLBACK
+    example = f"such as `fallback: {{service: {name}_onboard}}`"
+    if not wanted:
+        if "fallback" in section.children:
+            raise section.error(
+                "fallback", "is not used: `on_timeout` is not `fallback`",
+                "write `on_timeout: fallback`, or remove it",
+            )  # fmt: skip
+        return None
+    if "state" in section.children:
+        raise section.error(
+            "on_timeout", "cannot be `fallback` for a service with `state`: it knows none of it",
+            "write `silent` or `empty`",
+        )  # fmt: skip
+    if not section.has("fallback"):
+        hint = f"name a service of the same type on the robot, {example}"
+        raise section.error("fallback", "is missing", hint)
+    below = section.section("fallback", f"write a map, {example}")
+    below.only(FALLBACK_KEYS)
+    service = _other_service(below, "service", name, "the name of a service on the robot")
+    if not service:
+        raise below.error("service", "is missing", f"name a service on the robot, {example}")
+    timeout_s = section.number("timeout_s", DAY_S, "seconds", ServiceSpec.timeout_s)
+    after_s = below.number("after_s", DAY_S, "seconds", 0.0) or None
+    if after_s is not None and after_s >= timeout_s:
+        raise below.error(
+            "after_s",
+            f"must be below `timeout_s`, which is {timeout_s:g}",
+            "make it shorter, or remove it: at the deadline the fallback is asked anyway",
+        )
+    return FallbackSpec(
+        service=service,
+        after_s=after_s,
+        while_none_ready=below.flag("while_none_ready", FallbackSpec.while_none_ready),
+        limit_s=below.number("limit_s", DAY_S, "seconds", FallbackSpec.limit_s),
+    )
+
+
+def _trace(section: Section) -> bool:
+    wanted = section.flag("trace", ServiceSpec.trace)
+    if wanted and "state" in section.children:
+        raise section.error("trace", "is not there for a service with `state`", "remove it")
+    return wanted
 
 
 def _concurrency(section: Section) -> int:

@@ -22,7 +22,7 @@ from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.spec import ServiceSpec
 from fogft.proxy.dispatcher import Dispatcher
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
-from fogft.ros.port import RosNode, RosServer
+from fogft.ros.port import RosClient, RosNode, RosServer
 from fogft.wire.port import Answer, Dialer, Link, Peer
 
 log = logging.getLogger(__name__)
@@ -49,12 +49,15 @@ class _Service:
         self.spec = spec
         self.dispatcher = dispatcher
         self.server: RosServer | None = None
+        self.fallback: RosClient | None = None
+        self.fallback_name = ""
         self.trouble = ""  # why it cannot be advertised; empty when it can
 
     def close(self) -> None:
-        """Withdraw it, and let go of what its dispatcher holds."""
-        if self.server is not None:
-            self.server.close()
+        """Withdraw it from ROS, and let go of what its dispatcher holds."""
+        for end in (self.server, self.fallback):
+            if end is not None:
+                end.close()
         if isinstance(self.dispatcher, OrderedDispatcher):
             self.dispatcher.close()
 
@@ -110,7 +113,7 @@ class ClientProxy:
                 old = self._services.get(spec.name)
                 if old is not None and (old.spec.type, old.spec.state) == (spec.type, spec.state):
                     old.spec = spec
-                    old.dispatcher.adopt(spec)
+                    self._adopt(old)
                     continue
                 if old is not None:
                     old.close()
@@ -129,7 +132,27 @@ class ClientProxy:
                 service.server.respond(handle, payload)
 
         service = _Service(spec, self._make_dispatcher(spec, respond, self._wake.set))
+        if spec.fallback is not None:
+            self._adopt(service)
         return service
+
+    def _adopt(self, service: _Service) -> None:
+        """Have the dispatcher follow its service's spec, with a client of the fallback."""
+        spec, dispatcher = service.spec, service.dispatcher
+        if isinstance(dispatcher, OrderedDispatcher):
+            dispatcher.adopt(spec)
+            return
+        name = spec.fallback.service if spec.fallback is not None else ""
+        if name != service.fallback_name:
+            old, service.fallback, service.fallback_name = service.fallback, None, name
+            if name:
+                try:
+                    service.fallback = self._node.client(name, spec.type)
+                except RosError as error:
+                    log.error("fallback_not_usable service=%s reason=%r", spec.name, error.message)
+            if old is not None:
+                old.close()
+        dispatcher.adopt(spec, service.fallback)
 
     # -- membership -----------------------------------------------------------------------
 
@@ -251,7 +274,8 @@ class ClientProxy:
                 continue
             able = [link for link in self._links.values() if name in link.ready]
             fresh = [link for link in able if not self._draining(link)]
-            if able:
+            fallback = service.spec.fallback
+            if able or (fallback is not None and fallback.while_none_ready):
                 self._advertise(service)
             service.dispatcher.route(fresh or able)
 
@@ -317,6 +341,16 @@ class ClientProxy:
             "work": dict(answer.work) if answer else {},
             "detail": status.detail or (answer.detail if answer else ""),
         }
+
+    def trace(self) -> list[dict[str, Any]]:
+        """Return how requests ended since the last call, of the services that are traced."""
+        with self._lock:
+            return [
+                {"service": name, **line}
+                for name, service in self._services.items()
+                if isinstance(service.dispatcher, Dispatcher)
+                for line in service.dispatcher.trace()
+            ]
 
     def close(self) -> None:
         """Close every link. The ROS node is its owner's to close."""

@@ -7,6 +7,7 @@ needs no manager: started alone it goes on with the last membership on disk.
 from __future__ import annotations
 
 import functools
+import json
 import logging
 import os
 import threading
@@ -30,6 +31,8 @@ from fogft.ros import environment, memory_tuning
 
 log = logging.getLogger(__name__)
 
+TRACE_NAME = "trace.jsonl"
+_TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 0.5
 _REPORT_AFTER_CHANGE_S = 0.05
 
@@ -188,6 +191,8 @@ def _loop(
                 return
             report = {**proxy.report(), **following.report()}
             _apply(functools.partial(_report, config, report, now - started), config.status)
+            trace = config.status.with_name(TRACE_NAME)
+            _apply(functools.partial(_write_trace, trace, proxy), trace)
 
 
 _troubles: dict[Path, str] = {}
@@ -228,6 +233,21 @@ def _report(config: ClientProxyConfig, report: Mapping[str, Any], uptime_s: floa
         "robot": config.robot,
     }
     disk.write_json(config.status, {**header, **report}, durable=False)
+
+
+def _write_trace(path: Path, proxy: ClientProxy) -> None:
+    """Append how requests ended, a JSON object a line; keep one older file."""
+    lines = proxy.trace()
+    if not lines:
+        return
+    at = round(time.time(), 3)
+    try:
+        if path.exists() and path.stat().st_size > _TRACE_BYTES:
+            path.replace(path.with_name(path.name + ".1"))
+        with path.open("a") as file:
+            file.writelines(json.dumps({"at": at, **line}) + "\n" for line in lines)
+    except OSError as error:
+        raise StateError(f"`{path}` cannot be written: {error.strerror}") from error
 
 
 def _node_name(prefix: str, pool: str) -> str:

@@ -17,6 +17,7 @@ import logging
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -29,6 +30,9 @@ from fogft.core.model import ReplicaId
 from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
 from fogft.proxy.outcomes import Outcomes
+from fogft.proxy.request import Request
+from fogft.proxy.rescuer import Rescuer, Shared, note_end
+from fogft.ros.port import RosClient
 from fogft.wire.port import Answer, Link, Refusal
 
 log = logging.getLogger(__name__)
@@ -44,15 +48,7 @@ _BLAMELESS_REFUSALS = frozenset(
 )
 
 
-class _Request:
-    """What is kept with a request: its bytes, the handle of its caller, when it came."""
-
-    __slots__ = ("arrived", "handle", "payload")
-
-    def __init__(self, payload: bytes, handle: Any, arrived: float) -> None:
-        self.payload = payload
-        self.handle = handle
-        self.arrived = arrived
+_TRACE_KEPT = 20_000  # lines until they are written, twice a second
 
 
 class Dispatcher:
@@ -88,12 +84,14 @@ class Dispatcher:
         self._max_pending_bytes = max_pending_bytes
         self._pending_bytes = 0
         self._lock = threading.Lock()
-        self._requests: FirstResponse[_Request] = FirstResponse()
+        self._requests: FirstResponse[Request] = FirstResponse()
         self._hedging = _policy(spec)
         self._next_look = NEVER  # when the policy wants to be asked, as the last tick said
         self._links: dict[int, Link] = {}
         self._able: tuple[int, ...] = ()
         self._outcomes = Outcomes()
+        self._rescuer: Rescuer | None = None
+        self._follow(spec, None)
 
     # -- requests -------------------------------------------------------------------------
 
@@ -116,13 +114,15 @@ class Dispatcher:
                 self._requests.register(
                     request,
                     deadline=now + timeout_s,
-                    item=_Request(payload, handle, now),
+                    item=Request(payload, handle, now),
                     replicas=chosen,
                     now=now,
                     complete=len(chosen) == len(able),
                 )
                 count["sent"] += len(chosen)
                 soon = self._hedging.look_at
+                if self._rescuer is not None and self.spec.fallback is not None:
+                    soon = min(soon, self._rescuer.submitted(request, now, able=bool(able)))
         if turned_away:
             self._log_rarely("request_turned_away", turned_away, "pending is full")
             return
@@ -165,8 +165,12 @@ class Dispatcher:
                 self._hedging.late(request, replica, now, answered=True)
             else:
                 losers = self._hedging.answered(request, pending.open, replica, now)
-                self._close(pending)
+                self._close(request, pending)
                 self._outcomes.won(link.peer.id, now - pending.item.arrived)
+                note_end(
+                    self._outcomes, request, pending,
+                    outcome="answered", now=now, replica=link.peer.id.short,
+                )  # fmt: skip
         if pending is None:
             self._outcomes.late()
             return
@@ -226,8 +230,10 @@ class Dispatcher:
             if any(replica not in pending.barred for replica in self._able):
                 return False
             self._requests.close(request)
-            self._close(pending)
+            self._close(request, pending)
             self._outcomes.count["answered"] += 1
+            now = self._clock()
+            note_end(self._outcomes, request, pending, outcome="answered", now=now)
         self._return(pending.item.handle, pending.rejection)
         return True
 
@@ -245,20 +251,48 @@ class Dispatcher:
         if count & (count - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
             log.warning("%s service=%s reason=%r count=%d", event, self.spec.name, reason, count)
 
-    def _close(self, pending: Pending[_Request]) -> None:
+    def _close(self, request: bytes, pending: Pending[Request]) -> None:
         self._pending_bytes -= len(pending.item.payload)
+        if self._rescuer is not None:
+            self._rescuer.ended(request)
 
-    # -- policy, links and time -------------------------------------------------------------------
+    def _stop(self, request: bytes, pending: Pending[Request], now: float) -> None:
+        """Somebody else than a replica has answered."""
+        self._hedging.stopped(request, pending.open, now)
+        self._close(request, pending)
 
-    def adopt(self, spec: ServiceSpec) -> None:
-        """Follow another policy from now on; requests under way keep their deadlines."""
+    # -- policy, links and time -----------------------------------------------------------
+
+    def adopt(self, spec: ServiceSpec, fallback: RosClient | None = None) -> None:
+        """Follow another policy from now on; requests under way keep their deadlines.
+
+        Args:
+            spec: The policy.
+            fallback: The client of its fallback service, if it has one.
+        """
         with self._lock:
             old, self.spec = self.spec, spec
+            self._follow(spec, fallback)
             if (old.hedging, old.hedging_budget) != (spec.hedging, spec.hedging_budget):
                 self._hedging = _policy(spec)
                 self._requests.reconsider()
                 log.info("hedging_changed service=%s to=%s", spec.name, spec.hedging.value)
         self._wake()
+
+    def _follow(self, spec: ServiceSpec, fallback: RosClient | None) -> None:
+        """Follow what a spec says of fallback and trace."""
+        if spec.fallback is not None and self._rescuer is None:
+            self._rescuer = Rescuer(
+                Shared(
+                    spec.name, self._lock, self._requests, self._outcomes, self._is_ok,
+                    self._clock, self._stop, self._return, self._forget,
+                ),
+                spec.fallback,
+            )  # fmt: skip
+        if self._rescuer is not None:
+            self._rescuer.follow(spec.fallback, fallback)
+        if spec.trace != (self._outcomes.trace is not None):
+            self._outcomes.trace = deque(maxlen=_TRACE_KEPT) if spec.trace else None
 
     def route(self, links: Sequence[Link]) -> None:
         """Set the links that can answer this service now, and offer them what they lack."""
@@ -282,7 +316,7 @@ class Dispatcher:
             expired = self._requests.expire(now)
             for request, pending in expired:
                 self._hedging.expired(request, pending.open, now)
-                self._close(pending)
+                self._pending_bytes -= len(pending.item.payload)
         for request, pending in expired:
             self._expired(request, pending)
         self._offer_more(now)
@@ -290,6 +324,9 @@ class Dispatcher:
             idle = [request for request, _ in self._requests.idle()]
         for request in idle:
             self._settle(request)
+        if self._rescuer is not None:
+            look_at = self._rescuer.tick(now, able=bool(self._able))
+            self._next_look = min(self._next_look, look_at)
         return self._next_look
 
     def _offer_more(self, now: float) -> None:
@@ -326,21 +363,28 @@ class Dispatcher:
         elif request not in self._requests:  # it was answered meanwhile
             self._forget(request, (replica,))
 
-    def _expired(self, request: bytes, pending: Pending[_Request]) -> None:
-        response = pending.rejection
-        if response is not None:
+    def _expired(self, request: bytes, pending: Pending[Request]) -> None:
+        response, rescuer = pending.rejection, self._rescuer
+        if rescuer is not None and self.spec.on_timeout is OnTimeout.FALLBACK:
+            outcome = "fallback"
+        elif response is not None:
             outcome = "answered"
         elif self.spec.on_timeout is OnTimeout.EMPTY and self._empty_response is not None:
             outcome, response = "empty", self._empty_response
         else:
             outcome = "silent"
-        with self._lock:
-            self._outcomes.count[outcome] += 1
+        if outcome != "fallback":
+            with self._lock:
+                self._outcomes.count[outcome] += 1
+                now = self._clock()
+                note_end(self._outcomes, request, pending, outcome=outcome, now=now)
         log.warning(
             "request_timed_out service=%s outcome=%s waited_s=%.3f open=%s request=%s",
             self.spec.name, outcome, self.spec.timeout_s, sorted(pending.open), request.hex(),
         )  # fmt: skip
-        if response is not None:
+        if outcome == "fallback" and rescuer is not None:
+            rescuer.expired(request, pending)
+        elif response is not None:
             self._return(pending.item.handle, response)
         self._forget(request, tuple(self._links))
 
@@ -350,12 +394,22 @@ class Dispatcher:
         """Return how many requests a replica has answered first."""
         return self._outcomes.won_by(replica)
 
+    def trace(self) -> list[dict[str, Any]]:
+        """Return how requests ended since the last call; none where the spec wants no trace."""
+        with self._lock:
+            trace = self._outcomes.trace
+            if not trace:
+                return []
+            found = list(trace)
+            trace.clear()
+        return found
+
     def report(self) -> dict[str, Any]:
         """Return counters and latency quantiles (seconds; None before the first answer)."""
         with self._lock:
             return {
                 **self._outcomes.report(),
-                "pending": len(self._requests),
+                "pending": len(self._requests) + len(self._rescuer or ()),
                 "pending_bytes": self._pending_bytes,
                 "hedging": self._hedging.report(),
             }

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 from fogft.core.model import ReplicaId
@@ -16,7 +17,7 @@ from fogft.core.model import ReplicaId
 _LATENCIES_KEPT = 2000
 _COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
-    *("turned_away", "undelivered"),
+    *("fallback", "fallback_failed", "turned_away", "undelivered"),
 )
 
 
@@ -25,10 +26,12 @@ class Outcomes:
 
     Attributes:
         count: ``received`` requests and ``sent`` copies of them; how they ended
-            (``answered``, ``silent``, ``empty``, ``turned_away``); answers that came too late
+            (``answered``, ``fallback``, ``silent``, ``empty``, ``turned_away``); calls of the
+            fallback that came to nothing (``fallback_failed``); answers that came too late
             to be used (``late``); responses that were not ok (``rejected``); responses that
             ROS did not take (``undelivered``).
         refused: Refusals by reason.
+        trace: How each request ended, until somebody takes it; None where it is not wanted.
     """
 
     def __init__(self) -> None:
@@ -37,12 +40,45 @@ class Outcomes:
         self._won: dict[ReplicaId, int] = {}
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._late_lock = threading.Lock()
+        self.trace: deque[dict[str, Any]] | None = None
 
     def won(self, replica: ReplicaId, took_s: float) -> None:
         """Count a request that a replica has answered first."""
         self.count["answered"] += 1
         self._won[replica] = self._won.get(replica, 0) + 1
         self._latencies.append(took_s)
+
+    def note(
+        self,
+        request: bytes,
+        outcome: str,
+        *,
+        took_s: float,
+        asked: Mapping[int, float],
+        replica: str = "",
+    ) -> None:
+        """Trace how a request ended.
+
+        Args:
+            request: Its id.
+            outcome: One of `count`'s.
+            took_s: Since it arrived, in seconds.
+            asked: Who worked on it at its end, and since when after its arrival.
+            replica: Who answered it.
+        """
+        if self.trace is not None:
+            self.trace.append(
+                {
+                    "request": request.hex(),
+                    "outcome": outcome,
+                    "replica": replica,
+                    "took_s": round(took_s, 6),
+                    "asked": {
+                        f"{key >> 32}.{key & 0xFFFFFFFF}": round(after_s, 6)
+                        for key, after_s in asked.items()
+                    },
+                }
+            )
 
     def won_by(self, replica: ReplicaId) -> int:
         """Return how many requests a replica has answered first."""
@@ -63,6 +99,7 @@ class Outcomes:
         return {
             **self.count,
             "refused": dict(self.refused),
+            "won": {replica.short: count for replica, count in self._won.items()},
             "p50_s": ordered[len(ordered) // 2] if ordered else None,
             "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,
         }

@@ -46,6 +46,7 @@ STATE_TABLE = "`state`"
 
 
 MORE_TABLES = {
+    "`fallback`": spec_keys.FALLBACK_KEYS,
     "`traffic`": spec_keys.TRAFFIC_KEYS,
     "`availability`": spec_keys.AVAILABILITY_KEYS,
     "`correlation`": spec_keys.CORRELATION_KEYS,
@@ -88,6 +89,7 @@ def test_defaults_are_the_codes():
         "`on_timeout`": f"`{ServiceSpec.on_timeout.value}`",
         "`hedging`": f"`{ServiceSpec.hedging.value}`",
         "`hedging_budget`": f"{ServiceSpec.hedging_budget:g}",
+        "`trace`": f"`{str(ServiceSpec.trace).lower()}`",
         "`suspect_after_s`": f"{HealthSpec.suspect_after_s:g}",
         "`replace_after_s`": f"{HealthSpec.replace_after_s:g}",
         "`start_limit_s`": f"{HealthSpec.start_limit_s:g}",

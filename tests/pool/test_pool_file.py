@@ -358,7 +358,8 @@ MISTAKES = {
     ),
     "unknown choice": (
         pool(services="[{name: a, type: a/srv/A, on_timeout: emty}]"),
-        "pool.yaml:3: fogft.services[0].on_timeout: must be `silent` or `empty`, not `emty`",
+        "pool.yaml:3: fogft.services[0].on_timeout: must be `silent` or `empty` or "
+        "`fallback`, not `emty`",
         "did you mean `empty`?",
     ),
     "unknown hedging": (
@@ -372,6 +373,29 @@ MISTAKES = {
         "pool.yaml:3: fogft.services[0].hedging_budget: has no meaning here: only "
         "`hedging: adaptive` sends extra copies by a budget",
         "write `hedging: adaptive`, or remove it",
+    ),
+    "fallback without a service": (
+        pool(services="[{name: a, type: a/srv/A, on_timeout: fallback}]"),
+        "pool.yaml:3: fogft.services[0].fallback: is missing",
+        "name a service of the same type on the robot, such as `fallback: {service: /a_onboard}`",
+    ),
+    "fallback that is not used": (
+        pool(services="[{name: a, type: a/srv/A, fallback: {service: b}}]"),
+        "pool.yaml:3: fogft.services[0].fallback: is not used: `on_timeout` is not `fallback`",
+        "write `on_timeout: fallback`, or remove it",
+    ),
+    "fallback that is the service": (
+        pool(services="[{name: a, type: a/srv/A, on_timeout: fallback, fallback: {service: a}}]"),
+        "pool.yaml:3: fogft.services[0].fallback.service: is the service itself",
+        "write the name of a service on the robot, such as `service: /a_service`",
+    ),
+    "fallback after the deadline": (
+        pool(
+            services="[{name: a, type: a/srv/A, timeout_s: 2, on_timeout: fallback, "
+            "fallback: {service: b, after_s: 2}}]"
+        ),
+        "pool.yaml:3: fogft.services[0].fallback.after_s: must be below `timeout_s`, which is 2",
+        "make it shorter, or remove it: at the deadline the fallback is asked anyway",
     ),
     "cancel service and concurrency": (
         pool(services="[{name: a, type: a/srv/A, cancel: stop, concurrency: 4}]"),
