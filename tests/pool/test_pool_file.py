@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from fogft.core.errors import SpecError
 from fogft.core.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
+from fogft.core.spec_keys import FOGFT_KEYS, LATER_KEYS
 from fogft.core.spec_tree import plain
 from fogft.pool import pool_file, yaml_tree
 
@@ -84,8 +85,7 @@ MISTAKES = {
     "unknown key in fogft, like nothing": (
         pool("zzz: 3"),
         "pool.yaml:4: fogft.zzz: unknown key",
-        "known here: `health`, `max_hours`, `max_surge`, `max_usd_per_hour`, `orphan_after_s`, "
-        "`replicas`, `services`",
+        "known here: " + ", ".join(f"`{key}`" for key in sorted(FOGFT_KEYS)),
     ),
     "unknown key in a service": (
         pool(services="\n    - name: /a\n      typ: a/srv/A"),
@@ -123,9 +123,9 @@ MISTAKES = {
         "`run` belongs at the top level of the file",
     ),
     "key that comes later": (
-        pool("availability: 0.9995"),
-        "pool.yaml:4: fogft.availability: is not supported yet",
-        "remove it and say how many: `replicas: 2`",
+        pool("topology: tree"),
+        "pool.yaml:4: fogft.topology: is not supported yet",
+        LATER_KEYS["topology"],
     ),
     "key that comes later, in a service": (
         pool(services="[{name: a, quorum: 2}]"),
