@@ -44,6 +44,11 @@ def probe_key(pool_uid: str, slot: int) -> str:
     return f"{slot_prefix(pool_uid, slot)}/probe"
 
 
+def records_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot takes signed records, revocations above all."""
+    return f"{slot_prefix(pool_uid, slot)}/records"
+
+
 def cancel_key(pool_uid: str, slot: int) -> str:
     """Return the Zenoh key at which a slot hears which requests are no longer wanted."""
     return f"{slot_prefix(pool_uid, slot)}/cancel"

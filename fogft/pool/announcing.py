@@ -1,7 +1,8 @@
 """What the manager tells the rendezvous: whom it admits, and whose certificates it took back.
 
 The same membership goes to the client proxy of this machine as a file, and to everybody else
-as signed records. Without a rendezvous in the pool file nothing is done here.
+as signed records. Without a rendezvous in the pool file only what was taken back is signed, for
+the client proxy to pass on.
 
 Owns: the manager's certificate for signing, and its record client.
 Not here: what the membership is (`reconciler`).
@@ -17,12 +18,14 @@ from fogft.core import names
 from fogft.core.errors import CredentialError
 from fogft.core.holders import holder_of
 from fogft.core.model import Membership
-from fogft.core.records import RecordKind
+from fogft.core.records import Record, RecordKind, sign_record
 from fogft.core.roster import admission_content
 from fogft.pool import credentials
 from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
+from fogft.wire import record_cache
 from fogft.wire.rendezvous_client import RendezvousClient
+from fogft.wire.signing import Signer
 
 CERTIFICATE_DAYS = 365.0
 RENEW_BEFORE = datetime.timedelta(days=60)
@@ -54,6 +57,7 @@ class ManagerRecords:
         self._client: RendezvousClient | None = None
         self._certified_at: datetime.datetime | None = None
         self._said: Membership | None = None
+        self._revoked: frozenset[str] = frozenset()
 
     def look(self, endpoints: tuple[str, ...], membership: Membership | None) -> None:
         """Publish what is new, to these rendezvous.
@@ -62,6 +66,8 @@ class ManagerRecords:
             CredentialError: The pool's CA cannot be used.
             StateError: The manager's certificate cannot be written.
         """
+        if membership is not None and membership.revoked != self._revoked:
+            self._write_revocations(membership.revoked)
         if endpoints != self._endpoints:
             self.close()
             self._endpoints, self._said = endpoints, None
@@ -69,19 +75,38 @@ class ManagerRecords:
             return
         self._certify(datetime.datetime.now(datetime.timezone.utc))
         if self._client is None:
-            folder = self._paths.credentials
-            files = _Files(
-                folder / credentials.AUTHORITY_CERTIFICATE,
-                folder / f"{_STEM}.crt",
-                folder / f"{_STEM}.key",
-            )
             self._client = RendezvousClient(
-                endpoints, files, self._pool_uid, cache=self._paths.manager_records
+                endpoints, self._files(), self._pool_uid, cache=self._paths.manager_records
             )
             self._client.start()
         if membership is not None and membership != self._said:
             self._say(self._client, membership)
             self._said = membership
+
+    def _write_revocations(self, revoked: frozenset[str]) -> None:
+        """Sign what was taken back, for the client proxy to pass on: there may be no rendezvous."""
+        self._certify(datetime.datetime.now(datetime.timezone.utc))
+        files = self._files()
+        # Revocations only grow, so their number counts the writings of one epoch.
+        record = Record(
+            self._pool_uid,
+            RecordKind.REVOCATION,
+            "",
+            self._epoch,
+            len(revoked),
+            {"names": sorted(revoked)},
+        )
+        signed = sign_record(record, Signer(files.certificate, files.key))
+        record_cache.write(self._paths.revocations, [signed])
+        self._revoked = revoked
+
+    def _files(self) -> _Files:
+        folder = self._paths.credentials
+        return _Files(
+            folder / credentials.AUTHORITY_CERTIFICATE,
+            folder / f"{_STEM}.crt",
+            folder / f"{_STEM}.key",
+        )
 
     def _say(self, client: RendezvousClient, membership: Membership) -> None:
         client.publish(

@@ -89,6 +89,7 @@ def proxy_config(
             "suspect_after_s": spec.health.suspect_after_s,
             "rendezvous": list(spec.rendezvous),
             "records": paths.records.name,
+            "revocations": paths.revocations.name,
             "dial_in": "" if robot else spec.dial_in,  # that is where this machine is
         },
     )

@@ -93,6 +93,11 @@ class PoolPaths:
         return self.folder / "manager-records.json"
 
     @property
+    def revocations(self) -> Path:
+        """The manager's signed revocations, which the client proxy passes on to replicas."""
+        return self.folder / "revocations.json"
+
+    @property
     def history(self) -> Path:
         """One JSON object a line: launches, ends, refusals; the generations used."""
         return self.folder / "history.jsonl"

@@ -12,13 +12,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 from fogft.core import names
 from fogft.core.errors import RosError
 from fogft.core.hedging import NEVER
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
+from fogft.core.records import SignedRecord
 from fogft.core.spec import ServiceSpec
 from fogft.proxy.dispatcher import Dispatcher
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
@@ -175,6 +176,10 @@ class ClientProxy:
                     self._redial(id)
         self._change()
         return True
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Pass signed records on to every replica: revocations, where no rendezvous does."""
+        self._dialer.tell(records)
 
     def renew(self) -> None:
         """Take new credentials into use, link by link; no request is lost by it."""

@@ -172,6 +172,7 @@ def _loop(
     watched_config.changed()
     watched_certificate = Watched(config.credentials.certificate)  # written after its key
     watched_certificate.changed()
+    revocations = Watched(config.revocations) if config.revocations else None
     started = reported = time.monotonic()
     while not stop.is_set():
         changed = proxy.run_once()
@@ -183,6 +184,8 @@ def _loop(
         if watched_certificate.changed():
             proxy.renew()
             following.renew()
+        if revocations is not None and revocations.changed():
+            _apply(functools.partial(_tell, revocations.path, proxy), revocations.path)
         now = time.monotonic()
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
             reported = now
@@ -223,6 +226,12 @@ def _follow(following: Following, proxy: ClientProxy) -> None:
     membership = following.look()
     if membership is not None:
         proxy.follow(membership)
+
+
+def _tell(path: Path, proxy: ClientProxy) -> None:
+    from fogft.wire import record_cache
+
+    proxy.tell(record_cache.read(path))
 
 
 def _report(config: ClientProxyConfig, report: Mapping[str, Any], uptime_s: float) -> None:

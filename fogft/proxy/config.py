@@ -36,6 +36,7 @@ class ClientProxyConfig:
     Attributes:
         rendezvous: ``host:port`` of each.
         records: File that keeps what was learned there.
+        revocations: The manager's signed revocations, to be passed on to replicas.
         dial_in: ``host:port`` that replicas which cannot be reached are told; empty for none.
         dial_in_listen: Where to listen for them; empty for that port on all addresses.
     """
@@ -54,6 +55,7 @@ class ClientProxyConfig:
     domain_id: int | None = None
     rendezvous: tuple[str, ...] = ()
     records: Path | None = None
+    revocations: Path | None = None
     dial_in: str = ""
     dial_in_listen: str = ""
 
@@ -112,6 +114,7 @@ def read_client(path: Path) -> ClientProxyConfig:
             tell_losers=bool(raw.get("tell_losers", True)),
             rendezvous=_endpoints(raw.get("rendezvous")),
             records=base / raw["records"] if raw.get("records") else None,
+            revocations=base / raw["revocations"] if raw.get("revocations") else None,
             dial_in=_endpoint(raw.get("dial_in") or ""),
             dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
         )

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from fogft.core import names
 from fogft.core.errors import WireError
 from fogft.core.model import ReplicaId
+from fogft.core.records import SignedRecord
 from fogft.wire.memory_link import MemoryIncoming, MemoryLink, Session
 from fogft.wire.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnswer, Refusal
 
@@ -140,6 +141,9 @@ class MemoryDialer:
 
     def renew(self) -> None:
         """Do nothing: this wire has no certificates."""
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Do nothing: this wire has no certificates to take back."""
 
     def certificate(self) -> str:
         """Return nothing: this wire has no certificates."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fogft.core.model import LinkState, ReplicaId
+from fogft.core.records import SignedRecord
 
 
 @dataclass(frozen=True)
@@ -190,6 +191,9 @@ class Dialer(Protocol):
 
     def renew(self) -> None:
         """Take the credentials that now stand in their files into use. No request is lost."""
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Tell every replica these records, now and whenever a link comes up."""
 
     def certificate(self) -> str:
         """Return the common name of the certificate that every link uses.

@@ -183,6 +183,23 @@ def read_records(message: dict[str, Any]) -> list[SignedRecord]:
     return [from_plain(row) for row in rows]
 
 
+def pack(all: Sequence[SignedRecord]) -> bytes:
+    """Return records as one message of its own, for a link."""
+    return json.dumps({"v": VERSION, "records": [to_plain(one) for one in all]}).encode()
+
+
+def unpack(data: bytes) -> list[SignedRecord]:
+    """Return the records of `pack`, not yet judged.
+
+    Raises:
+        RecordError: They are none.
+    """
+    message = read_json(data, FRAME_LIMIT)
+    if message.get("v") is True or message.get("v") != VERSION:
+        raise RecordError("version", f"version {message.get('v')!r:.20} is not spoken here")
+    return read_records(message)
+
+
 def _expect(message: dict[str, Any], kind: str) -> None:
     if message.get("type") != kind:
         raise RecordError("malformed", f"no {kind}")

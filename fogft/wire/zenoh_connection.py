@@ -58,6 +58,9 @@ _REFUSED = {
 }
 
 
+_TELL_RECORDS_TIMEOUT_S = 5.0
+
+
 class OpenAttempt:
     """A request on its way through one connection."""
 
@@ -145,6 +148,7 @@ class Connection:
         self._telling = False
         self.window: LinkWindow[OpenAttempt] = LinkWindow()
         self.lost_because = ""
+        self.told = b""  # the records that the replica has taken from us
         self._session = zenoh.open(config)
         try:
             self._listener = self._session.info.declare_link_events_listener(
@@ -356,6 +360,27 @@ class Connection:
             return  # Zenoh's own: it timed out, and the keeper counts the silence
         words = _REFUSED.get(reason, f"the replica refuses our probes: {reason}")
         self._lose(words)
+
+    def tell_records(self, key: str, records: bytes) -> None:
+        """Send signed records; `told` is them once the replica has taken them.
+
+        Raises:
+            zenoh.ZError: They could not be sent.
+        """
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self.told = records
+
+        self._session.get(
+            key,
+            handlers.Callback(on_reply, indirect=False),
+            payload=records,
+            attachment=frame.encode_greeting(frame.Greeting(self._token)),
+            timeout=_TELL_RECORDS_TIMEOUT_S,
+            target=_ALL,
+            consolidation=_AT_ONCE,
+        )
 
     def sweep(self) -> None:
         """End the attempts whose time is up and of which Zenoh told nothing."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 
@@ -22,7 +22,8 @@ import zenoh
 from fogft.core import names
 from fogft.core.errors import CredentialError, WireError
 from fogft.core.model import LinkState
-from fogft.wire import config, diagnosis, frame
+from fogft.core.records import SignedRecord
+from fogft.wire import config, diagnosis, frame, record_frames
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
@@ -284,6 +285,8 @@ class ZenohLink:
             if now >= next_probe:
                 connection.sweep()
                 self._probe(connection, now)
+                if up:
+                    self._tell_records(connection)
                 next_probe = now + self._next_probe_in_s(up=up)
             left_s = self._suspect_after_s - self._asked.for_s(now)
             if left_s <= 0:
@@ -302,6 +305,17 @@ class ZenohLink:
         if self._services.keys() <= self._ready:
             return self._probe_every_s
         return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
+
+    def _tell_records(self, connection: Connection) -> None:
+        """Send what the replica has not taken yet; with each probe until it has."""
+        records = self._dialer.records
+        if records == connection.told:
+            return
+        id = self._peer.id
+        try:
+            connection.tell_records(names.records_key(id.pool_uid, id.slot), records)
+        except zenoh.ZError as error:
+            connection.lost_because = f"sending failed: {error}"
 
     def _renewal_due(self, now: float) -> bool:
         if self._renew_at is not None and now >= self._renew_at:
@@ -457,6 +471,7 @@ class ZenohDialer:
         self.settings = settings or LinkSettings()
         self.turns = Turns()
         self._signer: Signer | None = None
+        self.records = b""
         self._pool_uid = pool_uid
         self._lock = threading.Lock()
         self._links: list[ZenohLink] = []
@@ -493,6 +508,10 @@ class ZenohDialer:
             links = list(self._links)
         for link in links:
             link.renew()
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Tell every replica these records, with the next probe of each link."""
+        self.records = record_frames.pack(records) if records else b""
 
     def certificate(self) -> str:
         """Return the common name of the certificate that every open link uses, or nothing."""

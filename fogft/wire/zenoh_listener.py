@@ -23,7 +23,9 @@ from zenoh import handlers
 from fogft.core import names
 from fogft.core.errors import WireError
 from fogft.core.model import ReplicaId
-from fogft.wire import config, frame
+from fogft.core.record_set import RecordSet, Verdict
+from fogft.core.records import RecordError, SignedRecord
+from fogft.wire import config, frame, record_frames
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.doorkeeper import Address, Doorkeeper, address
 from fogft.wire.guests import Guests, NotAdmittedError
@@ -149,6 +151,7 @@ class ZenohListener:
         self._guests = Guests(
             id.pool_uid, names.replica_certificate_name(id), LazyVerifier(credentials.ca)
         )
+        self._records = RecordSet(id.pool_uid, LazyVerifier(credentials.ca))
         self._counters = Counters()
         self._queues = ReplyQueues(self._counters)
         self._chores: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
@@ -191,6 +194,8 @@ class ZenohListener:
             self._declare(session, key, partial(self._request, name, on_request))
         cancel_key = names.cancel_key(self._id.pool_uid, self._id.slot)
         self._declare(session, cancel_key, partial(self._cancel, on_cancel))
+        records_key = names.records_key(self._id.pool_uid, self._id.slot)
+        self._declare(session, records_key, self._heard_records)
         # Last: who is told that this replica is ready finds every service.
         probe_key = names.probe_key(self._id.pool_uid, self._id.slot)
         self._declare(session, probe_key, partial(self._probe, on_probe))
@@ -268,13 +273,44 @@ class ZenohListener:
         self._chores.put(partial(_end_query, query))  # nobody awaits an answer
         self._chores.put(partial(on_cancel, ids))
 
-    def _malformed(self, error: frame.FrameError, query: zenoh.Query) -> None:
+    def _heard_records(self, query: zenoh.Query) -> None:
+        self._counters.add("records")
+        attachment = query.attachment
+        try:
+            greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
+            offered = record_frames.unpack(query.payload.to_bytes() if query.payload else b"")
+        except (frame.FrameError, RecordError) as error:
+            self._malformed(error, query)
+            return
+        self._chores.put(partial(self._take_records, greeting, offered, query))
+
+    def _malformed(self, error: ValueError, query: zenoh.Query) -> None:
         count = self._counters.add("malformed")
         if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
             log.warning("request_malformed reason=%r count=%d", str(error), count)
         self._chores.put(Reply(query, _NO_REQUEST, b"", Refusal.MALFORMED).send)
 
     # -- the probe thread -----------------------------------------------------------------
+
+    def _take_records(
+        self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query
+    ) -> None:
+        """Judge records by their own signatures: whoever brings them has no say in them."""
+        try:
+            self._guests.greet(greeting)
+        except NotAdmittedError as error:
+            self._turn_away(query, _NO_REQUEST, error.refusal, str(error))
+            return
+        try:
+            for one in offered:
+                verdict = self._records.offer(one)
+                if verdict is Verdict.REFUSED:
+                    self._counters.add("records_refused")
+                    log.warning("record_refused reason=%r", self._records.last_refusal)
+            query.reply(query.key_expr, b"")
+        finally:
+            query.drop()  # type: ignore[no-untyped-call]
+        self.revoke(self._records.revoked)
 
     def _answer_probe(
         self,
@@ -310,7 +346,7 @@ class ZenohListener:
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
-        ``malformed``, ``not_admitted``, ``handshakes_refused``,
+        ``malformed``, ``records``, ``records_refused``, ``not_admitted``, ``handshakes_refused``,
         ``unauthenticated``, ``revoked_links``, ``reply_dropped``, ``failed``, ``cancellations``.
         """
         return self._counters.snapshot()

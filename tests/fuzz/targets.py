@@ -201,6 +201,9 @@ def targets() -> dict[str, Target]:
             lambda data: _verifier()(data, b"", b""), recorded, (_records()[0].certificate,)
         ),
         "record stream": Target(_stream, recorded, (stream,)),
+        "records of a link": Target(
+            record_frames.unpack, recorded, (record_frames.pack(_records()),)
+        ),
         "bundle": Target(bundle.read_label, (CredentialError,), (_bundle(),)),
         "bundle's files": Target(
             lambda data: joining.checked_files(_object(data)),

@@ -87,6 +87,9 @@ class FakeDialer:
     def certificate(self) -> str:
         return self.name
 
+    def tell(self, records) -> None:
+        self.told = list(records)
+
     def close(self) -> None:
         for link in self.links:
             link.close()

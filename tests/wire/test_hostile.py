@@ -211,6 +211,9 @@ def _frames() -> Iterator[tuple[str, bytes, bytes | None]]:
         yield probe, payload, greeting
     for payload in (b"", b"\x07", bytes(100_000)):
         yield cancel, payload, None
+    token = frame.encode_greeting(frame.Greeting(bytes(8)))
+    for payload in (b"", b"{}", b'{"v":9,"records":[]}', b'{"v":1,"records":[7]}', bytes(300_000)):
+        yield names.records_key(POOL_UID, 0), payload, token
 
 
 def test_frames_that_cannot_be_read_are_counted_one_by_one(

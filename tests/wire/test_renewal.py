@@ -10,7 +10,10 @@ import pytest
 
 from fogft.core import names
 from fogft.core.model import LinkState
-from fogft.wire.zenoh_link import ZenohLink
+from fogft.core.records import Record, RecordKind, SignedRecord, sign_record
+from fogft.pool.credentials import Role
+from fogft.wire.signing import Signer
+from fogft.wire.zenoh_link import ZenohDialer, ZenohLink
 from tests.wire.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -18,6 +21,8 @@ from tests.wire.wire_pool import (
     Files,
     Owner,
     ReplicaProcess,
+    keys,
+    peer,
     request_id,
     wait_for,
 )
@@ -139,3 +144,39 @@ def test_a_revoked_robot_is_shut_out_and_told_why_while_another_goes_on(
     assert ada.offer(SERVICE, request_id(2), b"y", 20.0)
     wait_for(lambda: owner.of(2))
     assert owner.of(2)[0].payload == b"y"
+
+
+def _revocation(files: Files, name: str) -> SignedRecord:
+    content = {"names": [name]}
+    record = Record(POOL_UID, RecordKind.REVOCATION, "", 1, 1, content)
+    return sign_record(record, Signer(files.certificate, files.key))
+
+
+def test_a_robot_passes_the_managers_revocation_on_and_no_other(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+) -> None:
+    """A record that a robot or a replica signed revokes nobody, whoever brings it."""
+    replica = start_replica()
+    eve = dial(replica.endpoint, robot="eve")
+    dialer = ZenohDialer(authority.robot("ada"), robot="ada", pool_uid=POOL_UID)
+    try:
+        ada = dialer.dial(peer(replica.endpoint), keys(0), owner)
+        wait_for(lambda: ada.usable and eve.usable)
+        bad = names.robot_certificate_name(POOL_UID, "eve")
+        for number, signer in enumerate((authority.robot("mallory"), authority.replica(1)), 1):
+            dialer.tell([_revocation(signer, bad)])
+            wait_for(lambda number=number: replica.count("records_refused") == number)  # type: ignore[misc]
+        assert replica.count("not_admitted") == 0
+        manager = authority.issue(names.manager_certificate_name(POOL_UID), Role.MANAGER)
+        dialer.tell([_revocation(manager, bad)])
+        wait_for(lambda: eve.status().detail == "our certificate is revoked")
+        assert ada.usable
+        assert ada.status().reopened == 0
+        told = replica.count("records")
+        wait_for(lambda: replica.count("probes") > 20)
+        assert replica.count("records") == told, "what was taken is not told again"
+    finally:
+        dialer.close()

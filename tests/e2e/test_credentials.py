@@ -1,0 +1,122 @@
+"""A second robot from one file, new keys while requests flow, and the door closed on a robot."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.pool import Client, Pool
+
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
+
+
+class Joined:
+    """A robot of its own home and ROS domain, set up by `fogft join`."""
+
+    def __init__(self, pool: Pool, name: str, domain: int) -> None:
+        self.environ = {
+            **pool.environ,
+            "FOGFT_HOME": str(pool.folder / name),
+            "ROS_DOMAIN_ID": str(domain),
+        }
+        secret = pool.folder / "secret"
+        secret.write_text("a passphrase that nobody knows\n")
+        given = ("--passphrase-file", str(secret))
+        bundle = pool.fogft("credentials", "issue", "robot", name, *given).strip()
+        joined = subprocess.run(
+            [sys.executable, "-m", "fogft", "join", bundle, *given],
+            env=self.environ, cwd=pool.folder, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        self.config = Path(joined.stdout.strip())
+        self.log = self.config.with_suffix(".log")
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "fogft", "proxy", "--config", str(self.config)],
+                env=self.environ, cwd=pool.folder, stdout=log, stderr=log,
+            )  # fmt: skip
+
+    def links(self) -> list[dict]:
+        with contextlib.suppress(OSError, ValueError):
+            return json.loads((self.config.parent / "proxy-status.json").read_text())["links"]
+        return []
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def ada(pool, ros_domains):
+    pool.write(replicas=2)
+    pool.up()
+    joined = Joined(pool, "ada", ros_domains())
+    yield joined
+    joined.close()
+
+
+def flawless(result: dict) -> bool:
+    return result["failed"] == result["wrong"] == result["twice"] == 0
+
+
+def generations(pool: Pool) -> list[str]:
+    """Return the ready replicas' generations."""
+    return sorted(str(r["generation"]) for r in pool.status()["replicas"] if r["phase"] == "ready")
+
+
+def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
+    """Both robots use both replicas; then keys change twice over, and ada is shut out."""
+    pool.wait(lambda: [link["state"] for link in ada.links()] == ["up", "up"])
+    first = pool.client(120, 20)
+    second = Client(ada.environ, 6, 20, 12.0)
+    result = second.result()
+    assert result["requests"] > 80
+    assert flawless(result), result
+    os.kill(ada.process.pid, signal.SIGSTOP)  # a frozen robot holds nobody up
+    assert "is taken back" in pool_said(pool, "credentials", "rotate", "robot")
+    os.kill(ada.process.pid, signal.SIGCONT)
+    pool.wait(lambda: [link["state"] for link in ada.links()] == ["up", "up"])
+    pool.fogft("credentials", "revoke", "robot", "ada")
+    pool.wait(lambda: {link["detail"] for link in ada.links()} == {"our certificate is revoked"})
+    pool.fogft("credentials", "rotate", "replica")
+    pool.wait(lambda: generations(pool) == ["2", "2"])
+    result = first.finish()
+    assert result["requests"] > 300
+    assert flawless(result), result
+    states = [line.split()[:3] for line in pool.fogft("credentials", "list").splitlines()[1:]]
+    assert ["robot", "ada.1", "revoked"] in states
+    assert sorted(state for role, name, state in states if name.endswith("2")) == ["good"] * 3
+    assert secrets_told(pool, ada) == []
+
+
+def pool_said(pool: Pool, *words: str) -> str:
+    """Run a command; return all that it prints."""
+    return pool.fogft(*words, ok=False)
+
+
+def secrets_told(pool: Pool, ada: Joined) -> list[str]:
+    """Return where a key or the passphrase stands that is no key's own file (0600)."""
+    files = [path for path in pool.folder.rglob("*") if path.is_file() and path.name != "secret"]
+    keys = [path for path in files if path.suffix == ".key"]
+    secrets = {path.read_bytes().splitlines()[2] for path in keys} | {b"a passphrase that nobody"}
+    open_to_others = [str(path) for path in keys if path.stat().st_mode & 0o077]
+    told = [
+        str(path)
+        for path in files
+        if path not in keys
+        and path.name != "secret"
+        and any(s in path.read_bytes() for s in secrets)
+    ]
+    lines = [
+        Path(f"/proc/{pid}/cmdline").read_bytes() for pid in [*pool.processes(), ada.process.pid]
+    ]
+    status = pool.fogft("status", "--json").encode()
+    return (
+        open_to_others + told + [repr(t) for t in (*lines, status) if any(s in t for s in secrets)]
+    )
