@@ -121,6 +121,9 @@ def up(
     if not is_answering(seen, wanted, applied_at):
         raise not_answering(seen, f"does not answer after {limit_s:.0f} s")
     status = seen.status
+    if not status.target:
+        output.done(f"`{name}` is set up; its schedule wants no replica now")
+        return
     missing = max(0, status.target - status.ready)
     rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
     if order.preview.replaces_replicas and not missing:
@@ -156,8 +159,13 @@ def managed(pool: str) -> Seen:
 
 
 def is_answering(seen: Seen, services: set[str], since: float) -> bool:
-    """Whether every service has a ready replica and a client proxy, as seen after `since`."""
+    """Whether every service has a ready replica and a client proxy, as seen after `since`.
+
+    A pool whose schedule wants no replica now is as it should be.
+    """
     status = seen.status
+    if status.observed_at >= since and status.cloud_reachable and not status.target:
+        return True
     ready = {service.name for service in status.services if service.ready_replicas}
     return (
         status.observed_at >= since

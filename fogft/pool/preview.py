@@ -47,6 +47,7 @@ class Preview:
     """What applying a pool file would do.
 
     Attributes:
+        wanted: Replicas wanted now: the file's number, or what follows from it.
         launches: Of a new pool; by slot. Of one that exists: what it would get if it were new.
         costs_money: Its machines are paid for: nothing is ordered unasked.
         accounts: Of each cloud whose credentials were tested: empty, or what is wrong.
@@ -57,6 +58,7 @@ class Preview:
     spec: PoolSpec
     cloud: str
     is_new: bool
+    wanted: int = 0
     launches: tuple[PreviewedLaunch, ...] = ()
     changes: tuple[str, ...] = ()
     replaces_replicas: bool = False
@@ -138,6 +140,7 @@ def order(
         spec,
         cloud_name,
         is_new=before is None,
+        wanted=planned.wanted,
         launches=tuple(_launch(launch.slot, launch.offer, now) for launch in planned.launches),
         changes=() if before is None else tuple(changes(before, spec)),
         replaces_replicas=before is not None and replaces_replicas(before, spec),

@@ -329,3 +329,12 @@ def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
     with disk.locked(paths.manager_lock):
         with pytest.raises(FogftError, match="did not look again"):
             app.refresh("planner", limit_s=0.2)
+
+
+def test_a_schedule_that_wants_nobody_now_is_no_failure():
+    """`up` of a pool that sleeps at night does not wait for the morning."""
+    status = replace(UP, target=0, ready=0, replicas=(), observed_at=20.0)
+    assert is_answering(Seen(status, 0.1, True), {"/plan"}, since=10.0)
+    assert not is_answering(
+        Seen(replace(status, observed_at=5.0), 0.1, True), {"/plan"}, since=10.0
+    )
