@@ -30,9 +30,8 @@ def announce(preview: Preview) -> None:
     for name, problem in preview.accounts.items():
         output.say(f"`{name}` " + (f"cannot be used: {problem}" if problem else "can be used"))
     if preview.is_new:
-        output.say(
-            f"pool `{spec.name}`: {_count(preview.wanted or spec.replicas, 'replica')} on `{preview.cloud}`"
-        )
+        count = _count(preview.wanted or spec.replicas, "replica")
+        output.say(f"pool `{spec.name}`: {count} on `{preview.cloud}`")
         _say_launches(preview)
     elif preview.changes:
         output.say(f"pool `{spec.name}` changes:")
