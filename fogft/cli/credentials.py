@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from fogft.pool.ledger import Entry
 
 DAY_H = 24.0
-RoleName = Annotated[str, typer.Argument(metavar="ROLE", help="`robot`, `replica` or `gateway`.")]
+RoleName = Annotated[
+    str, typer.Argument(metavar="ROLE", help="`robot`, `replica`, `gateway` or `rendezvous`.")
+]
 PassphraseFile = Annotated[
     Path | None,
     typer.Option(
@@ -218,7 +220,7 @@ def join(
 
 
 def _role(text: str) -> Role:
-    allowed = (Role.ROBOT, Role.REPLICA, Role.GATEWAY)
+    allowed = (Role.ROBOT, Role.REPLICA, Role.GATEWAY, Role.RENDEZVOUS)
     for role in allowed:
         if role.value == text:
             return role

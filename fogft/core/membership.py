@@ -66,6 +66,17 @@ def members_of(
     )
 
 
+def with_by_hand(members: tuple[Member, ...], by_hand: Iterable[ReplicaId]) -> tuple[Member, ...]:
+    """Return members with those that people start themselves, whom no cloud lists.
+
+    Where they are is theirs to say: by a record, or by dialling in. Of several generations
+    of a slot the highest is meant; a slot that a machine has is the machine's.
+    """
+    taken = {member.id.slot for member in members}
+    latest = {id.slot: id for id in sorted(by_hand) if id.slot not in taken}
+    return (*members, *(Member(latest[slot], "") for slot in sorted(latest)))
+
+
 def is_newer(candidate: Membership, current: Membership | None) -> bool:
     """Whether a membership replaces another of the same pool."""
     if current is None:

@@ -1,4 +1,4 @@
-"""What is in a join bundle, and how it becomes a robot, gateway or replica on this machine.
+"""What is in a join bundle, and how it becomes a part of the pool on this machine.
 
 The bundle brings all that a proxy needs: configuration, certificate and key, the CA, and
 the membership as it was. It is used once: the file is destroyed when it has been opened,
@@ -23,17 +23,16 @@ from fogft.core import membership as memberships
 from fogft.core.errors import CredentialError, FogftError
 from fogft.core.holders import Holder, Role
 from fogft.core.model import ReplicaId
-from fogft.pool import bundle, configuration
+from fogft.pool import bundle, configuration, templates
 from fogft.pool.bundle import Label
 from fogft.pool.credentials import Credential
-from fogft.pool.ledger import Ledger
+from fogft.pool.ledger import FIRST_SLOT_BY_HAND, Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import PoolStore
 
-# The manager counts slots from 0; replicas that people start by hand stay out of its way.
-FIRST_SLOT_BY_HAND = 100
 FILE_LIMIT = 512 << 10
 _USED_LIMIT = 10_000
+_COMMANDS = {Role.REPLICA: "serve", Role.RENDEZVOUS: "rendezvous"}  # all others: `proxy`
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Joined:
 
     Attributes:
         config: The configuration to start with: ``fogft <command> --config <config>``.
-        command: ``proxy`` or ``serve``.
+        command: ``proxy``, ``serve`` or ``rendezvous``.
     """
 
     pool: str
@@ -79,7 +78,7 @@ def issue(
 def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str, str]:
     identity, spec = store.identity(), store.spec()
     stem = holder.role.value
-    folder = "" if holder.role is Role.REPLICA else "credentials/"
+    folder = "" if holder.role in _COMMANDS else "credentials/"
     files = {
         f"{folder}ca.crt": credential.authority_pem.decode(),
         f"{folder}{stem}.key": credential.key_pem.decode(),
@@ -87,6 +86,8 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
     if holder.role is Role.REPLICA:
         id = ReplicaId(identity.uid, int(holder.name), holder.generation)
         files["replica.yaml"] = configuration.replica_config(identity, spec, id)
+    elif holder.role is Role.RENDEZVOUS:
+        files["rendezvous.yaml"] = templates.render("rendezvous.yaml", {"pool_uid": identity.uid})
     else:
         files["proxy.yaml"] = configuration.proxy_config(
             PoolPaths(Path()), identity, spec, robot=holder.name, stem=stem
@@ -131,9 +132,8 @@ def join(file: Path, passphrase: str, root: Path, now: float) -> Joined:
             disk.write_whole(place, text)
         disk.write_json(used, [*ids, label.id][-_USED_LIMIT:])
     _destroy(file, len(data))
-    is_replica = holder.role is Role.REPLICA
-    config = folder / ("replica.yaml" if is_replica else "proxy.yaml")
-    return Joined(label.pool, holder, config, "serve" if is_replica else "proxy")
+    config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
+    return Joined(label.pool, holder, config, _COMMANDS.get(holder.role, "proxy"))
 
 
 def read(file: Path) -> bytes:

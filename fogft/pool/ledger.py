@@ -19,10 +19,13 @@ from typing import Any
 from fogft import disk
 from fogft.core.errors import CredentialError, StateError
 from fogft.core.holders import Holder, Role, holder_of
+from fogft.core.model import ReplicaId
 from fogft.pool import credentials
 from fogft.pool.credentials import Credential
 
 _DAY_S = 86_400.0
+# The manager counts slots from 0; replicas that people start by hand stay out of its way.
+FIRST_SLOT_BY_HAND = 100
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,15 @@ class Ledger:
     def revoked(self) -> frozenset[str]:
         """Return the common names that were taken back."""
         return frozenset(e.common_name for e in self.entries() if e.revoked_at is not None)
+
+    def by_hand(self) -> frozenset[ReplicaId]:
+        """Return the replicas that people start themselves, and whose certificates are good."""
+        good = [e.holder for e in self.entries() if e.state(self._clock()) == "good"]
+        return frozenset(
+            ReplicaId(h.pool_uid, int(h.name), h.generation)
+            for h in good
+            if h.role is Role.REPLICA and int(h.name) >= FIRST_SLOT_BY_HAND
+        )
 
     def issue(self, holder: Holder, *, days: float) -> Credential:
         """Certify a holder, and remember it.

@@ -89,6 +89,7 @@ class Manager:
             submit=on_thread,
             epoch=self._lease.epoch,
             revoked=self._ledger.revoked,
+            by_hand=self._ledger.by_hand,
             on_done=self._wake.set,
             distances=Distances(Latencies(latency_file()), on_thread),
         )

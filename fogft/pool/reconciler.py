@@ -22,7 +22,7 @@ from fogft.core.groups import replica_hash, sales, task_at
 from fogft.core.health import judge
 from fogft.core.history import EventKind, History
 from fogft.core.intent import Intent
-from fogft.core.membership import Found, members_of, successor
+from fogft.core.membership import Found, members_of, successor, with_by_hand
 from fogft.core.model import (
     LinkReport,
     Machine,
@@ -92,6 +92,7 @@ class Reconciler:
         submit: Runs a long cloud call, now or on another thread.
         epoch: Of the lease; goes into every membership.
         revoked: Common names of certificates that were taken back.
+        by_hand: Replicas that people start themselves, and that are still let in.
         on_done: Called when a long cloud call has ended.
         distances: Says how far regions are from the robot, of what is sold and what runs.
     """
@@ -107,6 +108,7 @@ class Reconciler:
         submit: Submit = lambda run: run(),
         epoch: int = 1,
         revoked: Callable[[], frozenset[str]] = frozenset,
+        by_hand: Callable[[], frozenset[ReplicaId]] = frozenset,
         on_done: Callable[[], None] = lambda: None,
         distances: Distances = lambda spec, *_: spec.placement.rtt_s,
     ) -> None:
@@ -118,6 +120,7 @@ class Reconciler:
         self._build_order = build_order
         self._epoch = epoch
         self._revoked = revoked
+        self._by_hand = by_hand
         # A planned launch is what a launch is about; None stands for a termination.
         self._operations: Operations[Machine | None] = Operations(submit, on_done)
         self._refreshes: Operations[None] = Operations(submit, on_done)
@@ -256,6 +259,8 @@ class Reconciler:
             revoked=revoked,
             found=Found.of(spec),
         )
+        if Found.of(spec) is not Found.BY_CLOUD:
+            members = with_by_hand(members, self._by_hand())
         membership = successor(
             self._membership,
             pool=identity.name,

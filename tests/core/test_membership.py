@@ -159,3 +159,11 @@ def test_a_name_of_nobody_in_the_pool_cannot_be_revoked(name: object) -> None:
     del raw["checksum"]
     with pytest.raises(StateError):
         memberships.from_dict({**raw, "checksum": memberships._checksum(raw)})
+
+
+def test_replicas_started_by_hand_are_members_that_say_where_they_are() -> None:
+    """The highest generation of each slot, and never in the place of a machine."""
+    machine = Member(ReplicaId(UID, 100, 1), "10.0.0.1:1")
+    by_hand = [ReplicaId(UID, 101, 1), ReplicaId(UID, 101, 3), ReplicaId(UID, 100, 9)]
+    found = memberships.with_by_hand((machine,), by_hand)
+    assert found == (machine, Member(ReplicaId(UID, 101, 3), ""))

@@ -16,7 +16,7 @@ from fogft.core.holders import Role
 from fogft.core.membership import from_dict
 from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.spec import PoolSpec, ServiceSpec
-from fogft.pool import bundle, credentials, joining
+from fogft.pool import bundle, credentials, joining, rendezvous
 from fogft.pool.bundle import Label
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import Identity, PoolStore, write_identity
@@ -82,6 +82,19 @@ def test_a_replica_by_hand_joins_too(store: PoolStore, tmp_path: Path) -> None:
     for slot in ("3", "99", "x", "-1"):
         with pytest.raises(CredentialError, match="no slot for a replica"):
             issued(store, Role.REPLICA, slot)
+
+
+def test_a_rendezvous_joins_too(store: PoolStore, tmp_path: Path) -> None:
+    """Its file is all that a small reachable machine needs."""
+    path = tmp_path / "meet.join"
+    path.write_bytes(issued(store, Role.RENDEZVOUS, "meet"))
+    joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
+    assert joined.command == "rendezvous"
+    config = rendezvous.read_config(joined.config)
+    said = credentials.describe(config.credentials.certificate)
+    assert (said.common_name, said.role) == (f"rendezvous.meet.1.{UID}", "rendezvous")
+    assert config.credentials.key.exists()
+    assert config.credentials.ca.exists()
 
 
 def test_it_is_good_for_one_time(file: Path, tmp_path: Path) -> None:
