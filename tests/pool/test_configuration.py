@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 from pathlib import Path
 
@@ -107,3 +108,16 @@ def test_the_robots_certificate_is_made_once_and_renewed_in_time(paths: PoolPath
     assert described.role == credentials.Role.ROBOT.value
     assert described.common_name.startswith("robot.")
     assert described.common_name.endswith(UID)
+
+
+@pytest.mark.parametrize("max_hours", [None, 24.0, 365 * 24.0, 2000 * 24.0])
+def test_a_replicas_certificate_outlives_the_pool_and_a_margin(
+    paths: PoolPaths, max_hours: float | None
+) -> None:
+    """A manager that died at the launch stops no traffic until the pool was to end anyway."""
+    asked = dataclasses.replace(spec(), max_hours=max_hours)
+    order = configuration.build_order(paths, identity(paths.folder), asked, planned())
+    said = credentials.describe_pem(order.files["replica.crt"])
+    lasts = said.not_after - datetime.datetime.now(datetime.timezone.utc)
+    least = max(365.0, (max_hours or 0.0) / 24 + configuration.MARGIN_DAYS)
+    assert lasts > datetime.timedelta(days=least) - datetime.timedelta(hours=1)
