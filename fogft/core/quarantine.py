@@ -94,3 +94,16 @@ def avoided(history: History, now: float) -> Mapping[str, float]:
             if now < until:
                 out[location] = until
     return out
+
+
+def next_change(history: History, now: float) -> float:
+    """Return when, should nothing happen until then, `resting` can next say something else.
+
+    Infinity for never. A rest ends, or an older failure is forgiven and it gets shorter.
+    """
+    rests = resting(history, now)
+    times = [rest.until for rest in rests.values()]
+    for location, failures in history.failures.items():
+        if location in rests or EVERYWHERE in rests:
+            times += [f.at + FORGIVE_S for f in failures]
+    return min((at for at in times if at > now), default=float("inf"))

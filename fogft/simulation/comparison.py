@@ -1,0 +1,237 @@
+"""Run policies side by side in the same markets, one market a seed.
+
+Owns: which policies, from which offers; means and their intervals; the report's JSON.
+Not here: how it is shown (`fogft.cli`, `plot`).
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from fogft.core.errors import FogftError
+from fogft.core.model import Offer, Placement
+from fogft.core.placement import choose
+from fogft.core.spec import PoolSpec
+from fogft.simulation.baselines import SkyServe, Static
+from fogft.simulation.generator import generate
+from fogft.simulation.managed import Managed
+from fogft.simulation.market import FindOffers, Market, on_demand, spot
+from fogft.simulation.meter import DAY_S, HOURS_A_MONTH, Outcome
+from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.timeline import Timeline
+from fogft.simulation.world import Policy, World
+
+SETTLE_S = 3600.0
+FIGURES = (
+    "available",
+    "under_target",
+    "mean_ready",
+    "usd_per_hour",
+    "launches_per_day",
+    "preemptions_per_day",
+    "outages_per_day",
+)
+_RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is simulated.
+
+    Attributes:
+        find: What a cloud offers for a task's `resources`.
+        recorded: Location -> what was recorded there; empty to make markets up.
+        model: To make them up from.
+        days: How long each run is measured, after the first hour.
+        seeds: One run each.
+    """
+
+    spec: PoolSpec
+    find: FindOffers
+    timing: Timing
+    model: MarketModel
+    recorded: Mapping[str, Timeline] = field(default_factory=dict)
+    days: float = 7.0
+    seeds: Sequence[int] = tuple(range(20))
+
+    @property
+    def resources(self) -> Mapping[str, Any]:
+        """What the pool file says of its machines."""
+        return self.spec.task.get("resources") or {}
+
+    @property
+    def length_s(self) -> float:
+        """How long each run takes, in simulated seconds."""
+        return SETTLE_S + self.days * DAY_S
+
+    def market(self, seed: int) -> Market:
+        """Return the market of a seed: a stretch of what was recorded, or a made-up one."""
+        chance = random.Random(f"market {seed}")
+        if not self.recorded:
+            places = {o.placement.location for o in self.find(spot(self.resources))}
+            lines = generate(self.model, sorted(places), self.length_s, chance)
+            return Market(self.find, lines, self.timing)
+        known_s = min(line.length_s for line in self.recorded.values())
+        begin_s = chance.uniform(0, known_s - self.length_s) if known_s > self.length_s else 0.0
+        lines = {p: t.window(begin_s, self.length_s) for p, t in self.recorded.items()}
+        return Market(self.find, lines, self.timing)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over seeds with its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    def to_json(self) -> dict[str, float]:
+        """Return mean and interval."""
+        return dict(self.__dict__)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One policy over all seeds.
+
+    Attributes:
+        curve: Of the first seed: from when how many served, in seconds from the beginning.
+    """
+
+    name: str
+    outcomes: tuple[Outcome, ...]
+    curve: tuple[tuple[float, int], ...] = ()
+
+    def estimate(self, figure: str) -> Estimate:
+        """Return a figure's mean and interval; ``..._per_day`` counts by the day."""
+        if figure.endswith("_per_day"):
+            counted = figure.removesuffix("_per_day")
+            values = [getattr(o, counted) / (o.seconds / DAY_S) for o in self.outcomes]
+        else:
+            values = [getattr(o, figure) for o in self.outcomes]
+        return estimate(values)
+
+    @property
+    def longest_outage_s(self) -> float:
+        """The longest of all outages."""
+        return max(o.longest_outage_s for o in self.outcomes)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures."""
+        out: dict[str, Any] = {"policy": self.name}
+        for figure in FIGURES:
+            out[figure] = self.estimate(figure).to_json()
+        out["usd_per_month"] = out["usd_per_hour"]["mean"] * HOURS_A_MONTH
+        out["longest_outage_s"] = self.longest_outage_s
+        out["by_seed"] = [o.to_json() for o in self.outcomes]
+        return out
+
+
+def estimate(values: Sequence[float]) -> Estimate:
+    """Return the mean of some values with its interval; the same values give the same."""
+    chance = random.Random(len(values))
+    mean = sum(values) / len(values)
+    if len(values) == 1:
+        return Estimate(mean, mean, mean)
+    means = sorted(
+        sum(chance.choices(values, k=len(values))) / len(values) for _ in range(_RESAMPLES)
+    )
+    return Estimate(mean, means[int(0.025 * _RESAMPLES)], means[int(0.975 * _RESAMPLES)])
+
+
+Factory = Callable[[World], Policy]
+
+
+def policies(scenario: Scenario) -> dict[str, Factory]:
+    """Return how to make each policy, by name; fogft first.
+
+    Raises:
+        FogftError: The pool can buy nothing here.
+    """
+    spec, market = scenario.spec, scenario.market(scenario.seeds[0])
+    wanted = spec.replicas
+    spots = [o for o in market.offers(spot(scenario.resources)) if o.placement.spot]
+    reserved = sorted(
+        (o for o in market.offers(on_demand(scenario.resources)) if not o.placement.spot),
+        key=lambda o: (o.usd_per_hour, o.placement),
+    )
+    if not market.offers(scenario.resources):
+        raise FogftError(
+            "no location that the pool may use has a trace",
+            "name its regions under `resources.any_of`, or leave out `--traces`",
+        )
+    found: dict[str, Factory] = {"fogft": lambda world: Managed(world, spec)}
+    if reserved:
+        found["one on-demand"] = lambda world: Static(world, reserved[:1], wanted)
+    if spots:
+        places = static_places(spots, wanted)
+        found[f"static, any of {len(places)}"] = lambda world: Static(world, places, wanted)
+        dear = reserved[0] if reserved else None
+        found["SkyServe's policy"] = lambda world: SkyServe(world, spots, dear, wanted)
+    return found
+
+
+def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
+    """Return where a careful person would put so many replicas once and for all."""
+    chosen: list[Offer] = []
+    taken: list[Placement] = []
+    for _ in range(count):
+        offer = choose(offers, taken=taken).offer
+        if offer is not None:
+            chosen.append(offer)
+            taken.append(offer.placement)
+    return chosen
+
+
+def compare(scenario: Scenario, told: Callable[[int], None] = lambda done: None) -> list[Row]:
+    """Run every policy in every market.
+
+    Args:
+        scenario: What is simulated.
+        told: Called with the number of runs done.
+    """
+    made = policies(scenario)
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in made}
+    curves: dict[str, tuple[tuple[float, int], ...]] = {}
+    for done, (seed, name, world) in enumerate(_worlds(scenario, made)):
+        told(done)
+        with unlogged():
+            meter = world.run(made[name](world))
+        outcomes[name].append(meter.outcome())
+        if seed == scenario.seeds[0]:
+            curves[name] = tuple((at - meter.begin_s, ready) for at, ready in meter.curve)
+    return [Row(name, tuple(outcomes[name]), curves[name]) for name in made]
+
+
+@contextmanager
+def unlogged() -> Iterator[None]:
+    """Keep the manager's log quiet: what it tells of did not happen."""
+    log = logging.getLogger("fogft.pool")
+    before = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
+
+
+def _worlds(scenario: Scenario, made: Mapping[str, Factory]) -> Iterator[tuple[int, str, World]]:
+    for seed in scenario.seeds:
+        market = scenario.market(seed)
+        for name in made:
+            yield (
+                seed,
+                name,
+                World(
+                    market,
+                    seed=seed,
+                    length_s=scenario.length_s,
+                    settle_s=SETTLE_S,
+                    keep_curve=seed == scenario.seeds[0],
+                ),
+            )

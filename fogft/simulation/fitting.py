@@ -1,0 +1,98 @@
+"""Find the model that recorded traces could have come from.
+
+Owns: the estimates. MTTF and MTTR are times with and without room over the number of times
+that they ended (the maximum likelihood of an exponential, the last, unfinished spells
+included); correlations are means over pairs of locations, `together` the share of losses
+in which another zone of the region was lost at the same time. `regime_s` is not estimated.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from bisect import bisect_left
+from collections.abc import Mapping
+
+from fogft.core.errors import FogftError
+from fogft.simulation.model import MAX_CORRELATION, MarketModel
+from fogft.simulation.timeline import Timeline
+
+
+def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
+    """Return the model of some locations' timelines.
+
+    A correlation that no pair of locations can tell is that of the next narrower domain,
+    and 0 between clouds. Negative ones become 0, and no wider one exceeds a narrower one.
+
+    Raises:
+        FogftError: Nothing ever changed there.
+    """
+    spells = [spell for line in timelines.values() for spell in line.spells()]
+    means = []
+    for room, what in ((True, "full"), (False, "free")):
+        ended = sum(over for has_room, _, over in spells if has_room is room)
+        if not ended:
+            raise FogftError(
+                f"the traces cannot be fitted: no location ever becomes {what}",
+                "leave out `--fit` to replay them as they are",
+            )
+        means.append(sum(s for has_room, s, _ in spells if has_room is room) / ended)
+    region, cloud, world = _correlations(timelines)
+    region = cloud if region is None else region
+    cloud = region if cloud is None else cloud
+    region = min(MAX_CORRELATION, max(0.0, region or 0.0))
+    cloud = min(region, max(0.0, cloud or 0.0))
+    return MarketModel(
+        mttf_s=means[0],
+        mttr_s=means[1],
+        correlation_region=region,
+        correlation_cloud=cloud,
+        correlation_world=min(cloud, max(0.0, world or 0.0)),
+        together=_together(timelines),
+    )
+
+
+def _together(timelines: Mapping[str, Timeline]) -> float:
+    """Return how likely a zone is lost when a free one of its region is, at that moment."""
+    met = lost = 0
+    for one, other in itertools.permutations(sorted(timelines), 2):
+        if one.rsplit("/", 1)[0] != other.rsplit("/", 1)[0]:
+            continue
+        there, until_s = timelines[other], timelines[other].length_s
+        times = [at for at, _ in there.changes]
+        for at, capacity in timelines[one].changes[1:]:
+            if capacity or at >= until_s:
+                continue
+            index = bisect_left(times, at)
+            if index and there.changes[index - 1][1]:
+                met += 1
+                lost += index < len(times) and times[index] == at and not there.changes[index][1]
+    return lost / met if met else 0.0
+
+
+def _correlations(timelines: Mapping[str, Timeline]) -> tuple[float | None, ...]:
+    found: dict[str, list[float]] = {"region": [], "cloud": [], "world": []}
+    for one, other in itertools.combinations(sorted(timelines), 2):
+        value = correlation(timelines[one], timelines[other])
+        if value is None:
+            continue
+        (cloud, region, _), (cloud2, region2, _) = one.split("/"), other.split("/")
+        domain = "world" if cloud != cloud2 else "cloud" if region != region2 else "region"
+        found[domain].append(value)
+    return tuple(sum(v) / len(v) if v else None for v in found.values())
+
+
+def correlation(one: Timeline, other: Timeline) -> float | None:
+    """Return the correlation of having room, over the time that both know; None if constant."""
+    length_s = min(one.length_s, other.length_s)
+    a, b = one.window(0, length_s), other.window(0, length_s)
+    mean_a, mean_b = a.room_s() / length_s, b.room_s() / length_s
+    spread = mean_a * (1 - mean_a) * mean_b * (1 - mean_b)
+    if spread <= 0:
+        return None
+    times = sorted({at for at, _ in (*a.changes, *b.changes)})
+    both_s = 0.0
+    for at, end in zip(times, [*times[1:], length_s], strict=True):
+        if a.capacity(at) and b.capacity(at):
+            both_s += end - at
+    return (both_s / length_s - mean_a * mean_b) / math.sqrt(spread)

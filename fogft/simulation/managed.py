@@ -1,0 +1,137 @@
+"""The pool as fogft runs it: the real reconciler, planner, history and quarantine.
+
+Only the cloud, the links and the clock are simulated. Nothing here decides anything.
+
+Owns: the links' report, and when the manager can next have something to do.
+"""
+
+from __future__ import annotations
+
+from fogft.core.history import Event, History, compacted
+from fogft.core.intent import Intent
+from fogft.core.model import LinkReport, LinkState, Membership
+from fogft.core.quarantine import next_change
+from fogft.core.spec import PoolSpec
+from fogft.pool.reconciler import Reconciler, Tick
+from fogft.pool.store import Identity
+from fogft.simulation.world import NEVER, TICK_S, World
+
+UID = "0" * 16
+LOOK_EVERY_S = 900.0  # a safety net: tests show that the results do not depend on it
+_COMPACT_AFTER = 2_000
+
+
+class Memory:
+    """Implements `fogft.pool.store.Store` in memory."""
+
+    def __init__(self, spec: PoolSpec, now: float) -> None:
+        self.the_spec = spec
+        self.events: list[Event] = []
+        self.published: Membership | None = None
+        self._identity = Identity(spec.name, UID, "simulated", "", now)
+        self._history = History()
+
+    def identity(self) -> Identity:
+        """Return what the pool is."""
+        return self._identity
+
+    def spec(self) -> PoolSpec:
+        """Return the pool file."""
+        return self.the_spec
+
+    def intent(self) -> Intent:
+        """Return no wishes besides the file."""
+        return _NO_WISHES
+
+    def history(self) -> History:
+        """Return what happened so far."""
+        return self._history
+
+    def append(self, event: Event) -> None:
+        """Remember an event."""
+        self.events.append(event)
+        self._history.add(event)
+
+    def membership(self) -> Membership | None:
+        """Return the membership as last written."""
+        return self.published
+
+    def write_membership(self, membership: Membership) -> None:
+        """Publish a membership."""
+        self.published = membership
+
+    def compact(self, now: float) -> None:
+        """Forget what no decision needs, as the store on disk does from time to time."""
+        if len(self.events) > _COMPACT_AFTER:
+            self.events = compacted(self.events, now)
+            self._history = History(self.events)
+
+
+_NO_WISHES = Intent()
+
+
+class Managed:
+    """A pool under its manager. Implements `world.Policy`."""
+
+    def __init__(self, world: World, spec: PoolSpec) -> None:
+        self.world = world
+        self.store = Memory(spec, world.now)
+        self._ready = frozenset(service.name for service in spec.services)
+        self._wanted = 0
+        self._reconciler = Reconciler(
+            world, self.store, clock=lambda: world.now, links=self._links, submit=world.submit
+        )
+
+    def wanted(self, now: float) -> int:
+        """Return how many replicas the planner wants."""
+        return self._wanted
+
+    def tick(self, now: float) -> float:
+        """Let the manager work once."""
+        self.store.compact(now)
+        before = len(self.store.events), self.store.published
+        tick = self._reconciler.tick()
+        self._wanted = tick.plan.wanted
+        done = tick.plan.terminations or tick.plan.draining
+        if done or (len(self.store.events), self.store.published) != before:
+            return now + TICK_S
+        return min(now + LOOK_EVERY_S, self._next_timer(tick))
+
+    def _next_timer(self, tick: Tick) -> float:
+        history, now = self.store.history(), tick.observed.now
+        health = tick.spec.health
+        times = [next_change(history, now) if tick.plan.notes else NEVER]
+        for record in history.open():
+            if record.draining_since is not None:
+                return now + TICK_S
+            if record.first_ready_at is None:
+                times.append(record.launched_at + health.start_limit_s + TICK_S)
+        for vm in self.world.vms.values():
+            if vm.gone_at <= now:
+                times += [
+                    vm.gone_at + patience_s + TICK_S
+                    for patience_s in (health.suspect_after_s, health.replace_after_s)
+                ]
+        return min((at for at in times if at > now), default=NEVER)
+
+    def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...]:
+        """Report as the client proxy does: of the published members, by what was heard."""
+        reports = []
+        for member in self.store.published.members if self.store.published else ():
+            vm = self.world.vms.get(member.id)
+            if vm is None:
+                continue
+            silent_s = max(now - vm.gone_at, 0.0)
+            silent = silent_s > self.store.the_spec.health.suspect_after_s
+            reports.append(
+                LinkReport(
+                    member.id,
+                    LinkState.SUSPECT if silent else LinkState.UP,
+                    ready=self._ready,
+                    draining=vm.noticed,
+                    silent_for_s=silent_s,
+                )
+            )
+        return tuple(reports)
+
+

@@ -1,0 +1,100 @@
+"""A spot market to simulate in: what is on offer, and when each location takes machines away.
+
+Owns: the events that the market causes, with notices reckoned in.
+Not here: the machines themselves (`world`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from fogft.core.model import Offer
+from fogft.simulation.model import Timing
+from fogft.simulation.timeline import Timeline
+
+FindOffers = Callable[[Mapping[str, Any]], Sequence[Offer]]
+
+
+@dataclass(frozen=True)
+class Market:
+    """Where, when and at what price.
+
+    Attributes:
+        find: What can be bought for a task's `resources`, as a cloud answers it.
+        timelines: Location -> its capacity for spot machines. A location without one
+            sells on-demand machines only.
+    """
+
+    find: FindOffers
+    timelines: Mapping[str, Timeline]
+    timing: Timing = field(default_factory=Timing)
+
+    def offers(self, resources: Mapping[str, Any]) -> list[Offer]:
+        """Return what suits and is not spot in a location that nothing is known of."""
+        return [
+            o
+            for o in self.find(resources)
+            if not o.placement.spot or o.placement.location in self.timelines
+        ]
+
+
+@dataclass(frozen=True)
+class Change:
+    """A location's capacity changes.
+
+    Attributes:
+        at_s: From here on no more machines than `capacity` are accepted.
+        ends_s: When machines beyond it end; after `at_s` where there is a notice.
+    """
+
+    at_s: float
+    location: str
+    capacity: int
+    ends_s: float
+
+
+def changes(market: Market, tick_s: float) -> Iterator[Change]:
+    """Yield what will happen, times rounded up to whole ticks, in no order between locations.
+
+    A loss is announced `notice_s` before, but not before the room that is lost was there.
+    """
+    for location, timeline in market.timelines.items():
+        before = 0
+        came_s = 0.0
+        for at, capacity in timeline.changes:
+            at_s = rounded_up(at, tick_s)
+            if capacity > before:
+                came_s = at_s
+                yield Change(at_s, location, capacity, at_s)
+            else:
+                notice_s = rounded_up(market.timing.notice_s, tick_s)
+                announced_s = max(came_s, at_s - notice_s, 0.0)
+                yield Change(announced_s, location, capacity, at_s)
+                came_s = announced_s
+            before = capacity
+
+
+def rounded_up(seconds: float, tick_s: float) -> float:
+    """Return the next whole number of ticks."""
+    return math.ceil(seconds / tick_s) * tick_s if math.isfinite(seconds) else seconds
+
+
+def on_demand(resources: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the same resources bought on demand."""
+    out = {**resources, "use_spot": False}
+    for key in ("any_of", "ordered"):
+        if isinstance(out.get(key), list):
+            out[key] = [{**entry, "use_spot": False} for entry in out[key]]
+    return out
+
+
+def spot(resources: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the same resources bought on the spot market."""
+    out = {**resources, "use_spot": True}
+    for key in ("any_of", "ordered"):
+        if isinstance(out.get(key), list):
+            out[key] = [{**entry, "use_spot": True} for entry in out[key]]
+    return out

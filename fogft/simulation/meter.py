@@ -1,0 +1,101 @@
+"""What a simulated pool was worth: how often it answered, and what it cost.
+
+Owns: adding up between events.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+HOURS_A_MONTH = 730.0
+DAY_S = 86_400.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One policy in one market, measured over `seconds`.
+
+    Attributes:
+        available: Fraction of time that at least one replica served.
+        under_target: Fraction of time that fewer served than the pool file wants.
+        launches: Machines that a cloud agreed to.
+        refusals: Orders that it refused.
+        preemptions: Machines that were taken away or failed.
+        outages: How often the pool stopped to answer, and how long the longest was.
+    """
+
+    seconds: float
+    available: float
+    under_target: float
+    mean_ready: float
+    usd_per_hour: float
+    launches: int
+    refusals: int
+    preemptions: int
+    outages: int
+    longest_outage_s: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures by name."""
+        return dict(self.__dict__)
+
+
+@dataclass
+class Meter:
+    """Adds up what happens from `begin_s` on; `curve` keeps each step if asked to."""
+
+    begin_s: float
+    keep_curve: bool = False
+    seconds: float = 0.0
+    up_s: float = 0.0
+    under_s: float = 0.0
+    ready_s: float = 0.0
+    usd: float = 0.0
+    launches: int = 0
+    refusals: int = 0
+    preemptions: int = 0
+    outages: int = 0
+    longest_outage_s: float = 0.0
+    curve: list[tuple[float, int]] = field(default_factory=list)
+    _down_s: float = 0.0
+
+    def pass_time(
+        self, now_s: float, seconds: float, *, ready: int, wanted: int, usd_per_hour: float
+    ) -> None:
+        """Take into account that for so long before `now_s` nothing changed."""
+        seconds = min(seconds, now_s - self.begin_s)
+        if seconds <= 0:
+            return
+        self.seconds += seconds
+        self.ready_s += seconds * ready
+        self.usd += seconds / 3600.0 * usd_per_hour
+        self.under_s += seconds if ready < wanted else 0.0
+        if ready:
+            self.up_s += seconds
+            self._down_s = 0.0
+        else:
+            self.outages += self._down_s == 0.0
+            self._down_s += seconds
+            self.longest_outage_s = max(self.longest_outage_s, self._down_s)
+        if self.keep_curve and (not self.curve or self.curve[-1][1] != ready):
+            self.curve.append((now_s - seconds, ready))
+
+    def counts(self, now_s: float) -> bool:
+        """Whether what happens now is counted."""
+        return now_s >= self.begin_s
+
+    def outcome(self) -> Outcome:
+        """Return the figures so far."""
+        return Outcome(
+            seconds=self.seconds,
+            available=self.up_s / self.seconds,
+            under_target=self.under_s / self.seconds,
+            mean_ready=self.ready_s / self.seconds,
+            usd_per_hour=self.usd / (self.seconds / 3600.0),
+            launches=self.launches,
+            refusals=self.refusals,
+            preemptions=self.preemptions,
+            outages=self.outages,
+            longest_outage_s=self.longest_outage_s,
+        )

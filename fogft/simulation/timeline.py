@@ -1,0 +1,68 @@
+"""How many spot machines fit into one location, over time.
+
+Owns: the step function, and how it follows from equally spaced samples.
+Not here: where it comes from (`traces`, `generator`) and who is taken away (`market`).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+UNLIMITED = 1 << 30
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """A step function from time to capacity, from 0 on.
+
+    Attributes:
+        changes: ``(at_s, capacity)``, times ascending from 0, capacities alternating.
+        length_s: Until when it is known.
+    """
+
+    changes: tuple[tuple[float, int], ...]
+    length_s: float
+
+    def capacity(self, at_s: float) -> int:
+        """Return how many machines fit at a time."""
+        index = bisect_right(self.changes, at_s, key=lambda change: change[0]) - 1
+        return self.changes[max(index, 0)][1]
+
+    def window(self, begin_s: float, length_s: float) -> Timeline:
+        """Return the part from `begin_s` on, its times counted from there."""
+        later = [
+            (at - begin_s, n) for at, n in self.changes if begin_s < at < begin_s + length_s
+        ]
+        return Timeline(((0.0, self.capacity(begin_s)), *later), length_s)
+
+    def spells(self) -> Iterator[tuple[bool, float, bool]]:
+        """Yield each time with or without room: ``(room, seconds, seen to its end)``."""
+        merged = list(_distinct((at, n > 0) for at, n in self.changes))
+        ends = [*(at for at, _ in merged[1:]), self.length_s]
+        for index, ((at, room), end) in enumerate(zip(merged, ends, strict=True)):
+            yield room, end - at, index < len(merged) - 1
+
+    def room_s(self) -> float:
+        """Return for how long there was room, in seconds."""
+        return sum(seconds for room, seconds, _ in self.spells() if room)
+
+
+def of_samples(counts: Sequence[int], gap_s: float) -> Timeline:
+    """Return the timeline of samples taken every `gap_s`: each holds until the next."""
+    changes = _distinct((index * gap_s, count) for index, count in enumerate(counts))
+    return Timeline(tuple(changes), len(counts) * gap_s)
+
+
+def of_changes(changes: Iterable[tuple[float, int]], length_s: float) -> Timeline:
+    """Return the timeline of changes in order of time, those without effect left out."""
+    return Timeline(tuple(_distinct(changes)), length_s)
+
+
+def _distinct(changes: Iterable[tuple[float, int]]) -> Iterator[tuple[float, int]]:
+    last: int | None = None
+    for at, value in changes:
+        if value != last:
+            yield at, value
+            last = value

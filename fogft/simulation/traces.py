@@ -1,0 +1,183 @@
+"""Read recorded spot traces, and find out which locations they speak of.
+
+A trace is a JSON file: ``{"metadata": {"gap_seconds": 300}, "data": [1, 1, 0, ...]}``, each
+sample the number of machines that could be had then. Optional: ``times``, the seconds at
+which the samples were taken, by which holes and clock jumps are found.
+
+Its location is its path below the folder, ``aws/us-west-2/us-west-2b.json``, or the zone
+alone, ``us-west-2b_v100_1.json``: what follows the first underscore is only a remark.
+
+Owns: the format, its mistakes, and matching traces with what a pool may buy.
+Not here: what is made of them (`comparison`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fogft.core.errors import FogftError
+from fogft.core.model import Placement
+from fogft.core.spec_tree import nearest
+from fogft.simulation.timeline import Timeline, of_samples
+
+FORMAT = 'a trace is `{"metadata": {"gap_seconds": 300}, "data": [1, 1, 0, ...]}`'
+MAX_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One file.
+
+    Attributes:
+        place: ``cloud/region/zone``, or the zone alone.
+    """
+
+    file: str
+    place: str
+    timeline: Timeline
+
+
+def read(folder: Path) -> list[Trace]:
+    """Read every ``.json`` file in and below a folder.
+
+    Raises:
+        FogftError: There is none, or one is no trace; nothing is skipped.
+    """
+    try:
+        files = sorted(path for path in folder.rglob("*.json") if path.is_file())
+    except OSError as error:
+        raise FogftError(f"{folder}: cannot be read: {error.strerror}") from None
+    if not folder.is_dir():
+        raise FogftError(f"{folder}: is not a folder of traces", FORMAT)
+    if not files:
+        raise FogftError(f"{folder}: there is no trace (`*.json`) in it", FORMAT)
+    return [_read_file(path, folder) for path in files]
+
+
+def _read_file(path: Path, folder: Path) -> Trace:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise FogftError(f"{path}: is larger than {MAX_BYTES >> 20} MiB", FORMAT)
+        value = json.loads(path.read_bytes())
+    except OSError as error:
+        raise FogftError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise FogftError(f"{path}: is not JSON: {error}", FORMAT) from None
+    inner = path.relative_to(folder).with_suffix("").parts
+    zone = inner[-1].split("_")[0]
+    place = "/".join((*inner[:-1], zone)) if len(inner) == 3 else zone
+    return Trace(str(path), place, parse(value, str(path)))
+
+
+def parse(value: Any, file: str) -> Timeline:
+    """Return the timeline of a trace.
+
+    Raises:
+        FogftError: It is no trace; the message names the place in the file.
+    """
+    if not isinstance(value, Mapping):
+        raise FogftError(f"{file}: must be a JSON object", FORMAT)
+    metadata = value.get("metadata")
+    gap_s = metadata.get("gap_seconds") if isinstance(metadata, Mapping) else None
+    if not _is_number(gap_s) or gap_s <= 0:
+        raise FogftError(f"{file}: metadata.gap_seconds: must be a number above 0", FORMAT)
+    data = value.get("data")
+    if not isinstance(data, list):
+        raise FogftError(f"{file}: data: must be a list of numbers", FORMAT)
+    if not data:
+        raise FogftError(f"{file}: data: the trace is empty", "remove the file, or record again")
+    for index, sample in enumerate(data):
+        if sample is None:
+            raise FogftError(
+                f"{file}: data[{index}]: the trace has a gap here ({gap_s:g} s a sample)",
+                "cut the trace before it or after it: what happened meanwhile is not known",
+            )
+        if not _is_number(sample) or sample < 0 or sample != int(sample):
+            raise FogftError(
+                f"{file}: data[{index}]: must be a number of machines, not `{sample!r:.40}`", FORMAT
+            )
+    if "times" in value:
+        _check_times(value["times"], len(data), float(gap_s), file)
+    return of_samples([int(sample) for sample in data], float(gap_s))
+
+
+def _check_times(times: Any, samples: int, gap_s: float, file: str) -> None:
+    if not isinstance(times, list) or len(times) != samples:
+        raise FogftError(
+            f"{file}: times: must be a list as long as `data` ({samples})", "or leave it out"
+        )
+    for index, at in enumerate(times):
+        if not _is_number(at):
+            raise FogftError(f"{file}: times[{index}]: must be a number of seconds", FORMAT)
+        if index == 0:
+            continue
+        step = at - times[index - 1]
+        if step <= 0:
+            raise FogftError(
+                f"{file}: times[{index}]: the clock jumps back by {-step:g} s",
+                "cut the trace there: which of the samples came first is not known",
+            )
+        if not 0.5 * gap_s <= step <= 1.5 * gap_s:
+            raise FogftError(
+                f"{file}: times[{index}]: {step:g} s after the sample before it, where "
+                f"`gap_seconds` says {gap_s:g}: a gap or a clock that jumped",
+                "cut the trace there: what happened meanwhile is not known",
+            )
+
+
+def _is_number(value: Any) -> bool:
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    )
+
+
+def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, Timeline]:
+    """Return the timelines by location, of those traces whose location is on offer.
+
+    Args:
+        traces: Of any places.
+        offered: What can be bought anywhere, not only what this pool may buy.
+
+    Raises:
+        FogftError: A trace is of a place that does not exist, or two are of the same.
+    """
+    found: dict[str, tuple[str, Timeline]] = {}
+    for trace in traces:
+        places = sorted({p.location for p in offered if trace.place in _names(p)})
+        if not places:
+            every = sorted({p.location for p in offered} | {_short(p) for p in offered})
+            raise FogftError(
+                f"{trace.file}: there is no location `{trace.place}` among the "
+                f"{len({p.location for p in offered})} that are offered",
+                nearest(trace.place, every),
+            )
+        if len(places) > 1:
+            raise FogftError(
+                f"{trace.file}: `{trace.place}` could be {' or '.join(f'`{p}`' for p in places)}",
+                f"put it in folders: `{places[0]}.json`",
+            )
+        if places[0] in found:
+            raise FogftError(
+                f"{trace.file}: is of `{places[0]}`, as {found[places[0]][0]} is",
+                "keep the one of the instance that the pool uses",
+            )
+        found[places[0]] = trace.file, trace.timeline
+    return {place: timeline for place, (_, timeline) in found.items()}
+
+
+def _names(placement: Placement) -> set[str]:
+    """Return what a trace may call a placement's zone: clouds prefix it with the region."""
+    return {placement.location, placement.zone, _short(placement), _dashed(placement)}
+
+
+def _short(placement: Placement) -> str:
+    return placement.region + placement.zone
+
+
+def _dashed(placement: Placement) -> str:
+    return f"{placement.region}-{placement.zone}"

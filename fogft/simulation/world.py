@@ -1,0 +1,233 @@
+"""A cloud and its machines under simulated time, event by event.
+
+Between two events nothing changes, so time jumps from one to the next. A policy is asked
+after each event and when it wanted to be asked; it acts through the cloud port only.
+
+Owns: the queue of events, the lives of machines, what is billed.
+Not here: who decides (`managed`, `baselines`) and what the market does (`market`).
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from fogft.cloud.port import Launch
+from fogft.core.errors import NoCapacity
+from fogft.core.model import Machine, MachinePhase, Offer, ReplicaId
+from fogft.simulation.market import Change, Market, changes, rounded_up
+from fogft.simulation.meter import Meter
+
+EPOCH = 1_704_067_200.0  # a Monday, 00:00 UTC: simulated time is a time of day as well
+TICK_S = 1.0
+NEVER = float("inf")
+
+
+class Policy(Protocol):
+    """Who decides what runs."""
+
+    def tick(self, now: float) -> float:
+        """Act on the world as it is; return when to be asked again should nothing happen."""
+
+    def wanted(self, now: float) -> int:
+        """Return how many replicas the pool file wants ready."""
+
+
+@dataclass(eq=False)
+class Vm:
+    """A machine. Times in seconds since the epoch.
+
+    Attributes:
+        ready: It runs and its service answers.
+        gone_at: It was taken away then, and may still be listed.
+    """
+
+    order: Launch
+    launched_at: float
+    ready: bool = False
+    noticed: bool = False
+    gone_at: float = NEVER
+    machine: Machine | None = None  # as listed; None when that has to be made anew
+
+    @property
+    def id(self) -> ReplicaId:
+        """The replica that it carries."""
+        return self.order.id
+
+
+class World:
+    """One market with one pool in it. Implements `fogft.cloud.port.Cloud`.
+
+    Args:
+        seed: Of boot times, victims and failures of on-demand machines.
+        settle_s: What happens before is not measured.
+    """
+
+    def __init__(
+        self,
+        market: Market,
+        *,
+        seed: int,
+        length_s: float,
+        settle_s: float = 0.0,
+        keep_curve: bool = False,
+    ) -> None:
+        self.now = EPOCH
+        self.market = market
+        self.vms: dict[ReplicaId, Vm] = {}
+        self.meter = Meter(EPOCH + settle_s, keep_curve)
+        self.asked = 0  # how often the policy was
+        self._until = EPOCH + length_s
+        self._chance = random.Random(f"machines {seed}")
+        self._capacity: dict[str, int] = {}
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        for change in changes(market, TICK_S):
+            if change.at_s <= length_s:
+                self.at(EPOCH + change.at_s, lambda change=change: self._change(change))
+
+    # -- time -------------------------------------------------------------------------------
+
+    def at(self, time: float, happen: Callable[[], None]) -> None:
+        """Let something happen at a time, or now where that is over."""
+        heapq.heappush(self._queue, (max(time, self.now), next(self._order), happen))
+
+    def after(self, seconds: float, happen: Callable[[], None]) -> None:
+        """Let something happen in a while, rounded up to whole ticks."""
+        self.at(self.now + rounded_up(seconds, TICK_S), happen)
+
+    def run(self, policy: Policy, *, every_tick: bool = False) -> Meter:
+        """Let a policy work until the end.
+
+        Args:
+            policy: Who decides.
+            every_tick: Ask at each tick, as the manager's loop does, and not only when
+                something can have changed. Slow: to check that it makes no difference.
+        """
+        wake = self.now
+        while True:
+            due = self._queue[0][0] if self._queue else NEVER
+            moment = min(wake, due)
+            if every_tick:
+                moment = min(moment, self.now + TICK_S) if self.asked else self.now
+            if moment >= self._until:
+                self._pass_until(self._until, policy)
+                return self.meter
+            self._pass_until(moment, policy)
+            while self._queue and self._queue[0][0] <= self.now:
+                heapq.heappop(self._queue)[2]()
+            self.asked += 1
+            wake = max(rounded_up(policy.tick(self.now), TICK_S), self.now + TICK_S)
+
+    def _pass_until(self, moment: float, policy: Policy) -> None:
+        if moment > self.now:
+            alive = [vm for vm in self.vms.values() if vm.gone_at == NEVER]
+            self.meter.pass_time(
+                moment,
+                moment - self.now,
+                ready=sum(vm.ready for vm in alive),
+                wanted=policy.wanted(self.now),
+                usd_per_hour=sum(vm.order.usd_per_hour for vm in alive),
+            )
+            self.now = moment
+
+    # -- the market ---------------------------------------------------------------------------
+
+    def _change(self, change: Change) -> None:
+        self._capacity[change.location] = change.capacity
+        here = self._spot_machines(change.location)
+        excess = len(here) - change.capacity
+        if excess <= 0:
+            return
+        for vm in self._chance.sample(here, excess):
+            if EPOCH + change.ends_s > self.now:
+                vm.noticed, vm.machine = True, None
+            self.at(EPOCH + change.ends_s, lambda vm=vm: self._lose(vm))
+
+    def _spot_machines(self, location: str) -> list[Vm]:
+        """Return who takes up room there: not those that are already to go."""
+        return [
+            vm
+            for vm in self.vms.values()
+            if vm.order.placement.spot
+            and vm.order.placement.location == location
+            and vm.gone_at == NEVER
+            and not vm.noticed
+        ]
+
+    def _lose(self, vm: Vm) -> None:
+        if vm.id not in self.vms or vm.gone_at != NEVER:
+            return  # it was ended before
+        vm.gone_at, vm.ready = self.now, False
+        self.meter.preemptions += self.meter.counts(self.now)
+        self.after(self.market.timing.detect_s, lambda: self._forget(vm))
+
+    def _forget(self, vm: Vm) -> None:
+        self.vms.pop(vm.id, None)
+
+    def _boot(self, vm: Vm) -> None:
+        if vm.id in self.vms and vm.gone_at == NEVER:
+            vm.ready, vm.machine = True, None
+
+    # -- the cloud port -----------------------------------------------------------------------
+
+    def submit(self, call: Callable[[], None]) -> None:
+        """Make a call of the cloud, which takes its time to answer."""
+        self.after(self.market.timing.answer_s, call)
+
+    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """List what the market sells; full locations too."""
+        return self.market.offers(resources)
+
+    def machines(self, pool_uid: str) -> Sequence[Machine]:
+        """List the machines, those lost and not yet missed included."""
+        return [vm.machine or _listed(vm) for _, vm in sorted(self.vms.items())]
+
+    def launch(self, order: Launch) -> None:
+        """Start a machine if there is room.
+
+        Raises:
+            NoCapacity: There is none.
+        """
+        if order.id in self.vms:
+            return
+        timing, place = self.market.timing, order.placement
+        if place.spot:
+            room = self._capacity.get(place.location, 0) - len(self._spot_machines(place.location))
+            if room <= 0:
+                self.meter.refusals += self.meter.counts(self.now)
+                raise NoCapacity(f"no capacity in `{place.location}`")
+        vm = self.vms[order.id] = Vm(order, self.now)
+        self.meter.launches += self.meter.counts(self.now)
+        boot_s = timing.boot_s * self._chance.uniform(0.75, 1.25)
+        self.after(max(boot_s - timing.answer_s, 0.0), lambda: self._boot(vm))
+        if not place.spot and timing.on_demand_mttf_s:
+            lives_s = self._chance.expovariate(1 / timing.on_demand_mttf_s)
+            self.after(lives_s, lambda: self._lose(vm))
+
+    def terminate(self, id: ReplicaId) -> None:
+        """End a machine at once."""
+        self.vms.pop(id, None)
+
+    def log(self, id: ReplicaId) -> str | None:
+        """Keep no log."""
+        return None
+
+
+def _listed(vm: Vm) -> Machine:
+    order = vm.order
+    vm.machine = Machine(
+        id=order.id,
+        placement=order.placement,
+        phase=MachinePhase.RUNNING if vm.ready else MachinePhase.PROVISIONING,
+        launched_at=vm.launched_at,
+        endpoint=order.id.short if vm.ready else None,
+        notice=vm.noticed,
+        usd_per_hour=order.usd_per_hour,
+        spec_hash=order.spec_hash,
+    )
+    return vm.machine
