@@ -34,6 +34,7 @@ from fogft.app.parts import (
     run_server,
 )
 from fogft.app.planning import plan
+from fogft.app.simulate import check_plot, draw, simulate
 from fogft.app.sweeping import clouds_to_sweep, end_unowned, sweep
 from fogft.app.wishes import drain, exclude, include, scale
 
@@ -41,12 +42,14 @@ __all__ = [
     "CLOUDS",
     "certificates",
     "chaos",
+    "check_plot",
     "cloud_of",
     "clouds_to_sweep",
     "costs_money",
     "doctor",
     "down",
     "drain",
+    "draw",
     "end_unowned",
     "examples",
     "exclude",
@@ -75,6 +78,7 @@ __all__ = [
     "run_rendezvous",
     "run_server",
     "scale",
+    "simulate",
     "slots",
     "start",
     "status",

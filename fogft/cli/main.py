@@ -21,7 +21,18 @@ from typing import Annotated
 import typer
 
 from fogft import __version__
-from fogft.cli import change, chaos, credentials, doctor, lifecycle, output, parts, sweep, watch
+from fogft.cli import (
+    change,
+    chaos,
+    credentials,
+    doctor,
+    lifecycle,
+    output,
+    parts,
+    simulate,
+    sweep,
+    watch,
+)
 from fogft.cli import plan as planning
 from fogft.cli.sections import Commands
 from fogft.core.errors import FogftError
@@ -50,6 +61,7 @@ planning.register(app)
 watch.register(app)
 doctor.register(app)
 change.register(app)
+simulate.register(app)
 chaos.register(app)
 credentials.register(app)
 parts.register(app)

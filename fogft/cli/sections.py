@@ -10,7 +10,7 @@ SECTIONS = {
     "Begin and end": ("init", "up", "join", "down", "sweep"),
     "Look": ("plan", "status", "logs", "doctor"),
     "Change what runs": ("scale", "drain", "exclude", "include", "credentials"),
-    "Try what happens when": ("chaos",),
+    "Try what happens when": ("simulate", "chaos"),
     "Run one part by hand": ("proxy", "serve", "manager", "rendezvous"),
 }
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from fogft.cloud.port import Launch
 from fogft.core.errors import NoCapacity
@@ -85,7 +86,7 @@ class Static:
             self._due[id.slot] = now
         for slot in [slot for slot, at in self._due.items() if at <= now]:
             del self._due[slot]
-            self._fleet.order(slot, self._offers[slot], lambda slot=slot: self._retry(slot))
+            self._fleet.order(slot, self._offers[slot], partial(self._retry, slot))
         return min(self._due.values(), default=NEVER)
 
     def _retry(self, slot: int) -> None:
@@ -93,7 +94,7 @@ class Static:
 
 
 class SkyServe:
-    """SkyServe's spot placer with its on-demand fallback.
+    """SkyServe's spot placer, with or without its on-demand fallback.
 
     A location is active until a replica is lost or refused there, and again once one becomes
     ready; when fewer than two are active, all are. A launch goes to the cheapest active
@@ -130,7 +131,7 @@ class SkyServe:
         if self._spot and now >= self._spot_from:
             for slot in range(len(spot), self._wanted):
                 offer = self._place()
-                fleet.order(slot, offer, lambda offer=offer: self._refused(offer))
+                fleet.order(slot, offer, partial(self._refused, offer))
         self._fall_back(self._wanted - sum(map(fleet.ready, spot)))
         return self._spot_from if self._spot_from > now else NEVER
 

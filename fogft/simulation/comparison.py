@@ -171,8 +171,10 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
     if spots:
         places = static_places(spots, wanted)
         found[f"static, any of {len(places)}"] = lambda world: Static(world, places, wanted)
-        dear = reserved[0] if reserved else None
-        found["SkyServe's policy"] = lambda world: SkyServe(world, spots, dear, wanted)
+        found["SkyServe, spot only"] = lambda world: SkyServe(world, spots, None, wanted)
+        if reserved:
+            dear = reserved[0]
+            found["SkyServe, fallback"] = lambda world: SkyServe(world, spots, dear, wanted)
     return found
 
 

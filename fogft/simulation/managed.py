@@ -7,6 +7,8 @@ Owns: the links' report, and when the manager can next have something to do.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from fogft.core.history import Event, History, compacted
 from fogft.core.intent import Intent
 from fogft.core.model import LinkReport, LinkState, Membership
@@ -27,6 +29,7 @@ class Memory:
     def __init__(self, spec: PoolSpec, now: float) -> None:
         self.the_spec = spec
         self.events: list[Event] = []
+        self._appended = 0
         self.published: Membership | None = None
         self._identity = Identity(spec.name, UID, "simulated", "", now)
         self._history = History()
@@ -49,6 +52,7 @@ class Memory:
 
     def append(self, event: Event) -> None:
         """Remember an event."""
+        self._appended += 1
         self.events.append(event)
         self._history.add(event)
 
@@ -62,7 +66,8 @@ class Memory:
 
     def compact(self, now: float) -> None:
         """Forget what no decision needs, as the store on disk does from time to time."""
-        if len(self.events) > _COMPACT_AFTER:
+        if self._appended > _COMPACT_AFTER:
+            self._appended = 0
             self.events = compacted(self.events, now)
             self._history = History(self.events)
 
@@ -75,7 +80,7 @@ class Managed:
 
     def __init__(self, world: World, spec: PoolSpec) -> None:
         self.world = world
-        self.store = Memory(spec, world.now)
+        self.store = Memory(replace(spec, max_hours=None), world.now)  # a run is as long as asked
         self._ready = frozenset(service.name for service in spec.services)
         self._wanted = 0
         self._reconciler = Reconciler(
@@ -133,5 +138,3 @@ class Managed:
                 )
             )
         return tuple(reports)
-
-

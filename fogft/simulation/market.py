@@ -6,6 +6,7 @@ Not here: the machines themselves (`world`).
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,19 @@ from fogft.simulation.model import Timing
 from fogft.simulation.timeline import Timeline
 
 FindOffers = Callable[[Mapping[str, Any]], Sequence[Offer]]
+
+
+def remembered(find: FindOffers) -> FindOffers:
+    """Return the same, each question asked only once: nothing changes while one simulates."""
+    known: dict[str, Sequence[Offer]] = {}
+
+    def ask(resources: Mapping[str, Any]) -> Sequence[Offer]:
+        key = json.dumps(resources, sort_keys=True, default=str)
+        if key not in known:
+            known[key] = tuple(find(resources))
+        return known[key]
+
+    return ask
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,7 @@ def _number(key: str, text: str) -> float:
     if not math.isfinite(value) or value < 0 or (key in _POSITIVE and value == 0):
         range_ = "above 0" if key in _POSITIVE else "0 or more"
         raise FogftError(f"--model: `{key}` must be {range_} and finite, not `{text:.40}`", HINT)
-    most = _BELOW.get(key.split("_")[0], math.inf)
+    most = _BELOW.get(key.split("_", maxsplit=1)[0], math.inf)
     if value > most:
         raise FogftError(f"--model: `{key}` must be from 0 to {most:g}, not `{text:.40}`", HINT)
     return value

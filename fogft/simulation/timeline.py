@@ -32,17 +32,15 @@ class Timeline:
 
     def window(self, begin_s: float, length_s: float) -> Timeline:
         """Return the part from `begin_s` on, its times counted from there."""
-        later = [
-            (at - begin_s, n) for at, n in self.changes if begin_s < at < begin_s + length_s
-        ]
+        later = [(at - begin_s, n) for at, n in self.changes if begin_s < at < begin_s + length_s]
         return Timeline(((0.0, self.capacity(begin_s)), *later), length_s)
 
     def spells(self) -> Iterator[tuple[bool, float, bool]]:
         """Yield each time with or without room: ``(room, seconds, seen to its end)``."""
-        merged = list(_distinct((at, n > 0) for at, n in self.changes))
+        merged = list(_distinct((at, int(n > 0)) for at, n in self.changes))
         ends = [*(at for at, _ in merged[1:]), self.length_s]
         for index, ((at, room), end) in enumerate(zip(merged, ends, strict=True)):
-            yield room, end - at, index < len(merged) - 1
+            yield bool(room), end - at, index < len(merged) - 1
 
     def room_s(self) -> float:
         """Return for how long there was room, in seconds."""

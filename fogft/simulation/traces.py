@@ -84,7 +84,7 @@ def parse(value: Any, file: str) -> Timeline:
         raise FogftError(f"{file}: must be a JSON object", FORMAT)
     metadata = value.get("metadata")
     gap_s = metadata.get("gap_seconds") if isinstance(metadata, Mapping) else None
-    if not _is_number(gap_s) or gap_s <= 0:
+    if gap_s is None or not _is_number(gap_s) or gap_s <= 0:
         raise FogftError(f"{file}: metadata.gap_seconds: must be a number above 0", FORMAT)
     data = value.get("data")
     if not isinstance(data, list):
@@ -131,9 +131,7 @@ def _check_times(times: Any, samples: int, gap_s: float, file: str) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    return (
-        isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    )
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, Timeline]:

@@ -14,6 +14,7 @@ import itertools
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 from fogft.cloud.port import Launch
@@ -88,7 +89,7 @@ class World:
         self._order = itertools.count()
         for change in changes(market, TICK_S):
             if change.at_s <= length_s:
-                self.at(EPOCH + change.at_s, lambda change=change: self._change(change))
+                self.at(EPOCH + change.at_s, partial(self._change, change))
 
     # -- time -------------------------------------------------------------------------------
 
@@ -146,7 +147,7 @@ class World:
         for vm in self._chance.sample(here, excess):
             if EPOCH + change.ends_s > self.now:
                 vm.noticed, vm.machine = True, None
-            self.at(EPOCH + change.ends_s, lambda vm=vm: self._lose(vm))
+            self.at(EPOCH + change.ends_s, partial(self._lose, vm))
 
     def _spot_machines(self, location: str) -> list[Vm]:
         """Return who takes up room there: not those that are already to go."""

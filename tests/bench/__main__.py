@@ -23,7 +23,7 @@ Rows = list[dict[str, Any]]
 
 def measurements() -> dict[str, Callable[..., Rows]]:
     """Return what can be measured, by name, in the order of running."""
-    from tests.bench import commands, faults, planning, speed, tail
+    from tests.bench import commands, faults, planning, simulation, speed, tail
 
     found: dict[str, Callable[..., Rows]] = {
         "commands": commands.commands,
@@ -37,6 +37,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["memory"] = speed.memory
     found["hedging"] = tail.hedging
     found["cancellation"] = tail.cancellation
+    found["simulation"] = simulation.simulation
     return found
 
 

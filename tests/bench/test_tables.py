@@ -46,4 +46,5 @@ def test_there_is_a_measurement_for_each_promise():
         "memory",
         "hedging",
         "cancellation",
+        "simulation",
     ]

@@ -1,0 +1,139 @@
+"""What a pool would have been worth in a recorded or made-up spot market."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fogft.app.clouds import LOCAL, cloud_names, make_cloud
+
+if TYPE_CHECKING:
+    from fogft.core.model import Offer
+    from fogft.simulation.report import Report
+
+
+def simulate(
+    file: Path,
+    *,
+    traces: Path | None = None,
+    fit: bool = False,
+    model: str = "",
+    days: float = 7.0,
+    seeds: Sequence[int] = tuple(range(20)),
+    cloud: str | None = None,
+    told: Callable[[int], None] = lambda done: None,
+) -> Report:
+    """Run a pool file and fixed baselines side by side. Launches nothing.
+
+    Args:
+        file: The pool file.
+        traces: A folder of recorded traces; None to make markets up.
+        fit: Make markets up that are like the traces.
+        model: ``KEY=VALUE,...``, see `fogft.simulation.model`.
+        days: Measured by each seed.
+        seeds: One run of each policy a seed.
+        cloud: Whose prices; None for the one that the pool file names, else `local`.
+        told: Called with the number of runs done.
+
+    Raises:
+        FogftError: The file, the traces or the numbers are wrong.
+    """
+    from fogft.core.errors import FogftError
+    from fogft.pool import named_clouds, pool_file
+    from fogft.simulation import fitting, report
+    from fogft.simulation import model as models
+    from fogft.simulation import traces as recorded
+    from fogft.simulation.comparison import Scenario
+    from fogft.simulation.market import remembered, spot
+
+    source = pool_file.text(file)
+    spec = pool_file.parse(source, file=str(file), folder=file.parent)
+    chosen = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL
+    find = remembered(_pricing(make_cloud(chosen, file.resolve().parent).offers, source, file))
+    values = models.parse(model)
+    market, timing = models.MarketModel(), models.Timing()
+    lines: Mapping[str, Any] = {}
+    notes: list[str] = []
+    if traces is None:
+        if fit:
+            raise FogftError("`--fit` needs traces to fit to", "name their folder with `--traces`")
+        notes.append("the market is made up; `--traces DIR` replays a recorded one")
+    else:
+        resources = spec.task.get("resources") or {}
+        offered = [o.placement for o in find(spot(resources))]
+        everywhere = [*offered, *(o.placement for o in _everything(find))]
+        found = recorded.located(recorded.read(traces), everywhere)
+        usable = {p.location for p in offered}
+        lines = {place: line for place, line in found.items() if place in usable}
+        if len(lines) < len(found):
+            notes.append(f"{len(found) - len(lines)} traces are of locations outside this pool")
+        if len(lines) < len(usable):
+            notes.append(
+                f"no trace of {len(usable) - len(lines)} of the pool's {len(usable)} locations: "
+                "they sell no spot machines here"
+            )
+        if not lines:
+            raise FogftError(
+                "none of the traces is of a location that the pool may use",
+                "name the traces' regions under `resources.any_of`",
+            )
+        told_by_traces = sorted(set(values) & set(models.MARKET_KEYS))
+        if fit:
+            market = fitting.fit(lines)
+            lines = {}
+        elif told_by_traces:
+            raise FogftError(
+                f"--model: `{told_by_traces[0]}` is told by the traces",
+                "add `--fit` to change what was fitted to them",
+            )
+    market, timing = models.applied(market, timing, values)
+    scenario = Scenario(spec, find, timing, market, recorded=lines, days=days, seeds=tuple(seeds))
+    return report.simulate(scenario, notes=notes, told=told)
+
+
+def draw(report: Report, path: Path) -> None:
+    """Draw a report to a PNG, SVG or PDF file.
+
+    Raises:
+        FogftError: It cannot be drawn or written.
+    """
+    from fogft.simulation import plot
+
+    plot.draw(report, path)
+
+
+def check_plot(path: Path) -> None:
+    """Check that a plot can be drawn to a file.
+
+    Raises:
+        FogftError: It cannot.
+    """
+    from fogft.simulation import plot
+
+    plot.check(path)
+
+
+def _pricing(
+    find: Callable[[Mapping[str, Any]], Sequence[Offer]], source: str, file: Path
+) -> Callable[[Mapping[str, Any]], Sequence[Offer]]:
+    """Return the same, whose errors name the line of the pool file."""
+    from fogft.core.errors import SpecError
+    from fogft.pool.named_clouds import located
+
+    def ask(resources: Mapping[str, Any]) -> Sequence[Offer]:
+        try:
+            return find(resources)
+        except SpecError as error:
+            raise located(error, source, file) from None
+
+    return ask
+
+
+def _everything(find: Callable[[Mapping[str, Any]], Sequence[Offer]]) -> Sequence[Offer]:
+    from fogft.core.errors import FogftError
+
+    try:
+        return find({})
+    except FogftError:
+        return ()

@@ -1,0 +1,149 @@
+"""``fogft simulate``: what a pool would be worth, beside fixed policies, before it is started."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fogft.cli import output
+from fogft.cli.sections import Command
+from fogft.cli.table import Cell, columns
+
+if TYPE_CHECKING:
+    from fogft.simulation.comparison import Row
+    from fogft.simulation.report import Report
+
+
+def register(app: typer.Typer) -> None:
+    """Add this command to the application."""
+    app.command("simulate", cls=Command)(simulate)
+
+
+def simulate(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The pool file.")],
+    *,
+    traces: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Replay the spot traces recorded in this folder."),
+    ] = None,
+    fit: Annotated[
+        bool, typer.Option("--fit", help="Make up markets that are like the traces.")
+    ] = False,
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="KEY=VALUE,...",
+            help="Make up markets: mttf_s, mttr_s, correlation, boot_s, notice_s and more.",
+        ),
+    ] = "",
+    days: Annotated[
+        float, typer.Option(min=0.01, max=3650, metavar="N", help="Days measured by each seed.")
+    ] = 7.0,
+    seeds: Annotated[
+        int, typer.Option(min=1, max=10_000, metavar="N", help="How many markets.")
+    ] = 20,
+    first_seed: Annotated[
+        int, typer.Option("--first-seed", min=0, metavar="N", help="Of the first market.")
+    ] = 0,
+    cloud: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Whose prices; else the pool file's cloud.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw a PNG, SVG or PDF file as well.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead.")] = False,
+) -> None:
+    """Run a pool in spot markets under simulated time, beside fixed policies.
+
+    The planner is the real one. Launches nothing; the same seeds give the same figures.
+
+    \b
+    Examples:
+      fogft simulate pool.yaml --model mttf_s=54000,correlation=0.3
+      fogft simulate pool.yaml --traces recorded/ --plot report.png
+    """
+    from fogft import app
+
+    if plot is not None:
+        app.check_plot(plot)
+    report = app.simulate(
+        file,
+        traces=traces,
+        fit=fit,
+        model=model,
+        days=days,
+        seeds=range(first_seed, first_seed + seeds),
+        cloud=cloud,
+    )
+    if as_json:
+        output.json_data(report.to_json())
+    else:
+        output.data("\n".join(text(report, colour=output.coloured(sys.stdout))))
+    for note in report.notes:
+        output.say(f"note: {note}")
+    if plot is not None:
+        app.draw(report, plot)
+        output.done(f"`{plot}` is drawn")
+
+
+HEADER = (
+    *("POLICY", "AVAILABLE", "95 %", "UNDER TARGET", "$/HOUR", "$/MONTH"),
+    *("LAUNCHES/DAY", "LOST/DAY", "LONGEST OUTAGE"),
+)
+
+
+def text(report: Report, *, colour: bool) -> list[str]:
+    """Return the table, with what independent replicas would reach below it."""
+    rows = [_cells(row) for row in report.rows]
+    lines = columns(HEADER, rows, right=HEADER[1:], colour=colour)
+    scenario = report.scenario
+    kind = "recorded" if scenario.recorded else "made up"
+    lines += [
+        "",
+        f"{scenario.spec.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
+        f"{scenario.days:.4g} days.",
+    ]
+    if report.expected is not None:
+        moving, staying = (percent(report.expected[k]) for k in ("moving", "staying"))
+        lines.append(
+            f"If replicas failed independently: {moving} with replacement elsewhere, "
+            f"{staying} where they stay."
+        )
+    return lines
+
+
+def _cells(row: Row) -> list[Cell]:
+    up, cost = row.estimate("available"), row.estimate("usd_per_hour")
+    return [
+        Cell(row.name, "bold" if row.name == "fogft" else ""),
+        Cell(percent(up.mean)),
+        Cell(f"{percent(up.low)}-{percent(up.high)}", "dim"),
+        Cell(percent(row.estimate("under_target").mean)),
+        Cell(f"{cost.mean:.4f}"),
+        Cell(f"{cost.mean * 730:.0f}"),
+        Cell(f"{row.estimate('launches_per_day').mean:.1f}"),
+        Cell(f"{row.estimate('preemptions_per_day').mean:.1f}"),
+        Cell(duration(row.longest_outage_s)),
+    ]
+
+
+def percent(share: float) -> str:
+    """Return a share in percent, never rounded up to all."""
+    for digits in (2, 3, 4, 5):
+        shown = f"{100 * share:.{digits}f}"
+        if share >= 1 or float(shown) < 100:
+            return f"{shown} %"
+    return "99.99999 %"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in its largest fitting unit."""
+    if seconds == 0:
+        return "none"
+    for unit, size in (("d", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"

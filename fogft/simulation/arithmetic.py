@@ -1,0 +1,40 @@
+"""What arithmetic alone says of the same market, to set beside what was simulated.
+
+Owns: uptime and recovery of one replica in a modelled market. Their combination is
+`fogft.core.reliability`'s, for replicas that fail independently.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fogft.core.reliability import system_unavailability, unavailability
+from fogft.simulation.model import MarketModel, Timing
+
+
+def moving(model: MarketModel, timing: Timing) -> float:
+    """Return the unavailability of a replica that is at once launched elsewhere when lost.
+
+    It is away from its loss until its successor answers, the notice subtracted. That some
+    location always has room is assumed.
+    """
+    recovery_s = timing.boot_s + timing.detect_s - timing.notice_s
+    return unavailability(model.mttf_s, max(recovery_s, 0.0))
+
+
+def staying(model: MarketModel, timing: Timing) -> float:
+    """Return the unavailability of a replica that waits for room where it was.
+
+    Of each time with room, exponential with mean `mttf_s`, the boot is lost.
+    """
+    return 1 - model.availability * math.exp(-timing.boot_s / model.mttf_s)
+
+
+def independent(one: float, replicas: int) -> float:
+    """Return how available so many replicas are if they fail independently."""
+    return 1 - system_unavailability([one] * replicas)
+
+
+def correlated_pair(one: float, correlation: float) -> float:
+    """Return how available two replicas are whose states have a correlation."""
+    return 1 - (one * one + correlation * one * (1 - one))

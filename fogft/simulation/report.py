@@ -1,0 +1,105 @@
+"""A simulation's result as people and programs read it.
+
+Owns: what belongs into it, and its JSON.
+Not here: running it (`comparison`) and drawing it (`plot`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from fogft.core.errors import FogftError
+from fogft.simulation import arithmetic
+from fogft.simulation.comparison import Row, Scenario, compare
+from fogft.simulation.fitting import fit
+from fogft.simulation.meter import DAY_S
+
+MAX_POOL_DAYS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Report:
+    """Policies side by side.
+
+    Attributes:
+        expected: What independent arithmetic says of as many replicas that move, and that
+            stay; None where the traces cannot be fitted.
+        notes: What a reader should know, in sentences.
+    """
+
+    scenario: Scenario
+    rows: tuple[Row, ...]
+    expected: Mapping[str, float] | None
+    notes: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything, seed by seed."""
+        scenario = self.scenario
+        return {
+            "pool": scenario.spec.name,
+            "replicas": scenario.spec.replicas,
+            "market": "recorded" if scenario.recorded else "modelled",
+            "locations": len(scenario.recorded) or None,
+            "model": None if scenario.recorded else asdict(scenario.model),
+            "timing": asdict(scenario.timing),
+            "days": scenario.days,
+            "seeds": list(scenario.seeds),
+            "policies": [row.to_json() for row in self.rows],
+            "independent": dict(self.expected) if self.expected else None,
+            "notes": list(self.notes),
+        }
+
+
+def simulate(
+    scenario: Scenario,
+    *,
+    notes: Sequence[str] = (),
+    told: Callable[[int], None] = lambda done: None,
+) -> Report:
+    """Run a scenario.
+
+    Raises:
+        FogftError: It is too long or too short, or longer than what was recorded.
+    """
+    scenario, more = _fitting(scenario)
+    rows = compare(scenario, told)
+    return Report(scenario, tuple(rows), _expected(scenario), (*notes, *more))
+
+
+def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
+    if len(scenario.seeds) * scenario.days > MAX_POOL_DAYS:
+        raise FogftError(
+            f"{len(scenario.seeds)} seeds of {scenario.days:g} days are more than "
+            f"{MAX_POOL_DAYS} pool-days",
+            "ask for fewer `--seeds` or `--days`",
+        )
+    if not scenario.recorded:
+        return scenario, []
+    lengths = {place: line.length_s for place, line in scenario.recorded.items()}
+    shortest = min(lengths, key=lambda place: lengths[place])
+    most = (lengths[shortest] - (scenario.length_s - scenario.days * DAY_S)) / DAY_S
+    if most <= 0:
+        raise FogftError(
+            f"the trace of `{shortest}` is {lengths[shortest]:.0f} s long: too short to simulate",
+            "a trace must cover more than an hour",
+        )
+    if scenario.days > most:
+        scenario = replace(scenario, days=most)
+        return scenario, [f"the traces cover {most:.1f} days after the first hour: all are used"]
+    return scenario, []
+
+
+def _expected(scenario: Scenario) -> dict[str, float] | None:
+    model, timing = scenario.model, scenario.timing
+    if scenario.recorded:
+        try:
+            model = fit(scenario.recorded)
+        except FogftError:
+            return None
+    wanted = scenario.spec.replicas
+    return {
+        "moving": arithmetic.independent(arithmetic.moving(model, timing), wanted),
+        "staying": arithmetic.independent(arithmetic.staying(model, timing), wanted),
+    }
