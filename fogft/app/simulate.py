@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 from fogft.app.clouds import LOCAL, cloud_names, make_cloud
 
 if TYPE_CHECKING:
-    from fogft.core.model import Offer
+    from fogft.core.model import Offer, Placement
+    from fogft.core.spec import PoolSpec
+    from fogft.simulation.market import FindOffers
     from fogft.simulation.report import Report
 
 
@@ -44,8 +47,8 @@ def simulate(
     from fogft.simulation import fitting, report
     from fogft.simulation import model as models
     from fogft.simulation import traces as recorded
-    from fogft.simulation.comparison import Scenario
-    from fogft.simulation.market import remembered, spot
+    from fogft.simulation.comparison import Scenario, spot_locations
+    from fogft.simulation.market import remembered
 
     source = pool_file.text(file)
     spec = pool_file.parse(source, file=str(file), folder=file.parent)
@@ -60,11 +63,9 @@ def simulate(
             raise FogftError("`--fit` needs traces to fit to", "name their folder with `--traces`")
         notes.append("the market is made up; `--traces DIR` replays a recorded one")
     else:
-        resources = spec.task.get("resources") or {}
-        offered = [o.placement for o in find(spot(resources))]
-        everywhere = [*offered, *(o.placement for o in _everything(find))]
-        found = recorded.located(recorded.read(traces), everywhere)
-        usable = {p.location for p in offered}
+        usable = set(spot_locations(spec, find))
+        everywhere = {p.location: p for p in _everything(spec, find)}
+        found = recorded.located(recorded.read(traces), list(everywhere.values()))
         lines = {place: line for place, line in found.items() if place in usable}
         if len(lines) < len(found):
             notes.append(f"{len(found) - len(lines)} traces are of locations outside this pool")
@@ -114,9 +115,7 @@ def check_plot(path: Path) -> None:
     plot.check(path)
 
 
-def _pricing(
-    find: Callable[[Mapping[str, Any]], Sequence[Offer]], source: str, file: Path
-) -> Callable[[Mapping[str, Any]], Sequence[Offer]]:
+def _pricing(find: FindOffers, source: str, file: Path) -> FindOffers:
     """Return the same, whose errors name the line of the pool file."""
     from fogft.core.errors import SpecError
     from fogft.pool.named_clouds import located
@@ -130,10 +129,12 @@ def _pricing(
     return ask
 
 
-def _everything(find: Callable[[Mapping[str, Any]], Sequence[Offer]]) -> Sequence[Offer]:
+def _everything(spec: PoolSpec, find: FindOffers) -> list[Placement]:
+    """Return what can be bought anywhere; at least what the pool may use."""
     from fogft.core.errors import FogftError
+    from fogft.core.groups import groups_of, with_spot
 
-    try:
-        return find({})
-    except FogftError:
-        return ()
+    sold = [o for group in groups_of(spec) for o in find(with_spot(group.resources, True))]
+    with contextlib.suppress(FogftError):  # not every cloud lists all that it has
+        sold += find({"use_spot": True})
+    return [offer.placement for offer in sold]

@@ -61,8 +61,7 @@ def simulate(
     The planner is the real one. Launches nothing; the same seeds give the same figures.
 
     \b
-    Examples:
-      fogft simulate pool.yaml --model mttf_s=54000,correlation=0.3
+    Example:
       fogft simulate pool.yaml --traces recorded/ --plot report.png
     """
     from fogft import app
@@ -103,7 +102,7 @@ def text(report: Report, *, colour: bool) -> list[str]:
     kind = "recorded" if scenario.recorded else "made up"
     lines += [
         "",
-        f"{scenario.spec.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
+        f"{report.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
         f"{scenario.days:.4g} days.",
     ]
     if report.expected is not None:

@@ -58,6 +58,13 @@ class Group:
 
 def groups_of(spec: PoolSpec) -> tuple[Group, ...]:
     """Return a pool's groups, in the order of their slots; `CRITICAL` is not among them."""
+    if "groups" not in spec.derived:
+        spec.derived["groups"] = _groups_of(spec)
+    groups: tuple[Group, ...] = spec.derived["groups"]
+    return groups
+
+
+def _groups_of(spec: PoolSpec) -> tuple[Group, ...]:
     if not spec.groups:
         resources = spec.task.get("resources") or {}
         kind = Group("", "", 0, spec.replicas, resources, spec.on_demand, spec.services)
@@ -95,8 +102,12 @@ def critical_group(spec: PoolSpec, wanted: int) -> Group:
 
 def group_at(spec: PoolSpec, slot: int) -> Group:
     """Return the group that a slot belongs to; the last one for a slot of no group now."""
-    found = [*groups_of(spec), critical_group(spec, 0)]
-    return next((group for group in found if group.owns(slot)), found[-2])
+    key = "group", slot // BLOCK
+    if key not in spec.derived:
+        found = [*groups_of(spec), critical_group(spec, 0)]
+        spec.derived[key] = next((group for group in found if group.owns(slot)), found[-2])
+    group: Group = spec.derived[key]
+    return group
 
 
 def services_at(spec: PoolSpec, slot: int) -> tuple[ServiceSpec, ...]:
@@ -106,7 +117,10 @@ def services_at(spec: PoolSpec, slot: int) -> tuple[ServiceSpec, ...]:
 
 def replica_hash(spec: PoolSpec, slot: int) -> str:
     """Return the hash that a replica in this slot should have; see `PoolSpec.replica_hash`."""
-    return spec.hash_with(services_at(spec, slot))
+    key = "hash", slot // BLOCK
+    if key not in spec.derived:
+        spec.derived[key] = spec.hash_with(services_at(spec, slot))
+    return str(spec.derived[key])
 
 
 def task_at(spec: PoolSpec, slot: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ Not here: the file they are stored in (`fogft.pool.store`) and what to make of f
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -166,13 +167,14 @@ class History:
             if kind is EventKind.REFUSED or (kind is EventKind.GONE and died_young(record, event)):
                 self._fail(record, event)
             if kind is EventKind.GONE:
-                self._losses.setdefault(record.location, []).append(event.at)
+                insort(self._losses.setdefault(record.location, []), event.at)
             record.closed = kind
             record.closed_at = event.at
 
     def _fail(self, record: Record, event: Event) -> None:
         cause = event.detail.split(":")[0].split(" ")[0] or "error"
-        self._failures.setdefault(record.location, []).append(Failure(event.at, cause))
+        failures = self._failures.setdefault(record.location, [])
+        insort(failures, Failure(event.at, cause), key=lambda failure: failure.at)
 
     def record(self, slot: int, generation: int) -> Record | None:
         """Return what is known of a launch."""

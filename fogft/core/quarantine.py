@@ -21,7 +21,8 @@ that jumped back leaves behind, count for nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fogft.core.history import Failure, History
@@ -58,16 +59,30 @@ def resting(history: History, now: float) -> Mapping[str, Backoff]:
     out: dict[str, Backoff] = {}
     setup_failures: list[Failure] = []
     for location, failures in history.failures.items():
-        setup_failures += [f for f in failures if f.cause == "setup"]
+        lately = _lately(failures, now)
+        if not lately:
+            continue
+        setup_failures += [f for f in lately if f.cause == "setup"]
         proven_at = history.proven_at(location)
-        rest = backoff([f for f in failures if f.cause != "setup" and f.at > proven_at], now)
+        rest = backoff([f for f in lately if f.cause != "setup" and f.at > proven_at], now)
         if rest is not None:
             out[location] = rest
-    proven_at = max((history.proven_at(place) for place in history.failures), default=0.0)
-    everywhere = backoff([f for f in setup_failures if f.at > proven_at], now)
-    if everywhere is not None:
-        out[EVERYWHERE] = everywhere
+    if setup_failures:
+        proven_at = max(history.proven_at(place) for place in history.failures)
+        everywhere = backoff([f for f in setup_failures if f.at > proven_at], now)
+        if everywhere is not None:
+            out[EVERYWHERE] = everywhere
     return out
+
+
+def _lately(failures: Sequence[Failure], now: float) -> Sequence[Failure]:
+    """Return those that still count, of failures in order of time."""
+    first = bisect_right(failures, now - FORGIVE_S, key=_at)
+    return failures[first : bisect_right(failures, now, lo=first, key=_at)]
+
+
+def _at(failure: Failure) -> float:
+    return failure.at
 
 
 def backoff(failures: list[Failure], now: float) -> Backoff | None:
@@ -88,22 +103,26 @@ def avoided(history: History, now: float) -> Mapping[str, float]:
     """Return the locations to use only when no other is left, and until when."""
     out: dict[str, float] = {}
     for location, losses in history.losses.items():
-        recent = [at for at in losses if 0 <= now - at < AVOID_MEMORY_S]
+        first = bisect_right(losses, now - AVOID_MEMORY_S)
+        recent = losses[first : bisect_right(losses, now, lo=first)]
         if recent:
-            until = max(recent) + min(AVOID_S * 2.0 ** min(len(recent) - 1, 16), AVOID_LIMIT_S)
+            until = recent[-1] + min(AVOID_S * 2.0 ** min(len(recent) - 1, 16), AVOID_LIMIT_S)
             if now < until:
                 out[location] = until
     return out
 
 
 def next_change(history: History, now: float) -> float:
-    """Return when, should nothing happen until then, `resting` can next say something else.
+    """Return when, if nothing happens, a location may no longer be at rest or avoided.
 
-    Infinity for never. A rest ends, or an older failure is forgiven and it gets shorter.
+    Infinity for never. An older failure that is forgiven meanwhile may end a rest early.
     """
-    rests = resting(history, now)
-    times = [rest.until for rest in rests.values()]
-    for location, failures in history.failures.items():
-        if location in rests or EVERYWHERE in rests:
-            times += [f.at + FORGIVE_S for f in failures]
+    times: list[float] = []
+    for location, rest in resting(history, now).items():
+        places = list(history.failures) if location == EVERYWHERE else [location]
+        forgiven = (f.at + FORGIVE_S for p in places for f in _lately(history.failures[p], now))
+        times += [rest.until, *(at for at in forgiven if at < rest.until)]
+    for location, until in avoided(history, now).items():
+        forgotten = (at + AVOID_MEMORY_S for at in history.losses[location])
+        times += [until, *(at for at in forgotten if at < until)]
     return min((at for at in times if at > now), default=float("inf"))

@@ -98,3 +98,16 @@ def _holds(window: WindowSpec, today: int, second: int) -> bool:
     return (today in window.days and second >= window.begins_s) or (
         yesterday in window.days and second < window.ends_s
     )
+
+
+def next_change(schedule: ScheduleSpec, now: float) -> float:
+    """Return when `wish` can next say something else: a window begins, nears or ends.
+
+    Where the clock on the wall is changed before that, it may come early; never late.
+    """
+    local = datetime.datetime.fromtimestamp(now, zone(schedule.time_zone))
+    second = local.hour * 3600 + local.minute * 60 + local.second + local.microsecond / 1e6
+    times = {float(t) for w in schedule.windows for t in (w.begins_s, w.ends_s)}
+    times |= {w.begins_s - schedule.prelaunch_s for w in schedule.windows}
+    shifted = {t + shift for t in times for shift in (-3600.0, 0.0, 3600.0)}
+    return now + min((t - second) % DAY_S or DAY_S for t in shifted)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 from fogft.core.spec_choices import (
@@ -129,6 +130,11 @@ class PoolSpec:
     rendezvous: tuple[str, ...] = ()
     dial_in: str = ""
     task: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def derived(self) -> dict[Any, Any]:
+        """Where `groups` keeps what it worked out of this spec, which never changes."""
+        return {}
 
     @property
     def replica_hash(self) -> str:

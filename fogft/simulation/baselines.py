@@ -15,7 +15,7 @@ from functools import partial
 from fogft.cloud.port import Launch
 from fogft.core.errors import NoCapacity
 from fogft.core.model import Offer, ReplicaId
-from fogft.simulation.world import NEVER, World
+from fogft.simulation.world import NEVER, Target, World
 
 UID = "0" * 16
 RETRY_S = 60.0
@@ -70,15 +70,11 @@ class Fleet:
 class Static:
     """One machine for each offer given, ordered again there whenever it is lost or refused."""
 
-    def __init__(self, world: World, offers: Sequence[Offer], wanted: int) -> None:
+    def __init__(self, world: World, offers: Sequence[Offer], wanted: Target) -> None:
         self._fleet = Fleet(world)
         self._offers = offers
-        self._wanted = wanted
+        self.wanted = wanted
         self._due = dict.fromkeys(range(len(offers)), world.now)
-
-    def wanted(self, now: float) -> int:
-        """Return how many the pool file wants, even if there is an offer for fewer."""
-        return self._wanted
 
     def tick(self, now: float) -> float:
         """Order what is missing."""
@@ -103,20 +99,22 @@ class SkyServe:
     """
 
     def __init__(
-        self, world: World, spot: Sequence[Offer], on_demand: Offer | None, wanted: int
+        self,
+        world: World,
+        spot: Sequence[Offer],
+        on_demand: Offer | None,
+        replicas: int,
+        wanted: Target,
     ) -> None:
+        self.wanted = wanted
         self._fleet = Fleet(world)
         self._spot = spot
         self._on_demand = on_demand
-        self._wanted = wanted
+        self._replicas = replicas
         self._preempted: set[str] = set()
         self._seen_ready: set[ReplicaId] = set()
         self._refused_in_a_row = 0
         self._spot_from = world.now
-
-    def wanted(self, now: float) -> int:
-        """Return how many spot replicas it wants."""
-        return self._wanted
 
     def tick(self, now: float) -> float:
         """Order and end what the policy says."""
@@ -129,10 +127,10 @@ class SkyServe:
                 self._seen_ready.add(id)
                 self._preempted.discard(fleet.ordered[id].placement.location)
         if self._spot and now >= self._spot_from:
-            for slot in range(len(spot), self._wanted):
+            for slot in range(len(spot), self._replicas):
                 offer = self._place()
                 fleet.order(slot, offer, partial(self._refused, offer))
-        self._fall_back(self._wanted - sum(map(fleet.ready, spot)))
+        self._fall_back(self._replicas - sum(map(fleet.ready, spot)))
         return self._spot_from if self._spot_from > now else NEVER
 
     def _fall_back(self, wanted: int) -> None:

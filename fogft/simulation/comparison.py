@@ -10,21 +10,25 @@ import logging
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
-from fogft.core.errors import FogftError
-from fogft.core.model import Offer, Placement
+from fogft.core.groups import groups_of, with_spot
+from fogft.core.intent import Intent
+from fogft.core.model import Observed, Offer, Placement
 from fogft.core.placement import choose
+from fogft.core.sizing import size
 from fogft.core.spec import PoolSpec
+from fogft.pool.offers import ask
 from fogft.simulation.baselines import SkyServe, Static
 from fogft.simulation.generator import generate
 from fogft.simulation.managed import Managed
-from fogft.simulation.market import FindOffers, Market, on_demand, spot
+from fogft.simulation.market import FindOffers, Market
 from fogft.simulation.meter import DAY_S, HOURS_A_MONTH, Outcome
 from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.timeline import Timeline
-from fogft.simulation.world import Policy, World
+from fogft.simulation.world import EPOCH, Policy, Target, World
 
 SETTLE_S = 3600.0
 FIGURES = (
@@ -60,11 +64,6 @@ class Scenario:
     seeds: Sequence[int] = tuple(range(20))
 
     @property
-    def resources(self) -> Mapping[str, Any]:
-        """What the pool file says of its machines."""
-        return self.spec.task.get("resources") or {}
-
-    @property
     def length_s(self) -> float:
         """How long each run takes, in simulated seconds."""
         return SETTLE_S + self.days * DAY_S
@@ -73,13 +72,20 @@ class Scenario:
         """Return the market of a seed: a stretch of what was recorded, or a made-up one."""
         chance = random.Random(f"market {seed}")
         if not self.recorded:
-            places = {o.placement.location for o in self.find(spot(self.resources))}
-            lines = generate(self.model, sorted(places), self.length_s, chance)
+            lines = generate(
+                self.model, spot_locations(self.spec, self.find), self.length_s, chance
+            )
             return Market(self.find, lines, self.timing)
         known_s = min(line.length_s for line in self.recorded.values())
         begin_s = chance.uniform(0, known_s - self.length_s) if known_s > self.length_s else 0.0
         lines = {p: t.window(begin_s, self.length_s) for p, t in self.recorded.items()}
         return Market(self.find, lines, self.timing)
+
+
+def spot_locations(spec: PoolSpec, find: FindOffers) -> list[str]:
+    """Return where spot machines are sold that a pool may use, sorted."""
+    sold = (o for group in groups_of(spec) for o in find(with_spot(group.resources, True)))
+    return sorted({o.placement.location for o in sold if o.placement.spot})
 
 
 @dataclass(frozen=True)
@@ -150,32 +156,53 @@ Factory = Callable[[World], Policy]
 def policies(scenario: Scenario) -> dict[str, Factory]:
     """Return how to make each policy, by name; fogft first.
 
-    Raises:
-        FogftError: The pool can buy nothing here.
+    The fixed ones have the machines of the pool's largest group, as many as the pool has.
     """
     spec, market = scenario.spec, scenario.market(scenario.seeds[0])
-    wanted = spec.replicas
-    spots = [o for o in market.offers(spot(scenario.resources)) if o.placement.spot]
+    world = World(market, seed=0, length_s=0.0)
+    target = target_of(spec, ask(world, spec))
+    replicas = replicas_of(spec, ask(world, spec))
+    kind = max(groups_of(spec), key=lambda group: group.replicas).resources
+    spots = [o for o in market.offers(with_spot(kind, True)) if o.placement.spot]
     reserved = sorted(
-        (o for o in market.offers(on_demand(scenario.resources)) if not o.placement.spot),
+        (o for o in market.offers(with_spot(kind, False)) if not o.placement.spot),
         key=lambda o: (o.usd_per_hour, o.placement),
     )
-    if not market.offers(scenario.resources):
-        raise FogftError(
-            "no location that the pool may use has a trace",
-            "name its regions under `resources.any_of`, or leave out `--traces`",
-        )
-    found: dict[str, Factory] = {"fogft": lambda world: Managed(world, spec)}
+    found: dict[str, Factory] = {"fogft": lambda world: Managed(world, spec, target)}
     if reserved:
-        found["one on-demand"] = lambda world: Static(world, reserved[:1], wanted)
+        found["one on-demand"] = lambda world: Static(world, reserved[:1], target)
     if spots:
-        places = static_places(spots, wanted)
-        found[f"static, any of {len(places)}"] = lambda world: Static(world, places, wanted)
-        found["SkyServe, spot only"] = lambda world: SkyServe(world, spots, None, wanted)
+        places = static_places(spots, replicas)
+        found[f"static, any of {len(places)}"] = lambda world: Static(world, places, target)
+        skyserve = partial(SkyServe, spot=spots, replicas=replicas, wanted=target)
+        found["SkyServe, spot only"] = partial(skyserve, on_demand=None)
         if reserved:
-            dear = reserved[0]
-            found["SkyServe, fallback"] = lambda world: SkyServe(world, spots, dear, wanted)
+            found["SkyServe, fallback"] = partial(skyserve, on_demand=reserved[0])
     return found
+
+
+def replicas_of(spec: PoolSpec, offers: Sequence[Offer]) -> int:
+    """Return how many replicas the planner wants outside of the schedule's windows."""
+    bare = replace(spec, schedule=None)
+    return size(bare, Intent(), Observed(EPOCH, (), None, tuple(offers))).total
+
+
+def target_of(spec: PoolSpec, offers: Sequence[Offer]) -> Target:
+    """Return how many replicas a pool file wants at a time, nothing launched ahead."""
+    if spec.schedule is None:
+        replicas = replicas_of(spec, offers)
+        return lambda now: replicas
+    punctual = replace(spec, schedule=replace(spec.schedule, prelaunch_s=0.0))
+    known: dict[int, int] = {}
+
+    def target(now: float) -> int:
+        minute = int(now // 60)
+        if minute not in known:
+            seen = Observed(now, (), None, tuple(offers))
+            known[minute] = size(punctual, Intent(), seen).total
+        return known[minute]
+
+    return target
 
 
 def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from fogft.core import migration, quarantine, schedule
 from fogft.core.history import Event, History, compacted
 from fogft.core.intent import Intent
 from fogft.core.model import LinkReport, LinkState, Membership
-from fogft.core.quarantine import next_change
 from fogft.core.spec import PoolSpec
 from fogft.pool.reconciler import Reconciler, Tick
 from fogft.pool.store import Identity
-from fogft.simulation.world import NEVER, TICK_S, World
+from fogft.simulation.world import NEVER, TICK_S, Target, World
 
 UID = "0" * 16
 LOOK_EVERY_S = 900.0  # a safety net: tests show that the results do not depend on it
@@ -78,39 +78,40 @@ _NO_WISHES = Intent()
 class Managed:
     """A pool under its manager. Implements `world.Policy`."""
 
-    def __init__(self, world: World, spec: PoolSpec) -> None:
+    def __init__(self, world: World, spec: PoolSpec, target: Target) -> None:
         self.world = world
+        self.wanted = target
         self.store = Memory(replace(spec, max_hours=None), world.now)  # a run is as long as asked
         self._ready = frozenset(service.name for service in spec.services)
-        self._wanted = 0
         self._reconciler = Reconciler(
             world, self.store, clock=lambda: world.now, links=self._links, submit=world.submit
         )
 
-    def wanted(self, now: float) -> int:
-        """Return how many replicas the planner wants."""
-        return self._wanted
-
     def tick(self, now: float) -> float:
         """Let the manager work once."""
         self.store.compact(now)
-        before = len(self.store.events), self.store.published
+        before = self.store.published
         tick = self._reconciler.tick()
-        self._wanted = tick.plan.wanted
         done = tick.plan.terminations or tick.plan.draining
-        if done or (len(self.store.events), self.store.published) != before:
+        if done or self.store.published is not before:  # its next look sees other links
             return now + TICK_S
         return min(now + LOOK_EVERY_S, self._next_timer(tick))
 
     def _next_timer(self, tick: Tick) -> float:
         history, now = self.store.history(), tick.observed.now
         health = tick.spec.health
-        times = [next_change(history, now) if tick.plan.notes else NEVER]
+        times = [quarantine.next_change(history, now)]
+        if tick.spec.schedule is not None:
+            times.append(schedule.next_change(tick.spec.schedule, now))
         for record in history.open():
             if record.draining_since is not None:
                 return now + TICK_S
             if record.first_ready_at is None:
                 times.append(record.launched_at + health.start_limit_s + TICK_S)
+                continue
+            stays = [migration.RETURN_AFTER_S]
+            stays += [tick.spec.migration.stay_s] if tick.spec.migration else []
+            times += [record.first_ready_at + stay_s for stay_s in stays]
         for vm in self.world.vms.values():
             if vm.gone_at <= now:
                 times += [

@@ -94,21 +94,3 @@ def changes(market: Market, tick_s: float) -> Iterator[Change]:
 def rounded_up(seconds: float, tick_s: float) -> float:
     """Return the next whole number of ticks."""
     return math.ceil(seconds / tick_s) * tick_s if math.isfinite(seconds) else seconds
-
-
-def on_demand(resources: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the same resources bought on demand."""
-    out = {**resources, "use_spot": False}
-    for key in ("any_of", "ordered"):
-        if isinstance(out.get(key), list):
-            out[key] = [{**entry, "use_spot": False} for entry in out[key]]
-    return out
-
-
-def spot(resources: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the same resources bought on the spot market."""
-    out = {**resources, "use_spot": True}
-    for key in ("any_of", "ordered"):
-        if isinstance(out.get(key), list):
-            out[key] = [{**entry, "use_spot": True} for entry in out[key]]
-    return out

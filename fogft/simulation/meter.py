@@ -17,8 +17,8 @@ class Outcome:
     """One policy in one market, measured over `seconds`.
 
     Attributes:
-        available: Fraction of time that at least one replica served.
-        under_target: Fraction of time that fewer served than the pool file wants.
+        available: Fraction of the time in which any replica is wanted that one served.
+        under_target: Fraction of that time that fewer served than the pool file wants.
         launches: Machines that a cloud agreed to.
         refusals: Orders that it refused.
         preemptions: Machines that were taken away or failed.
@@ -48,6 +48,7 @@ class Meter:
     begin_s: float
     keep_curve: bool = False
     seconds: float = 0.0
+    wanted_s: float = 0.0
     up_s: float = 0.0
     under_s: float = 0.0
     ready_s: float = 0.0
@@ -70,9 +71,11 @@ class Meter:
         self.seconds += seconds
         self.ready_s += seconds * ready
         self.usd += seconds / 3600.0 * usd_per_hour
-        self.under_s += seconds if ready < wanted else 0.0
-        if ready:
-            self.up_s += seconds
+        if wanted:
+            self.wanted_s += seconds
+            self.under_s += seconds if ready < wanted else 0.0
+            self.up_s += seconds if ready else 0.0
+        if ready or not wanted:
             self._down_s = 0.0
         else:
             self.outages += self._down_s == 0.0
@@ -89,8 +92,8 @@ class Meter:
         """Return the figures so far."""
         return Outcome(
             seconds=self.seconds,
-            available=self.up_s / self.seconds,
-            under_target=self.under_s / self.seconds,
+            available=self.up_s / self.wanted_s if self.wanted_s else 1.0,
+            under_target=self.under_s / self.wanted_s if self.wanted_s else 0.0,
             mean_ready=self.ready_s / self.seconds,
             usd_per_hour=self.usd / (self.seconds / 3600.0),
             launches=self.launches,

@@ -65,7 +65,7 @@ def draw(report: Report, path: Path) -> None:
         scenario = report.scenario
         market = "recorded traces" if scenario.recorded else "a modelled market"
         figure.suptitle(
-            f"{scenario.spec.name}: {scenario.spec.replicas} replicas, {market}, "
+            f"{scenario.spec.name}: {report.replicas} replicas, {market}, "
             f"{len(scenario.seeds)} seeds of {scenario.days:.4g} days"
         )
         metadata: dict[str, Any] = {".svg": {"Date": None}, ".png": {"Software": None}}
@@ -104,7 +104,7 @@ def _costs(axes: Any, rows: tuple[Row, ...]) -> None:
 
 def _curves(axes: Any, report: Report) -> None:
     shown = min(_SHOWN_DAYS, report.scenario.days)
-    wanted = report.scenario.spec.replicas
+    wanted = report.replicas
     top = max((ready for row in report.rows for _, ready in row.curve), default=1)
     for ax, row, colour in zip(axes, report.rows, _COLOURS * len(axes), strict=False):
         points = [(at / DAY_S, ready) for at, ready in row.curve] or [(0.0, 0)]

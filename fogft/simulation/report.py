@@ -11,10 +11,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from fogft.core.errors import FogftError
+from fogft.pool.offers import ask
 from fogft.simulation import arithmetic
-from fogft.simulation.comparison import Row, Scenario, compare
+from fogft.simulation.comparison import Row, Scenario, compare, replicas_of
 from fogft.simulation.fitting import fit
 from fogft.simulation.meter import DAY_S
+from fogft.simulation.world import World
 
 MAX_POOL_DAYS = 1_000_000
 
@@ -24,6 +26,7 @@ class Report:
     """Policies side by side.
 
     Attributes:
+        replicas: How many the planner wants outside of the schedule's windows.
         expected: What independent arithmetic says of as many replicas that move, and that
             stay; None where the traces cannot be fitted.
         notes: What a reader should know, in sentences.
@@ -31,6 +34,7 @@ class Report:
 
     scenario: Scenario
     rows: tuple[Row, ...]
+    replicas: int
     expected: Mapping[str, float] | None
     notes: tuple[str, ...] = ()
 
@@ -39,7 +43,7 @@ class Report:
         scenario = self.scenario
         return {
             "pool": scenario.spec.name,
-            "replicas": scenario.spec.replicas,
+            "replicas": self.replicas,
             "market": "recorded" if scenario.recorded else "modelled",
             "locations": len(scenario.recorded) or None,
             "model": None if scenario.recorded else asdict(scenario.model),
@@ -65,7 +69,10 @@ def simulate(
     """
     scenario, more = _fitting(scenario)
     rows = compare(scenario, told)
-    return Report(scenario, tuple(rows), _expected(scenario), (*notes, *more))
+    world = World(scenario.market(scenario.seeds[0]), seed=0, length_s=0.0)
+    replicas = replicas_of(scenario.spec, ask(world, scenario.spec))
+    expected = _expected(scenario, replicas)
+    return Report(scenario, tuple(rows), replicas, expected, (*notes, *more))
 
 
 def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
@@ -91,14 +98,13 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
     return scenario, []
 
 
-def _expected(scenario: Scenario) -> dict[str, float] | None:
+def _expected(scenario: Scenario, wanted: int) -> dict[str, float] | None:
     model, timing = scenario.model, scenario.timing
     if scenario.recorded:
         try:
             model = fit(scenario.recorded)
         except FogftError:
             return None
-    wanted = scenario.spec.replicas
     return {
         "moving": arithmetic.independent(arithmetic.moving(model, timing), wanted),
         "staying": arithmetic.independent(arithmetic.staying(model, timing), wanted),

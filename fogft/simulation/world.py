@@ -26,16 +26,25 @@ from fogft.simulation.meter import Meter
 EPOCH = 1_704_067_200.0  # a Monday, 00:00 UTC: simulated time is a time of day as well
 TICK_S = 1.0
 NEVER = float("inf")
+UNSEEN = object()
+
+Happening = Callable[[], object]
+
+
+Target = Callable[[float], int]
 
 
 class Policy(Protocol):
-    """Who decides what runs."""
+    """Who decides what runs.
+
+    Attributes:
+        wanted: How many replicas the pool file wants ready at a time.
+    """
+
+    wanted: Target
 
     def tick(self, now: float) -> float:
         """Act on the world as it is; return when to be asked again should nothing happen."""
-
-    def wanted(self, now: float) -> int:
-        """Return how many replicas the pool file wants ready."""
 
 
 @dataclass(eq=False)
@@ -85,7 +94,7 @@ class World:
         self._until = EPOCH + length_s
         self._chance = random.Random(f"machines {seed}")
         self._capacity: dict[str, int] = {}
-        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._queue: list[tuple[float, int, Happening]] = []
         self._order = itertools.count()
         for change in changes(market, TICK_S):
             if change.at_s <= length_s:
@@ -93,11 +102,14 @@ class World:
 
     # -- time -------------------------------------------------------------------------------
 
-    def at(self, time: float, happen: Callable[[], None]) -> None:
-        """Let something happen at a time, or now where that is over."""
+    def at(self, time: float, happen: Happening) -> None:
+        """Let something happen at a time, or now where that is over.
+
+        It returns `UNSEEN` if nobody in the pool can notice it.
+        """
         heapq.heappush(self._queue, (max(time, self.now), next(self._order), happen))
 
-    def after(self, seconds: float, happen: Callable[[], None]) -> None:
+    def after(self, seconds: float, happen: Happening) -> None:
         """Let something happen in a while, rounded up to whole ticks."""
         self.at(self.now + rounded_up(seconds, TICK_S), happen)
 
@@ -119,8 +131,11 @@ class World:
                 self._pass_until(self._until, policy)
                 return self.meter
             self._pass_until(moment, policy)
+            seen = every_tick or self.now >= wake
             while self._queue and self._queue[0][0] <= self.now:
-                heapq.heappop(self._queue)[2]()
+                seen |= heapq.heappop(self._queue)[2]() is not UNSEEN
+            if not seen:
+                continue
             self.asked += 1
             wake = max(rounded_up(policy.tick(self.now), TICK_S), self.now + TICK_S)
 
@@ -138,16 +153,17 @@ class World:
 
     # -- the market ---------------------------------------------------------------------------
 
-    def _change(self, change: Change) -> None:
+    def _change(self, change: Change) -> object:
         self._capacity[change.location] = change.capacity
         here = self._spot_machines(change.location)
         excess = len(here) - change.capacity
         if excess <= 0:
-            return
+            return UNSEEN
         for vm in self._chance.sample(here, excess):
             if EPOCH + change.ends_s > self.now:
                 vm.noticed, vm.machine = True, None
             self.at(EPOCH + change.ends_s, partial(self._lose, vm))
+        return None
 
     def _spot_machines(self, location: str) -> list[Vm]:
         """Return who takes up room there: not those that are already to go."""

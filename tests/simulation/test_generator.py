@@ -1,0 +1,99 @@
+"""Made-up markets have the means and correlations that were asked for, and can be fitted back."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from fogft.core.errors import FogftError
+from fogft.simulation import fitting, model
+from fogft.simulation.generator import generate
+from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.timeline import of_samples
+from tests.simulation.markets import INDEPENDENT
+
+LOCATIONS = [f"c{i}/r{j}/z{k}" for i in range(2) for j in range(2) for k in range(2)]
+YEARS = 3 * 365 * 86_400.0
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        INDEPENDENT,
+        MarketModel(),
+        MarketModel(mttf_s=54_000.0, mttr_s=7_200.0, correlation_region=0.22,
+                    correlation_cloud=0.22, correlation_world=0.1, together=0.0),
+        MarketModel(mttf_s=7_200.0, mttr_s=7_200.0, correlation_region=0.5,
+                    correlation_cloud=0.1, together=0.4, regime_s=86_400.0),
+    ],
+    ids=["independent", "default", "everywhere", "strong"],
+)  # fmt: skip
+def test_a_made_up_market_is_as_its_model_says(asked):
+    """Means within 5 %, correlations within 0.03, over three years of eight zones."""
+    found = fitting.fit(generate(asked, LOCATIONS, YEARS, random.Random(7)))
+    assert found.mttf_s == pytest.approx(asked.mttf_s, rel=0.05)
+    assert found.mttr_s == pytest.approx(asked.mttr_s, rel=0.05)
+    assert found.correlation_region == pytest.approx(asked.correlation_region, abs=0.03)
+    assert found.correlation_cloud == pytest.approx(asked.correlation_cloud, abs=0.03)
+    assert found.correlation_world == pytest.approx(asked.correlation_world, abs=0.03)
+    assert found.together == pytest.approx(asked.together, abs=0.03)
+
+
+def test_the_same_seed_makes_the_same_market():
+    one, two, other = (
+        generate(MarketModel(), LOCATIONS, 86_400.0, random.Random(seed)) for seed in (1, 1, 2)
+    )
+    assert one == two
+    assert one != other
+
+
+def test_correlation_of_what_is_known():
+    """Of equal series 1, of opposite ones -1, of a constant one none."""
+    waves = of_samples([1, 1, 0, 0, 1, 1, 0, 0], 60)
+    assert fitting.correlation(waves, waves) == pytest.approx(1.0)
+    assert fitting.correlation(waves, of_samples([0, 0, 1, 1] * 2, 60)) == pytest.approx(-1.0)
+    assert fitting.correlation(waves, of_samples([1] * 8, 60)) is None
+
+
+def test_traces_that_never_change_cannot_be_fitted():
+    with pytest.raises(FogftError, match="no location ever becomes full"):
+        fitting.fit({"c/r/z": of_samples([1, 1, 1], 60)})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mttf_s=0", "`mttf_s` must be above 0"),
+        ("mttf_s=-3", "`mttf_s` must be above 0"),
+        ("boot_s=soon", "`boot_s` must be a number, not `soon`"),
+        ("boot_s=inf", "finite"),
+        ("correlation=1", "`correlation` must be from 0 to 0.95"),
+        ("mttf=3", "unknown key `mttf`"),
+        ("notice_s", "`notice_s` has no value"),
+        ("boot_s=1,boot_s=2", "`boot_s` is given twice"),
+    ],
+)
+def test_a_wrong_model_is_told(text, message):
+    with pytest.raises(FogftError, match=message):
+        model.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("correlation_region=0.1,correlation_cloud=0.3", "cannot be more alike"),
+        ("correlation=0.95,regime_s=60", "no market has correlations as high"),
+    ],
+)
+def test_numbers_that_contradict_one_another_are_told(text, message):
+    with pytest.raises(FogftError, match=message):
+        model.applied(MarketModel(), Timing(), model.parse(text))
+
+
+def test_correlation_stands_for_region_and_cloud():
+    market, timing = model.applied(
+        MarketModel(), Timing(), model.parse("correlation=0.22, notice_s=30")
+    )
+    assert (market.correlation_region, market.correlation_cloud) == (0.22, 0.22)
+    assert timing.notice_s == 30

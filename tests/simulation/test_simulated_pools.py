@@ -1,0 +1,254 @@
+"""Simulated pools: time, money and laws of chance come out as arithmetic says they must."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from fogft.core.history import EventKind
+from fogft.core.spec_choices import OnDemandSpec, ScheduleSpec, WindowSpec
+from fogft.simulation import arithmetic
+from fogft.simulation.comparison import (
+    SETTLE_S,
+    Row,
+    compare,
+    estimate,
+    policies,
+    unlogged,
+)
+from fogft.simulation.market import Market
+from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.report import simulate
+from fogft.simulation.timeline import UNLIMITED, of_changes, of_samples
+from fogft.simulation.world import World
+from tests.simulation.markets import INDEPENDENT, scenario, spec
+
+HOUR_S = 3600.0
+EVERY_DAY = frozenset(range(7))
+
+
+def managed(world, wanted):
+    """Return fogft's policy in a world."""
+    return policies(wanted)["fogft"](world)
+
+
+def run(wanted, policy="fogft", seed=0, **options):
+    """Run one policy in one market; return the policy and its meter."""
+    world = World(wanted.market(seed), seed=seed, length_s=wanted.length_s, settle_s=SETTLE_S)
+    chosen = policies(wanted)[policy](world)
+    with unlogged():
+        meter = world.run(chosen, **options)
+    return chosen, meter
+
+
+def always(wanted):
+    """The same scenario, with room everywhere at all times."""
+    length_s = wanted.length_s
+    places = wanted.market(0).timelines
+    return replace(wanted, recorded={p: of_samples([UNLIMITED], length_s) for p in places})
+
+
+# -- a quiet market ---------------------------------------------------------------------------
+
+
+def test_a_pool_that_nothing_happens_to_costs_its_machines_and_is_always_up():
+    policy, meter = run(always(scenario(spec(2))))
+    outcome = meter.outcome()
+    launches = [e for e in policy.store.events if e.kind is EventKind.LAUNCH]
+    assert (outcome.available, outcome.under_target, outcome.outages) == (1.0, 0.0, 0)
+    assert len(launches) == 2
+    offered = {
+        o.placement.location: o.usd_per_hour for o in policy.world.offers({"use_spot": True})
+    }
+    assert outcome.usd_per_hour == pytest.approx(sum(offered[e.location] for e in launches))
+    assert outcome.seconds == pytest.approx(86_400.0)
+
+
+@pytest.mark.parametrize(("notice_s", "outages"), [(0.0, 1), (400.0, 0)])
+def test_a_loss_costs_a_boot_and_its_detection_unless_it_was_announced(notice_s, outages):
+    """One replica; its zone is lost once. A notice longer than a boot hides it."""
+    timing = Timing(boot_s=240.0, notice_s=notice_s, detect_s=5.0)
+    wanted = always(scenario(spec(1), timing=timing))
+    lost = of_changes([(0, UNLIMITED), (4 * HOUR_S, 0), (5 * HOUR_S, UNLIMITED)], wanted.length_s)
+    first = run(wanted)[0].store.events[0].location
+    outcome = run(replace(wanted, recorded={**wanted.recorded, first: lost}))[1].outcome()
+    assert (outcome.outages, outcome.available < 1) == (outages, bool(outages))
+    if outages:
+        assert 0.75 * 240 <= outcome.longest_outage_s <= 1.25 * 240 + 5 + 2
+
+
+# -- the real planner's rules, as they come out ------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_asking_only_when_something_can_change_changes_nothing(seed):
+    """The same events as when the manager looks every second, as it does in real life."""
+    window = WindowSpec(EVERY_DAY, int(1.5 * HOUR_S), 4 * 3600, replicas=4)
+    pool = spec(
+        1 + seed % 3,
+        on_demand=OnDemandSpec(base=seed % 2, fallback=True) if seed % 3 else OnDemandSpec(),
+        schedule=ScheduleSpec("UTC", (window,), prelaunch_s=600.0) if seed % 2 else None,
+        max_usd_per_hour=0.5 if seed == 2 else None,
+    )
+    timing = Timing(notice_s=(0.0, 120.0, 30.0)[seed % 3])
+    wanted = scenario(pool, timing=timing, days=0.1, seeds=(seed,))
+    jumping, lazily = run(wanted, seed=seed)
+    ticking, eagerly = run(wanted, seed=seed, every_tick=True)
+    assert jumping.world.asked < ticking.world.asked / 20
+    assert jumping.store.events == ticking.store.events
+    assert lazily.outcome().available == pytest.approx(eagerly.outcome().available)
+    assert lazily.outcome().usd_per_hour == pytest.approx(eagerly.outcome().usd_per_hour)
+
+
+def test_a_pool_is_whole_when_its_window_opens():
+    """Prelaunched: in four days never under target, with four wanted by day and one by night."""
+    day = WindowSpec(EVERY_DAY, 8 * 3600, 18 * 3600, replicas=4)
+    ahead = spec(1, schedule=ScheduleSpec("UTC", (day,), prelaunch_s=600.0))
+    late = spec(1, schedule=ScheduleSpec("UTC", (day,), prelaunch_s=0.0))
+    outcomes = [run(always(scenario(s, days=4.0)))[1].outcome() for s in (ahead, late)]
+    assert outcomes[0].under_target == 0.0
+    assert outcomes[1].under_target > 0.0
+    assert outcomes[0].mean_ready == pytest.approx((4 * 10 + 14) / 24, rel=0.03)
+
+
+def test_while_no_replica_is_wanted_nothing_is_an_outage():
+    night = WindowSpec(EVERY_DAY, 20 * 3600, 6 * 3600, replicas=0)
+    pool = spec(2, schedule=ScheduleSpec("UTC", (night,), prelaunch_s=900.0))
+    outcome = run(always(scenario(pool, days=3.0)))[1].outcome()
+    assert (outcome.available, outcome.outages, outcome.longest_outage_s) == (1.0, 0, 0.0)
+    assert outcome.mean_ready == pytest.approx(2 * 14 / 24, rel=0.05)
+
+
+def test_the_budget_holds_at_every_moment():
+    pool = spec(4, max_usd_per_hour=0.25)
+    wanted = scenario(pool, days=2.0)
+    world = World(wanted.market(0), seed=0, length_s=wanted.length_s)
+    spent = []
+    policy = managed(world, wanted)
+    ask = policy.tick
+
+    def tick(now):
+        out = ask(now)
+        spent.append(sum(vm.order.usd_per_hour for vm in world.vms.values()))
+        return out
+
+    policy.tick = tick
+    with unlogged():
+        world.run(policy)
+    assert 0.2 < max(spent) <= 0.25 + 1e-9
+
+
+# -- arithmetic --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("replicas", [1, 2, 3])
+def test_without_correlation_the_product_of_unavailabilities_is_right(replicas):
+    """`core.reliability` for replicas that stay, against eight simulated months."""
+    wanted = scenario(
+        spec(replicas), model=INDEPENDENT, timing=Timing(boot_s=0.0, answer_s=1.0, detect_s=1.0),
+        days=40.0,
+    )  # fmt: skip
+    rows = [run(wanted, f"static, any of {replicas}", seed=s)[1].outcome() for s in range(6)]
+    down = 1 - sum(o.available for o in rows) / len(rows)
+    # A refused place is tried again after a minute, half of it lost on average.
+    one = arithmetic.staying(INDEPENDENT, Timing(boot_s=30.0))
+    assert down == pytest.approx(1 - arithmetic.independent(one, replicas), rel=0.15)
+
+
+def test_without_correlation_a_replica_that_moves_is_down_as_reckoned():
+    """P = recovery / (uptime + recovery), as long as some place has room."""
+    timing = Timing(boot_s=600.0, notice_s=0.0)
+    wanted = scenario(spec(1, migration=None), model=INDEPENDENT, timing=timing, days=60.0)
+    rows = [run(wanted, seed=seed)[1].outcome() for seed in range(4)]
+    down = 1 - sum(o.available for o in rows) / len(rows)
+    assert down == pytest.approx(arithmetic.moving(INDEPENDENT, timing), rel=0.15)
+
+
+def test_with_correlation_independence_promises_too_much():
+    """Two that stay, correlation 0.4: twice as often down together as independent ones."""
+    model = replace(
+        INDEPENDENT, correlation_region=0.4, correlation_cloud=0.4, correlation_world=0.4
+    )
+    timing = Timing(boot_s=0.0, answer_s=1.0, detect_s=1.0)
+    wanted = scenario(spec(2), model=model, timing=timing, days=60.0)
+    rows = [run(wanted, "static, any of 2", seed=seed)[1].outcome() for seed in range(6)]
+    down = 1 - sum(o.available for o in rows) / len(rows)
+    one = arithmetic.staying(model, Timing(boot_s=30.0))
+    assert down > 1.8 * (1 - arithmetic.independent(one, 2))
+    assert down == pytest.approx(1 - arithmetic.correlated_pair(one, 0.4), rel=0.2)
+
+
+# -- comparison --------------------------------------------------------------------------------
+
+
+def test_policies_meet_the_same_markets_and_the_same_seeds_give_the_same_report():
+    wanted = scenario(spec(2), days=0.5, seeds=(3, 4))
+    first, second = simulate(wanted).to_json(), simulate(wanted).to_json()
+    assert first == second
+    assert [row["policy"] for row in first["policies"]] == [
+        "fogft",
+        "one on-demand",
+        "static, any of 2",
+        "SkyServe, spot only",
+        "SkyServe, fallback",
+    ]
+    assert first != simulate(replace(wanted, seeds=(5, 6))).to_json()
+
+
+def test_an_on_demand_machine_costs_its_price_and_never_stops():
+    rows = {row.name: row for row in compare(scenario(spec(2), days=1.0))}
+    outcome = rows["one on-demand"].outcomes[0]
+    assert (outcome.available, outcome.under_target, outcome.launches) == (1.0, 1.0, 0)
+    assert outcome.usd_per_hour == pytest.approx(0.192)
+
+
+def test_skyserve_falls_back_to_on_demand_where_spot_is_gone():
+    wanted = scenario(spec(2), days=1.0)
+    nothing = {p: of_samples([0], wanted.length_s) for p in wanted.market(0).timelines}
+    rows = {row.name: row.outcomes[0] for row in compare(replace(wanted, recorded=nothing))}
+    assert rows["SkyServe, fallback"].available == 1.0
+    assert rows["SkyServe, fallback"].usd_per_hour == pytest.approx(2 * 0.192)
+    assert rows["SkyServe, spot only"].available == 0.0
+    assert rows["static, any of 2"].available == 0.0
+    assert rows["fogft"].available == 0.0
+
+
+def test_an_on_demand_machine_may_fail():
+    wanted = scenario(spec(1), days=30.0, timing=Timing(on_demand_mttf_s=5 * 86_400.0))
+    outcome = run(wanted, "one on-demand")[1].outcome()
+    assert outcome.preemptions > 2
+    assert 0.98 < outcome.available < 1.0
+
+
+def test_recorded_traces_shorter_than_asked_are_used_whole():
+    wanted = scenario(spec(1), days=5.0)
+    lines = {p: of_samples([1] * 48, HOUR_S) for p in wanted.market(0).timelines}
+    report = simulate(replace(wanted, recorded=lines))
+    assert report.scenario.days == pytest.approx(47 / 24)
+    assert report.notes == ("the traces cover 2.0 days after the first hour: all are used",)
+    assert report.expected is None  # nothing ever changes: nothing can be fitted
+
+
+def test_recorded_numbers_are_room_for_so_many_machines():
+    """Two replicas and room for one in the only zone with a trace: one serves."""
+    wanted = scenario(spec(2), days=1.0)
+    place = sorted(wanted.market(0).timelines)[0]
+    outcome = run(replace(wanted, recorded={place: of_samples([1], wanted.length_s)}))[1].outcome()
+    assert (outcome.available, outcome.under_target) == (1.0, 1.0)
+    assert outcome.mean_ready == pytest.approx(1.0)
+    assert outcome.refusals > 0
+
+
+def test_an_interval_holds_the_mean_and_narrows_with_seeds():
+    few, many = estimate([0.0, 1.0] * 3), estimate([0.0, 1.0] * 60)
+    assert few.low < few.mean == many.mean == 0.5 < few.high
+    assert many.high - many.low < few.high - few.low
+    assert estimate([0.3]).low == estimate([0.3]).high == 0.3
+
+
+def test_a_day_is_a_market_s_unit():
+    meter = run(scenario(spec(1), model=MarketModel(), days=2.0))[1]
+    row = Row("x", (meter.outcome(),))
+    assert row.estimate("launches_per_day").mean == meter.launches / 2
+    assert isinstance(Market(lambda resources: [], {}).offers({}), list)
