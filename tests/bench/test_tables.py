@@ -37,6 +37,7 @@ def test_there_is_a_measurement_for_each_promise():
     names = list(measurements())
     assert names == [
         "commands",
+        "planning",
         "overhead-1",
         "overhead-2",
         "overhead-3",
