@@ -24,6 +24,7 @@ Rows = list[dict[str, Any]]
 def measurements() -> dict[str, Callable[..., Rows]]:
     """Return what can be measured, by name, in the order of running."""
     from tests.bench import commands, faults, planning, simulation, speed, tail
+    from tests.bench import commands, faults, ordering, planning, speed, tail
 
     found: dict[str, Callable[..., Rows]] = {
         "commands": commands.commands,
@@ -38,6 +39,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["hedging"] = tail.hedging
     found["cancellation"] = tail.cancellation
     found["simulation"] = simulation.simulation
+    found["ordering"] = ordering.ordering
     return found
 
 

@@ -25,10 +25,11 @@ from fogft import disk
 from fogft.core import membership as memberships
 from fogft.core import names
 from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.spec_state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
 from fogft.pool import credentials
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
-from tests.bench.service import FLAG, MAP
+from tests.bench.service import FLAG, MAP, STATEFUL
 
 ROOT = Path(__file__).resolve().parents[2]
 _READY_LIMIT_S = 60.0
@@ -97,6 +98,7 @@ class Rig:
         services: What each slot's service is started with, instead of `sleep_s`.
         replica: More of the `/bench_flag` service for the replicas' configurations.
         policy: More of it for the client proxy's.
+        stateful: Whether its services keep state, so that their requests are ordered.
         tell_losers: Whether the client proxy tells replicas what is no longer wanted.
     """
 
@@ -110,6 +112,7 @@ class Rig:
         services: Sequence[str] = (),
         replica: dict[str, Any] | None = None,
         policy: dict[str, Any] | None = None,
+        stateful: bool = False,
         tell_losers: bool = True,
     ) -> None:
         self._folder = folder
@@ -119,6 +122,7 @@ class Rig:
         self._arguments = services or [str(sleep_s)] * replicas
         self._of_replica = replica or {}
         self._tell_losers = tell_losers
+        self._stateful = stateful
         self._policy: dict[str, Any] = policy or {}
         self.robot_domain, *domains = free_domains(replicas + 1)
         self.domains = domains
@@ -200,6 +204,7 @@ class Rig:
             "listen": f"127.0.0.1:{port}",
             "services": self._services(self._of_replica),
             "run": f"exec {sys.executable} -m tests.bench.service {self._arguments[slot]}",
+            "envs": {STATEFUL: "1"} if self._stateful else {},
             "workdir": str(ROOT),
             "credentials": _pair(name, "replica"),
             "domain_id": self.domains[slot],
@@ -271,7 +276,10 @@ class Rig:
 
     def _services(self, of_flag: dict[str, Any]) -> list[dict[str, Any]]:
         flag, other = ({"name": n, "type": t, "timeout_s": 10.0} for n, t in (FLAG, MAP))
-        return [{**flag, **of_flag}, other]
+        services = [{**flag, **of_flag}, other]
+        if self._stateful:
+            return [{**s, "state": _state(str(s["name"])).to_plain()} for s in services]
+        return services
 
     def _start(self, name: str, module: str, *arguments: str) -> subprocess.Popen[bytes]:
         environ = {**child_environment(), "PYTHONPATH": str(ROOT)}
@@ -301,6 +309,13 @@ class Rig:
                 process.kill()
                 process.wait()
         shared_memory.sweep()
+
+
+def _state(service: str) -> StateSpec:
+    return StateSpec(
+        StateService(f"{service}/get_state", SNAPSHOT_TYPE, FIELD),
+        StateService(f"{service}/set_state", RESTORE_TYPE, FIELD),
+    )
 
 
 def _pair(folder: str, stem: str) -> dict[str, str]:

@@ -21,6 +21,7 @@ from fogft.ros import environment, memory_tuning
 
 FLAG = ("/bench_flag", "std_srvs/srv/SetBool")
 MAP = ("/bench_map", "nav_msgs/srv/SetMap")
+STATEFUL = "FOGFT_BENCH_STATEFUL"  # set: both services can be given a state, which is empty
 CANCEL = ("/bench_cancel", "std_srvs/srv/Trigger")
 _DEFAULTS = ("0", "0", "0", "0", "16")
 
@@ -53,6 +54,8 @@ def main() -> None:
             pool.submit(_respond_after, sleeps, ends[0], handle, it)
 
         ends.append(node.serve(name, type_name, answer_later if sleep_s else answer_now))
+    if os.environ.get(STATEFUL):
+        _offer_states(node, SetMap.Response(success=True))
     stopped = bytes(serialize_message(Trigger.Response(success=True)))
 
     def stop(_: bytes, handle: Any) -> None:
@@ -61,6 +64,23 @@ def main() -> None:
 
     cancel = node.serve(*CANCEL, stop)
     threading.Event().wait()  # its server proxy ends it
+
+
+def _offer_states(node: Any, restored: Any) -> None:
+    from nav_msgs.srv import GetMap
+    from rclpy.serialization import serialize_message
+
+    answers = {"get": ("Get", GetMap.Response()), "set": ("Set", restored)}
+    for service, _ in (FLAG, MAP):
+        for verb, (prefix, response) in answers.items():
+            ends: list[Any] = []
+            answer = bytes(serialize_message(response))
+
+            def respond(_: bytes, handle: Any, ends: list[Any] = ends, it: bytes = answer) -> None:
+                ends[0].respond(handle, it)
+
+            name = f"{service}/{verb}_state"
+            ends.append(node.serve(name, f"nav_msgs/srv/{prefix}Map", respond))
 
 
 class Sleeps:

@@ -48,4 +48,5 @@ def test_there_is_a_measurement_for_each_promise():
         "hedging",
         "cancellation",
         "simulation",
+        "ordering",
     ]
