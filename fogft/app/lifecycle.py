@@ -34,6 +34,7 @@ def order(
     """
     from fogft.cloud.port import Accounts
     from fogft.pool import named_clouds, pool_file, preview
+    from fogft.ros.comparison import check_tolerances
     from fogft.ros.state_bytes import check_state
     from fogft.ros.types import check_ok_field, check_service_type
 
@@ -44,6 +45,7 @@ def order(
         check_types=check_service_type,
         check_fields=check_ok_field,
         check_states=check_state,
+        check_tolerances=check_tolerances,
         folder=file.parent,
     )
     chosen = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL

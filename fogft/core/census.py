@@ -80,7 +80,7 @@ def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged, size: Size) -> str
     reasons = {
         "drained by the user": intent.is_drained(slot, judged.id.generation),
         f"excluded location {location}": intent.is_excluded(location),
-        judged.why: judged.verdict in (Verdict.STUCK, Verdict.AT_RISK),
+        judged.why: judged.verdict in (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES),
         "its group is not in the pool file": not any(g.owns(slot) for g in size.groups),
         "outdated by a change of the pool file": machine.spec_hash != replica_hash(spec, slot),
     }

@@ -41,6 +41,7 @@ class Verdict(str, Enum):
     LEAVING = "leaving"  # a preemption notice was given, or it asked to be left alone
     UNRESPONSIVE = "unresponsive"  # silent past `replace_after_s` while another answers
     AT_RISK = "at risk"  # serves, and its cloud recommends to move it
+    DISAGREES = "disagrees"  # its answers differ from those of a quorum, repeatedly
     STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
 
 
@@ -180,7 +181,7 @@ def _phase(machine: Machine, verdict: Verdict, serving: bool) -> Phase:
     return Phase.READY if serving else Phase.STARTING
 
 
-def _verdict(  # noqa: PLR0911 - one line a verdict reads better than nesting
+def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than nesting
     context: _Context,
     machine: Machine,
     link: LinkReport | None,
@@ -199,6 +200,8 @@ def _verdict(  # noqa: PLR0911 - one line a verdict reads better than nesting
     # A mark of our own comes back in the report: it is not the replica's wish.
     if link is not None and link.draining and not (record and record.draining_since):
         return Verdict.LEAVING, "it asked to be left alone"
+    if link is not None and link.disagrees and context.may_doubt:
+        return Verdict.DISAGREES, "its answers differ from those of the others"
     if serving and link is not None and link.at_risk and _has_settled(record, now):
         return Verdict.AT_RISK, "the cloud recommends to move it (rebalance)"
     if serving or not context.may_doubt:

@@ -134,6 +134,7 @@ class LinkReport:
         ready: Names of the services that this replica says it can answer now.
         draining: The replica asked to be left alone (a preemption notice, a drain).
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
+        disagrees: Its answers have differed from those of a quorum, repeatedly.
         heard_age_s: Since the server proxy last answered a probe; None if never.
         silent_for_s: How long probes have gone unanswered; 0 while they are answered.
         rtt_s: Round trip of the last probe.
@@ -146,6 +147,7 @@ class LinkReport:
     ready: frozenset[str] = frozenset()
     draining: bool = False
     at_risk: bool = False
+    disagrees: bool = False
     heard_age_s: float | None = None
     silent_for_s: float = 0.0
     rtt_s: float | None = None

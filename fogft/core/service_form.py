@@ -37,6 +37,8 @@ def to_plain(service: ServiceSpec, keys: tuple[str, ...] = ()) -> dict[str, Any]
             written[field.name] = asdict(value) if is_map else getattr(value, "value", value)
     if service.state is not None and "state" in written:
         written["state"] = service.state.to_plain()
+    if "tolerance" in written:
+        written["tolerance"] = dict(service.tolerance)
     return written
 
 
@@ -58,6 +60,8 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         hedging_budget=_share(raw.get("hedging_budget") or ServiceSpec.hedging_budget),
         concurrency=int(raw.get("concurrency") or 0),
         cancel=str(raw.get("cancel") or ""),
+        quorum=int(raw.get("quorum") or 1),
+        tolerance=tuple((str(k), float(v)) for k, v in (raw.get("tolerance") or {}).items()),
         state=spec_state.from_plain(raw.get("state")),
         fallback=_fallback(raw.get("fallback")),
         trace=bool(raw.get("trace")),

@@ -56,6 +56,8 @@ class ServiceSpec:
         fallback: Who answers at the deadline, or before; only with `on_timeout: fallback`.
         trace: Whether each request leaves a line in the client proxy's `trace.jsonl`.
         cancel: Name of the service's cancel service (`std_srvs/srv/Trigger`); empty for none.
+        quorum: The answer is the one that so many replicas agree on; 1 for the first.
+        tolerance: Path of a float field of the response -> how far apart still agrees.
         state: How its state is taken and given; None for a service that keeps none.
     """
 
@@ -70,6 +72,8 @@ class ServiceSpec:
     traffic: TrafficSpec = field(default_factory=TrafficSpec)
     concurrency: int = 0
     cancel: str = ""
+    quorum: int = 1
+    tolerance: tuple[tuple[str, float], ...] = ()
     state: StateSpec | None = None
     fallback: FallbackSpec | None = None
     trace: bool = False

@@ -29,7 +29,7 @@ SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
     *("hedging", "hedging_budget", "concurrency", "cancel"),
     *("fallback", "trace"),
-    *("replicas", "traffic", "state"),
+    *("replicas", "traffic", "quorum", "tolerance", "state"),
 )
 FALLBACK_KEYS = ("service", "after_s", "while_none_ready", "limit_s")
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
@@ -74,7 +74,6 @@ REFUSED_TASK_KEYS = {
 # Designed, not built. Ignoring one would promise what nobody does.
 LATER_KEYS = {
     "topology": "remove it; every replica is linked to the robot directly",
-    "quorum": "remove it; the first successful response is returned",
 }
 
 

@@ -11,7 +11,7 @@ Not here: YAML (`fogft.pool.yaml_tree`), loading types (`check_types`), prices a
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import PurePath
 
 from fogft.core.names import POOL_NAME_PATTERN
@@ -36,6 +36,7 @@ from fogft.core.spec_tree import Node, Section, plain, shown
 TypeCheck = Callable[[str], str | None]  # of a service type
 FieldCheck = Callable[[str, str], str | None]  # of a service type and a boolean response field
 StateCheck = Callable[[StateSpec], str | None]  # of a service's `state`
+ToleranceCheck = Callable[[str, Mapping[str, float]], str | None]  # of a type, by field
 FolderCheck = Callable[[str], str | None]  # of `workdir`
 
 MAX_SURGE = 4
@@ -49,6 +50,7 @@ def pool_spec(
     check_types: TypeCheck | None = None,
     check_fields: FieldCheck | None = None,
     check_states: StateCheck | None = None,
+    check_tolerances: ToleranceCheck | None = None,
     check_workdir: FolderCheck | None = None,
 ) -> PoolSpec:
     """Return what a pool file asks for.
@@ -61,6 +63,7 @@ def pool_spec(
             service, when all else is right.
         check_fields: Says why a type's response has no boolean field of that name.
         check_states: Says why a service's state cannot travel by the services that `state` names.
+        check_tolerances: Says why a type's responses cannot be compared with such tolerances.
         check_workdir: Says why a `workdir` cannot be used here.
 
     Raises:
@@ -109,6 +112,9 @@ def pool_spec(
             _judge(section, "type", check_types(service.type))
         if service.ok_field and check_fields is not None:
             _judge(section, "ok_field", check_fields(service.type, service.ok_field))
+        if service.tolerance and check_tolerances is not None:
+            reason = check_tolerances(service.type, dict(service.tolerance))
+            _judge(section, "tolerance", reason)
         if service.state is not None and check_states is not None:
             _judge(section, "state", check_states(service.state))
     return spec

@@ -66,6 +66,8 @@ def _service(section: Section) -> ServiceSpec:
         traffic=read_traffic(section),
         concurrency=_concurrency(section),
         cancel=_other_service(section, "cancel", name, "the name of its cancel service"),
+        quorum=_quorum(section),
+        tolerance=_tolerance(section),
         state=read_state(section),
         fallback=_fallback(section, name),
         trace=_trace(section),
@@ -145,11 +147,36 @@ def _other_service(section: Section, key: str, of: str, what: str) -> str:
     return name
 
 
+def _quorum(section: Section) -> int:
+    if "quorum" not in section.children:
+        return ServiceSpec.quorum
+    for key in ("ok_field", "hedging", "cancel"):
+        if section.has(key) and section.children[key].value != HedgingMode.ALL.value:
+            what = "does not go with `quorum`: every replica is asked, and every answer counts"
+            raise section.error(key, what, "remove it")
+    return section.whole("quorum", 2, 2, MAX_REPLICAS)
+
+
+def _tolerance(section: Section) -> tuple[tuple[str, float], ...]:
+    if "tolerance" not in section.children:
+        return ()
+    if "quorum" not in section.children:
+        what = "has no meaning here: answers are compared only with a `quorum`"
+        raise section.error("tolerance", what, "write `quorum: 2`, or remove it")
+    by_field = section.section("tolerance", "write `tolerance: {plan.cost: 0.01}`")
+    for path in by_field.children:
+        if not all(map(ros_names.is_field_name, path.split("."))):
+            what = f"{shown(path)} is not the path of a field"
+            raise by_field.error(path, what, "write a path such as `plan.cost`", at_key=True)
+    unit = "the field's own"
+    return tuple((path, by_field.number(path, 1e12, unit)) for path in by_field.children)
+
+
 def _check_stateful(section: Section) -> None:
     """A stateful service is asked of every replica, and its first answer is the answer."""
     if not section.has("state"):
         return
-    for key in ("ok_field", "hedging", "concurrency", "cancel"):
+    for key in ("ok_field", "hedging", "concurrency", "cancel", "quorum"):
         if section.has(key) and section.children[key].value != HedgingMode.ALL.value:
             what = "does not go with `state`: every replica applies every request"
             raise section.error(key, what, "remove it")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fogft.core.errors import SpecError
 from fogft.core.spec import PoolSpec
-from fogft.core.spec_reader import FieldCheck, StateCheck, TypeCheck, pool_spec
+from fogft.core.spec_reader import FieldCheck, StateCheck, ToleranceCheck, TypeCheck, pool_spec
 from fogft.pool import yaml_tree
 
 MAX_BYTES = 1 << 20
@@ -22,6 +22,7 @@ def read(
     check_types: TypeCheck | None = None,
     check_fields: FieldCheck | None = None,
     check_states: StateCheck | None = None,
+    check_tolerances: ToleranceCheck | None = None,
 ) -> PoolSpec:
     """Return what a pool file asks for.
 
@@ -32,6 +33,7 @@ def read(
         check_fields: Returns why a service type's response has no such boolean field, for
             `ok_field`.
         check_states: Returns why a service's state cannot travel as `state` says, or None.
+        check_tolerances: Returns why a type's responses cannot be compared so, or None.
 
     Raises:
         SpecError: The file cannot be read, or its first mistake: ``file:line: key: what``.
@@ -42,6 +44,7 @@ def read(
         check_types=check_types,
         check_fields=check_fields,
         check_states=check_states,
+        check_tolerances=check_tolerances,
         folder=Path(path).parent,
     )
 
@@ -53,6 +56,7 @@ def parse(
     check_types: TypeCheck | None = None,
     check_fields: FieldCheck | None = None,
     check_states: StateCheck | None = None,
+    check_tolerances: ToleranceCheck | None = None,
     folder: Path | None = None,
 ) -> PoolSpec:
     """Return what the text of a pool file asks for.
@@ -63,6 +67,7 @@ def parse(
         check_types: As for `read`.
         check_fields: As for `read`.
         check_states: As for `read`.
+        check_tolerances: As for `read`.
         folder: Where `workdir` is looked for; None to leave it unjudged.
 
     Raises:
@@ -76,6 +81,7 @@ def parse(
         check_types=check_types,
         check_fields=check_fields,
         check_states=check_states,
+        check_tolerances=check_tolerances,
         check_workdir=None if folder is None else lambda workdir: _no_folder(folder, workdir),
     )
 

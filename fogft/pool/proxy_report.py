@@ -42,7 +42,7 @@ class ProxyReport:
     def digest(self) -> object:
         """Return what a manager should react to at once; counters and ages are left out."""
         return frozenset(
-            (link.id, link.state, link.ready, link.draining, link.at_risk) for link in self.links
+            (k.id, k.state, k.ready, k.draining, k.at_risk, k.disagrees) for k in self.links
         )
 
 
@@ -79,6 +79,7 @@ def _link(raw: Mapping[str, Any], pool_uid: str) -> LinkReport:
         ready=frozenset(str(name) for name in raw["ready"]),
         draining=bool(raw.get("draining")),
         at_risk=bool(raw.get("at_risk")),
+        disagrees=bool(raw.get("disagrees")),
         heard_age_s=None if heard is None else float(heard),
         silent_for_s=float(raw.get("silent_for_s") or 0.0),
         rtt_s=None if rtt is None else float(rtt),

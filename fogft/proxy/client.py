@@ -21,8 +21,9 @@ from fogft.core.hedging import NEVER
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.records import SignedRecord
 from fogft.core.spec import ServiceSpec
-from fogft.proxy.dispatcher import Dispatcher
+from fogft.proxy.dispatcher import Dispatcher, key_of
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
+from fogft.proxy.voting import VotingDispatcher
 from fogft.ros.port import RosClient, RosNode, RosServer
 from fogft.wire.port import Answer, Dialer, Link, Peer
 
@@ -112,7 +113,7 @@ class ClientProxy:
             keys_changed = False
             for spec in wanted.values():
                 old = self._services.get(spec.name)
-                if old is not None and (old.spec.type, old.spec.state) == (spec.type, spec.state):
+                if old is not None and _same_kind(old.spec, spec):
                     old.spec = spec
                     self._adopt(old)
                     continue
@@ -336,6 +337,10 @@ class ClientProxy:
             "ready": sorted(link.ready),
             "draining": self._draining(link),
             "at_risk": bool(answer and answer.at_risk),
+            "disagrees": any(
+                isinstance(s.dispatcher, VotingDispatcher) and s.dispatcher.disagrees(key_of(link))
+                for s in self._services.values()
+            ),
             "heard_age_s": status.heard_age_s,
             "silent_for_s": status.silent_for_s,
             "rtt_s": status.rtt_s,
@@ -370,3 +375,9 @@ def _good_members(membership: Membership) -> dict[ReplicaId, Member]:
         for member in membership.members
         if names.replica_certificate_name(member.id) not in membership.revoked
     }
+
+
+def _same_kind(one: ServiceSpec, other: ServiceSpec) -> bool:
+    """Whether one dispatcher can follow both policies, so that nothing under way is lost."""
+    kinds = [(s.type, s.state, s.quorum, s.tolerance) for s in (one, other)]
+    return kinds[0] == kinds[1]

@@ -27,6 +27,7 @@ from fogft.proxy.following import Following
 from fogft.proxy.mark import MarkFile
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.process import Watched, start_log, stop_on_signal
+from fogft.proxy.voting import VotingDispatcher
 from fogft.ros import environment, memory_tuning
 
 log = logging.getLogger(__name__)
@@ -136,20 +137,27 @@ def make_dispatcher(
         pool_uid: Whose marks they are.
     """
     from fogft.ros import types
+    from fogft.ros.comparison import Comparison
 
+    empty = types.default_response(spec.type) if spec.on_timeout is OnTimeout.EMPTY else None
     if spec.state is not None:
         mark = MarkFile(
             marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}", pool_uid
         )
-        empty = types.default_response(spec.type) if spec.on_timeout is OnTimeout.EMPTY else None
         return OrderedDispatcher(spec, respond, mark, empty_response=empty, wake=wake)
+    if spec.quorum > 1:
+        return VotingDispatcher(
+            spec,
+            respond,
+            empty_response=empty,
+            wake=wake,
+            comparison=Comparison(spec.type, dict(spec.tolerance)),
+        )
     return Dispatcher(
         spec,
         respond,
         is_ok=types.bool_field(spec.type, spec.ok_field) if spec.ok_field else None,
-        empty_response=(
-            types.default_response(spec.type) if spec.on_timeout is OnTimeout.EMPTY else None
-        ),
+        empty_response=empty,
         wake=wake,
     )
 

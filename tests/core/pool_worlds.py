@@ -107,6 +107,7 @@ def replica(
     outdated: bool = False,
     price: float = 0.1,
     at_risk: bool = False,
+    disagrees: bool = False,
     of: PoolSpec | None = None,
 ) -> Part:
     """Make a replica.
@@ -140,6 +141,7 @@ def replica(
         silent_for_s=silent_s,
         in_flight=in_flight,
         at_risk=at_risk,
+        disagrees=disagrees,
     )
     if state in ("provisioning", "failed"):
         link = None
@@ -242,6 +244,7 @@ def parts(draw: st.DrawFn, of: PoolSpec, slot: int, generation: int) -> Part:
         outdated=draw(st.sampled_from([False, False, True])),
         price=draw(st.sampled_from([0.1, 0.2])),
         at_risk=draw(st.sampled_from([False, False, True])),
+        disagrees=draw(st.sampled_from([False, False, False, True])),
         of=of,
     )
 

@@ -87,6 +87,16 @@ def test_a_rebalance_waits_where_no_surge_is_allowed() -> None:
     assert (launches(world), ends(world)) == ([], [])
 
 
+def test_a_replica_that_disagrees_with_the_others_is_replaced_new_before_old() -> None:
+    """Voting masks it meanwhile; it is ended once its replacement serves."""
+    world = World(spec(3)).having(replica(0), replica(1), replica(2, disagrees=True))
+    assert (launches(world), ends(world)) == (["2.2"], [])
+    assert "differ from those of the others" in world.plan().launches[0].reason
+    ready = world.having(replica(2, 2, age_s=50))
+    assert launches(ready) == []
+    assert [id.short for id in ready.plan().draining] == ["2.1"]
+
+
 def test_notice_does_not_count_against_the_surge() -> None:
     """With no surge allowed, a noticed replica is replaced all the same."""
     world = World(spec(2, max_surge=0)).having(replica(0), replica(1, state="noticed"))

@@ -100,3 +100,32 @@ def test_what_does_not_go_with_state_is_refused(line):
 def test_types_are_judged_where_they_can_be():
     with pytest.raises(SpecError, match=r"p.yaml:8: fogft.services\[0\].state: no such field"):
         parse(SHORT, check_states=lambda state: "no such field; name another")
+
+
+VOTING = FILE + "      quorum: 2\n"
+
+
+def test_a_quorum_and_its_tolerances_reach_the_client_proxy():
+    (service,) = pool_file.parse(
+        VOTING + "      tolerance: {plan.cost: 0.5, x: 1}\n", file="p.yaml"
+    ).services
+    assert (service.quorum, service.tolerance) == (2, (("plan.cost", 0.5), ("x", 1.0)))
+    assert service_form.from_plain(service_form.to_plain(service)) == service
+
+
+@pytest.mark.parametrize(
+    ("file", "what"),
+    [
+        (VOTING + "      ok_field: success\n", "does not go with `quorum`"),
+        (VOTING + "      hedging: failover\n", "does not go with `quorum`"),
+        (VOTING + f"      state: {SHORT}\n", "does not go with `state`"),
+        (FILE + "      tolerance: {x: 1}\n", "has no meaning here"),
+        (VOTING + "      tolerance: {a..b: 1}\n", "is not the path of a field"),
+        (VOTING + "      tolerance: {x: 0}\n", "must be above 0"),
+        (VOTING + "      tolerance: 3\n", "must be a map"),
+        (FILE + "      quorum: 1\n", "must be from 2 to 16"),
+    ],
+)
+def test_mistakes_with_a_quorum_are_told(file, what):
+    with pytest.raises(SpecError, match=what):
+        pool_file.parse(file, file="p.yaml")

@@ -128,9 +128,9 @@ MISTAKES = {
         LATER_KEYS["topology"],
     ),
     "key that comes later, in a service": (
-        pool(services="[{name: a, quorum: 2}]"),
-        "pool.yaml:3: fogft.services[0].quorum: is not supported yet",
-        "remove it; the first successful response is returned",
+        pool(services="[{name: a, topology: 2}]"),
+        "pool.yaml:3: fogft.services[0].topology: is not supported yet",
+        "remove it; every replica is linked to the robot directly",
     ),
     "SkyServe's section": (
         pool(top="service: {replicas: 2}"),

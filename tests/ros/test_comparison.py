@@ -1,0 +1,103 @@
+"""Responses that say the same, or do not: field by field, after deserialising."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from fogft.core.errors import RosError
+from fogft.ros.comparison import Comparison, check_tolerances
+
+pytestmark = pytest.mark.ros
+
+PLAN = "nav_msgs/srv/GetPlan"
+MAP = "nav_msgs/srv/GetMap"
+X = "plan.poses.pose.position.x"
+
+
+def plan(*xs: float, frame: str = "map", y: float = 0.0):
+    from geometry_msgs.msg import PoseStamped
+    from nav_msgs.srv import GetPlan
+
+    response = GetPlan.Response()
+    response.plan.header.frame_id = frame
+    for x in xs:
+        pose = PoseStamped()
+        pose.pose.position.x, pose.pose.position.y = x, y
+        response.plan.poses.append(pose)
+    return response
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "tolerances", "same"),
+    [
+        (plan(1.0, 2.0), plan(1.0, 2.0), {}, True),
+        (plan(1.0), plan(1.0 + 1e-12), {}, False),
+        (plan(1.0), plan(1.009), {X: 0.01}, True),
+        (plan(1.0), plan(1.011), {X: 0.01}, False),
+        (plan(1.0, y=0.0), plan(1.0, y=0.005), {X: 0.01}, False),
+        (plan(1.0), plan(1.0, 1.0), {X: 9.0}, False),
+        (plan(), plan(), {}, True),
+        (plan(1.0, frame="map"), plan(1.0, frame="odom"), {}, False),
+        (plan(math.nan), plan(math.nan), {}, True),
+        (plan(math.nan), plan(1.0), {X: 9.0}, False),
+        (plan(math.inf), plan(math.inf), {X: 0.1}, True),
+    ],
+)
+def test_plans(one, other, tolerances, same):
+    comparison = Comparison(PLAN, tolerances)
+    assert comparison.agree(one, other) == comparison.agree(other, one) == same
+
+
+def test_lists_of_numbers():
+    from nav_msgs.srv import GetMap
+
+    one, other = GetMap.Response(), GetMap.Response()
+    one.map.data = other.map.data = [1, 2, 3]
+    comparison = Comparison(MAP, {"map.info.resolution": 0.1})
+    assert comparison.agree(one, other)
+    one.map.info.resolution, other.map.info.resolution = 0.5, 0.55
+    assert comparison.agree(one, other)
+    other.map.data = [1, 2, 4]
+    assert not comparison.agree(one, other)
+
+
+def test_padding_does_not_count():
+    """CDR leaves gaps before wide fields; whatever lies in them, the message is the same."""
+    from nav_msgs.srv import GetPlan
+    from rclpy.serialization import serialize_message
+
+    comparison = Comparison(PLAN, {})
+    payload = bytes(serialize_message(plan(1.0, frame="a")))
+    wanted = comparison.read(payload)
+    same, seen = 0, 0
+    for at in range(4, len(payload)):
+        if payload[at] == 0:
+            changed = payload[:at] + b"\xaa" + payload[at + 1 :]
+            try:
+                read = comparison.read(changed)
+            except RosError:
+                continue
+            seen += 1
+            same += comparison.agree(read, wanted)
+    assert isinstance(wanted, GetPlan.Response)
+    assert 0 < same < seen, "some zeros are padding, and some are not"
+
+
+def test_noise_is_no_response():
+    with pytest.raises(RosError, match="not a response"):
+        Comparison(PLAN, {}).read(b"noise")
+
+
+@pytest.mark.parametrize(
+    "path", ["plan", "plan.header.frame_id", "plan.poses.x", "no_such", "plan.header.stamp.sec"]
+)
+def test_only_floats_have_tolerances(path):
+    reason = check_tolerances(PLAN, {path: 0.1})
+    assert reason is not None
+    assert f"`{path}`; " in reason
+
+
+def test_paths_lead_through_lists():
+    assert check_tolerances(PLAN, {X: 0.1}) is None
