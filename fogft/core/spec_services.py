@@ -176,7 +176,7 @@ def _check_stateful(section: Section) -> None:
     """A stateful service is asked of every replica, and its first answer is the answer."""
     if not section.has("state"):
         return
-    for key in ("ok_field", "hedging", "concurrency", "cancel", "quorum"):
+    for key in ("ok_field", "hedging", "concurrency", "cancel", "quorum", "trace"):
         if section.has(key) and section.children[key].value != HedgingMode.ALL.value:
             what = "does not go with `state`: every replica applies every request"
             raise section.error(key, what, "remove it")
