@@ -23,8 +23,7 @@ Rows = list[dict[str, Any]]
 
 def measurements() -> dict[str, Callable[..., Rows]]:
     """Return what can be measured, by name, in the order of running."""
-    from tests.bench import commands, faults, planning, simulation, speed, tail
-    from tests.bench import commands, faults, ordering, planning, speed, tail
+    from tests.bench import commands, faults, ordering, planning, simulation, speed, tail
 
     found: dict[str, Callable[..., Rows]] = {
         "commands": commands.commands,
