@@ -122,6 +122,7 @@ class Proof:
         self.machines = timetable.Machines()
         self.reactions: list[str] = []
         self.result: dict[str, Any] = {}
+        self.skypilots: list[timetable.Span] = []
 
     def whole(self, count: int) -> None:
         """Wait until the pool is whole; note when its new machines were set up."""
@@ -253,6 +254,7 @@ class Proof:
         assert not running()
         assert not clusters()
         assert not list((HOME / "pools").glob("*"))
+        self.skypilots = timetable.skypilots(self.machines)  # its server remembers, while it runs
         subprocess.run(["sky", "api", "stop"], env=self.pool.environ, check=True, text=True,
                        capture_output=True)  # fmt: skip
         until("nothing of it runs here", lambda: not processes(), 60)
@@ -302,7 +304,7 @@ def main() -> int:
         if log.exists():
             shutil.copy(log, results / "manager.log")
     told = [
-        timetable.table(step.done, timetable.skypilots(proof.machines)),
+        timetable.table(step.done, proof.skypilots),
         *(f"{line}\n" for line in proof.reactions),
         f"requests: {json.dumps(proof.result)}\n",
     ]
