@@ -68,6 +68,7 @@ def emulated(folder: Path, make: Callable[..., Any]) -> Iterator[Any]:
     """
     stub_server()
     cloud = adapter(folder)
+    assert cloud.check(["aws"]) == {"aws": ""}  # as `up` does first: it starts SkyPilot's server
     filled: list[str] = []
 
     def fill_and_note(location: str) -> None:
