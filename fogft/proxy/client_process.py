@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from fogft import disk
 from fogft.core import names
 from fogft.core.errors import FogftError, PoolBusy, StateError
-from fogft.core.spec import OnTimeout, ServiceSpec
+from fogft.core.spec import ServiceSpec
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.config import ClientProxyConfig, read_client
 from fogft.proxy.dispatcher import Dispatcher
@@ -139,7 +139,7 @@ def make_dispatcher(
     from fogft.ros import types
     from fogft.ros.comparison import Comparison
 
-    empty = types.default_response(spec.type) if spec.on_timeout is OnTimeout.EMPTY else None
+    empty = types.default_response(spec.type)  # the policy may become `empty` later
     if spec.state is not None:
         mark = MarkFile(
             marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}", pool_uid
@@ -156,7 +156,7 @@ def make_dispatcher(
     return Dispatcher(
         spec,
         respond,
-        is_ok=types.bool_field(spec.type, spec.ok_field) if spec.ok_field else None,
+        ok_of=functools.partial(types.bool_field, spec.type),
         empty_response=empty,
         wake=wake,
     )

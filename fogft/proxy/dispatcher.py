@@ -57,7 +57,8 @@ class Dispatcher:
     Args:
         spec: The service and its policy.
         respond: Sends a response to the caller of a handle. Any thread.
-        is_ok: Whether a response is a success; None when every response is.
+        ok_of: Returns, for a name of a boolean response field, whether a response is a success;
+            asked where the spec names an `ok_field`.
         empty_response: The serialised default response, for ``on_timeout: empty``.
         wake: Has `tick` called soon. Any thread.
         clock: Monotonic seconds.
@@ -69,7 +70,7 @@ class Dispatcher:
         spec: ServiceSpec,
         respond: Respond,
         *,
-        is_ok: Callable[[bytes], bool] | None = None,
+        ok_of: Callable[[str], Callable[[bytes], bool]] | None = None,
         empty_response: bytes | None = None,
         wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
@@ -77,7 +78,8 @@ class Dispatcher:
     ) -> None:
         self.spec = spec
         self._respond = respond
-        self._is_ok = is_ok
+        self._ok_of = ok_of
+        self._is_ok = self._check(spec.ok_field)
         self._empty_response = empty_response
         self._wake = wake
         self._clock = clock
@@ -149,9 +151,10 @@ class Dispatcher:
             self._refused(replica, answer)
             return
         now = self._clock()
-        if self._is_ok is not None:
+        is_ok = self._is_ok
+        if is_ok is not None:
             try:
-                ok = self._is_ok(payload)
+                ok = is_ok(payload)
             except RosError:  # no response of this type
                 self._refused(replica, replace(answer, refusal=Refusal.MALFORMED))
                 return
@@ -269,8 +272,13 @@ class Dispatcher:
         Args:
             spec: The policy.
             fallback: The client of its fallback service, if it has one.
+
+        Raises:
+            RosError: The response has no such `ok_field`; nothing was changed.
         """
+        is_ok = self._is_ok if spec.ok_field == self.spec.ok_field else self._check(spec.ok_field)
         with self._lock:
+            self._is_ok = is_ok
             old, self.spec = self.spec, spec
             self._follow(spec, fallback)
             if (old.hedging, old.hedging_budget) != (spec.hedging, spec.hedging_budget):
@@ -279,12 +287,19 @@ class Dispatcher:
                 log.info("hedging_changed service=%s to=%s", spec.name, spec.hedging.value)
         self._wake()
 
+    def _check(self, ok_field: str) -> Callable[[bytes], bool] | None:
+        return self._ok_of(ok_field) if ok_field and self._ok_of is not None else None
+
+    def _accepts(self, payload: bytes) -> bool:
+        is_ok = self._is_ok
+        return is_ok is None or is_ok(payload)
+
     def _follow(self, spec: ServiceSpec, fallback: RosClient | None) -> None:
         """Follow what a spec says of fallback and trace."""
         if spec.fallback is not None and self._rescuer is None:
             self._rescuer = Rescuer(
                 Shared(
-                    spec.name, self._lock, self._requests, self._outcomes, self._is_ok,
+                    spec.name, self._lock, self._requests, self._outcomes, self._accepts,
                     self._clock, self._stop, self._return, self._forget,
                 ),
                 spec.fallback,

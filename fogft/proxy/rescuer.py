@@ -41,7 +41,7 @@ class Shared:
     lock: threading.Lock
     requests: FirstResponse[Request]
     outcomes: Outcomes
-    is_ok: Callable[[bytes], bool] | None
+    accepts: Callable[[bytes], bool]
     clock: Callable[[], float]
     close: Callable[[bytes, Pending[Request], float], None]
     give: Callable[[Any, bytes], None]
@@ -130,7 +130,7 @@ class Rescuer:
         shared = self._shared
         now = shared.clock()
         try:
-            ok = shared.is_ok is None or shared.is_ok(payload)
+            ok = shared.accepts(payload)
         except RosError:
             ok = False
         with shared.lock:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,10 +22,11 @@ class Scene:
         self.clock = Clock()
         self.responses: list[tuple[object, bytes]] = []
         options = {
-            key: spec.pop(key)
-            for key in ("is_ok", "empty_response", "max_pending_bytes")
-            if key in spec
+            key: spec.pop(key) for key in ("empty_response", "max_pending_bytes") if key in spec
         }
+        if (is_ok := spec.pop("is_ok", None)) is not None:
+            spec["ok_field"] = "ok"
+            options["ok_of"] = {"ok": is_ok}.__getitem__
         self.dispatcher = Dispatcher(
             ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, **spec),
             lambda handle, payload: self.responses.append((handle, payload)),
@@ -337,3 +340,30 @@ def test_each_caller_is_answered_at_most_once_and_nothing_is_lost(steps):
     handles = [handle for handle, _ in scene.responses]
     assert len(handles) == len(set(handles)) == report["answered"]
     assert all(payload == b"to q%d" % handle for handle, payload in scene.responses)
+
+
+def test_a_changed_ok_field_counts_from_the_next_answer_on():
+    """Requests under way end by the check of now, and none is lost to the change."""
+    checks = {"ok": lambda payload: payload != b"bad", "fine": lambda payload: payload != b"poor"}
+    responses: list[tuple[object, bytes]] = []
+    spec = ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0)
+    dispatcher = Dispatcher(
+        spec, lambda *response: responses.append(response), ok_of=checks.__getitem__, clock=Clock()
+    )
+    links = [FakeLink(0), FakeLink(1)]
+    dispatcher.route(links)
+    for field, rejected in (("ok", b"bad"), ("fine", b"poor"), ("", b"")):
+        dispatcher.adopt(replace(spec, ok_field=field))
+        dispatcher.submit(b"q", field)
+        if rejected:
+            dispatcher.answered(links[0], links[0].reply(rejected))
+        dispatcher.answered(links[1], links[1].reply(b"good" if field else b"bad"))
+    assert responses == [("ok", b"good"), ("fine", b"good"), ("", b"bad")]
+
+
+def test_a_service_may_become_one_that_answers_empty_at_the_deadline():
+    scene = Scene(empty_response=b"empty")
+    scene.dispatcher.submit(b"q", "before")
+    scene.dispatcher.adopt(replace(scene.dispatcher.spec, on_timeout=OnTimeout.EMPTY))
+    scene.pass_time(6.0)
+    assert scene.responses == [("before", b"empty")]

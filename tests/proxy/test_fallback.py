@@ -25,12 +25,13 @@ class Scene:
         self.spec = ServiceSpec(
             "/s", "std_srvs/srv/SetBool", timeout_s=5.0, on_timeout=OnTimeout.FALLBACK,
             fallback=FallbackSpec("/local", **fallback), trace=trace,
+            ok_field="ok" if is_ok else "",
         )  # fmt: skip
         self.wakes = 0
         self.dispatcher = Dispatcher(
             self.spec,
             lambda handle, payload: self.responses.append((handle, payload)),
-            is_ok=is_ok,
+            ok_of=lambda _: is_ok,
             wake=self._wake,
             clock=self.clock,
         )
