@@ -110,7 +110,9 @@ def up(
     try:
         seen, _ = progress.wait(
             lambda: managed(name),
-            lambda seen: is_answering(seen, wanted, applied_at) or keeps_ending(seen),
+            lambda seen: (
+                is_answering(seen, wanted, applied_at) or keeps_ending(seen) or differs(seen)
+            ),
             limit_s,
         )
     except KeyboardInterrupt:
@@ -118,6 +120,8 @@ def up(
         raise typer.Exit(130) from None
     if keeps_ending(seen):
         raise not_answering(seen, "does not answer: `run` ends again and again")
+    if differs(seen):
+        raise not_answering(seen, "cannot answer: the types are not the same on both sides")
     if not is_answering(seen, wanted, applied_at):
         raise not_answering(seen, f"does not answer after {limit_s:.0f} s")
     status = seen.status
@@ -180,6 +184,12 @@ def keeps_ending(seen: Seen) -> bool:
     return bool(replicas) and not any(
         replica.phase == "ready" or replica.restarts < HOPELESS_RESTARTS for replica in replicas
     )
+
+
+def differs(seen: Seen) -> bool:
+    """Whether every replica has another definition of a service's type than this machine."""
+    replicas = seen.status.replicas
+    return bool(replicas) and all(replica.differs for replica in replicas)
 
 
 def not_answering(seen: Seen, what: str) -> FogftError:

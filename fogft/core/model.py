@@ -140,6 +140,8 @@ class LinkReport:
         rtt_s: Round trip of the last probe.
         restarts: How often the server proxy restarted the user's `run` command.
         detail: Last error in words (connection refused, wrong certificate, ...).
+        differs: A service's type is not the same there as on the robot, or cannot be loaded.
+        offered: Name and type of each service that `run` offers, where that is found out.
     """
 
     id: ReplicaId
@@ -155,6 +157,8 @@ class LinkReport:
     won: int = 0
     restarts: int = 0
     detail: str = ""
+    differs: bool = False
+    offered: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)

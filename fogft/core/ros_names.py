@@ -49,6 +49,17 @@ def is_service_type(name: str) -> bool:
     )
 
 
+# Every node has these: parameters, loggers, its types, its life cycle.
+_OF_ROS = frozenset(("rcl_interfaces", "type_description_interfaces", "lifecycle_msgs"))
+
+
+def is_of_application(name: str, type_name: str) -> bool:
+    """Whether a service is an application's own: not one of ROS itself, hidden, or an action's."""
+    if not is_service_type(type_name) or type_name.partition("/")[0] in _OF_ROS:
+        return False
+    return not any(token.startswith("_") for token in name.split("/"))
+
+
 def suggested_service_type(name: str) -> str:
     """Return the service type that was probably meant, or an empty text."""
     parts = [part for part in re.split(r"[./:]+", name.strip()) if part]

@@ -42,7 +42,8 @@ class ProxyReport:
     def digest(self) -> object:
         """Return what a manager should react to at once; counters and ages are left out."""
         return frozenset(
-            (k.id, k.state, k.ready, k.draining, k.at_risk, k.disagrees) for k in self.links
+            (k.id, k.state, k.ready, k.draining, k.at_risk, k.disagrees, k.offered)
+            for k in self.links
         )
 
 
@@ -87,4 +88,6 @@ def _link(raw: Mapping[str, Any], pool_uid: str) -> LinkReport:
         won=int(raw.get("won") or 0),
         restarts=int(raw.get("restarts") or 0),
         detail=str(raw.get("detail") or ""),
+        differs=bool(raw.get("differs")),
+        offered=tuple(sorted((str(k), str(v)) for k, v in (raw.get("offered") or {}).items())),
     )

@@ -43,6 +43,7 @@ class ReplicaStatus:
         verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
             ``at risk``.
         age_s: Since its launch.
+        differs: The type of a service is not the same there as here; `detail` says how.
     """
 
     slot: int
@@ -62,6 +63,7 @@ class ReplicaStatus:
     restarts: int
     age_s: float
     detail: str
+    differs: bool = False
 
 
 @dataclass(frozen=True)
@@ -195,6 +197,7 @@ def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float)
         restarts=link.restarts if link is not None else 0,
         age_s=max(0.0, now - launched_at),
         detail=_detail(one),
+        differs=link is not None and link.differs,
     )
 
 

@@ -23,6 +23,7 @@ from fogft.core.records import SignedRecord
 from fogft.core.spec import ServiceSpec
 from fogft.proxy.dispatcher import Dispatcher, key_of
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
+from fogft.proxy.sameness import Define, Sameness
 from fogft.proxy.voting import VotingDispatcher
 from fogft.ros.port import RosClient, RosNode, RosServer
 from fogft.wire.port import Answer, Dialer, Link, Peer
@@ -72,6 +73,7 @@ class ClientProxy:
         node: The robot's side of ROS.
         dialer: Makes links.
         make_dispatcher: Makes the dispatcher of a service, given how to respond.
+        define: Returns the definition of a service type here; None to compare none.
         clock: Monotonic seconds.
     """
 
@@ -81,8 +83,11 @@ class ClientProxy:
         node: RosNode,
         dialer: Dialer,
         make_dispatcher: MakeDispatcher,
+        *,
         clock: Callable[[], float] = time.monotonic,
+        define: Define | None = None,
     ) -> None:
+        self._sameness = Sameness(define)
         self._pool_uid = pool_uid
         self._node = node
         self._dialer = dialer
@@ -213,6 +218,7 @@ class ClientProxy:
     def _drop(self, id: ReplicaId) -> None:
         self._members.pop(id, None)
         link = self._links.pop(id)
+        self._sameness.forget(id)
         self._route()  # first out of every route, then closed: what was open there is LOST
         link.close()
         log.info("link_dropped replica=%s", id.short)
@@ -270,15 +276,25 @@ class ClientProxy:
         self._next_look = min(looks, default=NEVER)
         return changed
 
+    def _differences(self, link: Link) -> Mapping[str, str]:
+        return self._sameness.differences(link, [s.spec for s in self._services.values()])
+
     def _route(self) -> None:
+        differ = {id: self._differences(link) for id, link in self._links.items()}
         for service in self._services.values():
             name = service.spec.name
             if isinstance(service.dispatcher, OrderedDispatcher):
                 # It brings replicas to readiness itself, and needs those that are not.
-                usable = [link for link in self._links.values() if link.usable]
+                usable = [
+                    x for x in self._links.values() if x.usable and name not in differ[x.peer.id]
+                ]
                 service.dispatcher.route(usable)
                 continue
-            able = [link for link in self._links.values() if name in link.ready]
+            able = [
+                link
+                for id, link in self._links.items()
+                if name in link.ready and name not in differ[id]
+            ]
             fresh = [link for link in able if not self._draining(link)]
             fallback = service.spec.fallback
             if able or (fallback is not None and fallback.while_none_ready):
@@ -329,12 +345,16 @@ class ClientProxy:
     def _link_report(self, link: Link) -> dict[str, Any]:
         status = link.status()
         answer = status.probe_answer
+        differ = self._differences(link)
+        ours = next(iter(differ.values()), "") if link.usable else ""
         id = link.peer.id
         return {
             "slot": id.slot,
             "generation": id.generation,
             "state": status.state.value,
-            "ready": sorted(link.ready),
+            "ready": sorted(link.ready - differ.keys()),
+            "differs": bool(ours),
+            "offered": dict(answer.offered) if answer and link.usable else {},
             "draining": self._draining(link),
             "at_risk": bool(answer and answer.at_risk),
             "disagrees": any(
@@ -349,7 +369,7 @@ class ClientProxy:
             "won": sum(s.dispatcher.won(id) for s in self._services.values()),
             "restarts": answer.restarts if answer else 0,
             "work": dict(answer.work) if answer else {},
-            "detail": status.detail or (answer.detail if answer else ""),
+            "detail": status.detail or ours or (answer.detail if answer else ""),
         }
 
     def trace(self) -> list[dict[str, Any]]:

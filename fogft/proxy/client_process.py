@@ -84,6 +84,7 @@ def run(config_path: Path) -> None:
     if not lock.acquire(wait=False):
         raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
     environment.prepare(os.environ)
+    from fogft.ros.definition import definition
     from fogft.ros.node import SerialisedNode
 
     memory_tuning.tune()
@@ -92,7 +93,7 @@ def run(config_path: Path) -> None:
     make = functools.partial(
         make_dispatcher, marks=config.status.with_suffix(".marks"), pool_uid=config.pool_uid
     )
-    proxy = ClientProxy(config.pool_uid, node, _dialer(config, sign), make)
+    proxy = ClientProxy(config.pool_uid, node, _dialer(config, sign), make, define=definition)
     proxy.serve(config.services)
     following = Following(config)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())

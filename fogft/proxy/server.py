@@ -21,10 +21,13 @@ from collections.abc import Callable
 
 from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.core import names
+from fogft.core.definitions import Definition
+from fogft.core.errors import RosError
 from fogft.core.model import ReplicaId
 from fogft.core.spec import ServiceSpec
 from fogft.core.spec_state import StateSpec
 from fogft.proxy.interruption import CANCEL_TYPE
+from fogft.proxy.offering import Offering
 from fogft.proxy.ordered_responder import Clients, OrderedResponder, StateBytes
 from fogft.proxy.responder import Responder
 from fogft.proxy.supervisor import Supervisor
@@ -39,11 +42,12 @@ class ServerProxy:
 
     Args:
         id: Which replica this is.
-        services: What it answers.
+        services: What it answers; none for whatever the command offers.
         listener: Its end of the wire; `serve` is called here.
         make_node: Joins ROS; called again after each death of the command.
         supervisor: The user's command.
         make_state: Says how the state of a stateful service travels.
+        define: Returns the definition of a service type here, for the robot to compare.
         max_in_flight: Requests held at once.
         orphan_after_s: With no sign of the pool's manager for so long, `orphaned` is true.
         clock: Monotonic seconds.
@@ -58,12 +62,14 @@ class ServerProxy:
         supervisor: Supervisor,
         *,
         make_state: Callable[[StateSpec], StateBytes] | None = None,
+        define: Callable[[str], Definition] | None = None,
         max_in_flight: int = 512,
         orphan_after_s: float = 3600.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._id = id
-        self._services = services
+        self._offering = Offering(services, define, clock)
+        self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
         self._listener = listener
         self._make_node = make_node
         self._supervisor = supervisor
@@ -92,16 +98,17 @@ class ServerProxy:
 
     def start(self) -> None:
         """Begin to listen and start the user's command."""
-        keys = {
-            s.name: names.service_key(self._id.pool_uid, self._id.slot, s.name, s.type)
-            for s in self._services
-        }
+        keys = self._keys(self._offering.services)
         self._join_ros()
         # Where no service is stateful there is nothing to choose, and nothing to pay.
         request = self._request if self._ordered else self.responder.request
         self._listener.serve(keys, request, self._probe, self.responder.cancel)
         self._supervisor.poll()
         log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
+
+    def _keys(self, services: tuple[ServiceSpec, ...]) -> dict[str, str]:
+        id = self._id
+        return {s.name: names.service_key(id.pool_uid, id.slot, s.name, s.type) for s in services}
 
     def run_once(self) -> None:
         """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
@@ -111,10 +118,22 @@ class ServerProxy:
             self._crashed()
             self._leave_ros()
             self._join_ros()
+        self._take_up_new()
         self._look_for_services()
         self.responder.tick()
         for ordered in self._ordered.values():
             ordered.tick(self._supervisor.alive)
+
+    def _take_up_new(self) -> None:
+        if self._node is None or not self._supervisor.alive:
+            self._offering.reset()
+            return
+        complete = len(self._ready) == len(self._offering.services)
+        for service in self._offering.look(self._node, complete=complete):
+            log.info("service_found replica=%s service=%s type=%s", self._id, service.name,
+                     service.type)  # fmt: skip
+            self._make_client(service)
+            self._listener.add(self._keys((service,)))
 
     def _crashed(self) -> None:
         self.responder.crashed()
@@ -184,19 +203,36 @@ class ServerProxy:
             self._at_risk = True
 
     def _join_ros(self) -> None:
-        self._node = self._make_node()
-        self._clients = {s.name: self._node.client(s.name, s.type) for s in self._services}
+        node = self._node = self._make_node()
+        self._clients = {}
         self._servers = {}
-        cancels = {
-            s.name: self._node.client(s.cancel, CANCEL_TYPE) for s in self._services if s.cancel
-        }
+        services = self._offering.services
+        for service in services:
+            self._make_client(service)
+        cancels = {s.name: node.client(s.cancel, CANCEL_TYPE) for s in services if s.cancel}
         self.responder.use(self._clients, cancels)
-        for service in self._services:
+        for service in services:
+            if service.name not in self._clients:
+                continue
             if service.name in self._ordered and service.state is not None:
                 ends = (service.state.snapshot, service.state.restore)
-                snapshot, restore = (self._node.client(end.name, end.type) for end in ends)
+                snapshot, restore = (node.client(end.name, end.type) for end in ends)
                 clients = Clients(self._clients[service.name], snapshot, restore)
                 self._ordered[service.name].use(clients)
+
+    def _make_client(self, service: ServiceSpec) -> None:
+        """Make a service's client. Without its type the replica goes on, and says why."""
+        if self._node is None:
+            return
+        try:
+            self._clients[service.name] = self._node.client(service.name, service.type)
+        except RosError as error:
+            if self._not_usable.get(service.name) != error.message:
+                log.error("service_not_usable replica=%s service=%s reason=%r", self._id,
+                          service.name, error.message)  # fmt: skip
+            self._not_usable[service.name] = error.message
+        else:
+            self._not_usable.pop(service.name, None)
 
     def _leave_ros(self) -> None:
         node, self._node, self._clients = self._node, None, {}
@@ -232,17 +268,21 @@ class ServerProxy:
             + sum(ordered.in_flight for ordered in self._ordered.values()),
             detail=self._detail(),
             work=self.responder.report(),
+            offered=self._offering.told,
+            types=self._offering.types() if probe.describe else {},
         )
 
     def _detail(self) -> str:
-        if len(self._ready) == len(self._services):
+        services = self._offering.services
+        if services and len(self._ready) == len(services):
             return self._state_detail()
+        for why in self._not_usable.values():
+            return why
         if not self._supervisor.alive:
             if not self._supervisor.last_exit:
                 return "`run` has not started"
             return f"`run` {self._supervisor.last_exit}: see `fogft logs {self._id.slot}`"
-        missing = sorted({s.name for s in self._services} - self._ready)
-        return f"`run` does not offer {', '.join(missing)} yet"
+        return self._offering.missing(self._ready)
 
     def _state_detail(self) -> str:
         for name, ordered in self._ordered.items():

@@ -78,6 +78,7 @@ def run(
 
 
 def _make(config: ServerProxyConfig) -> ServerProxy:
+    from fogft.ros.definition import definition
     from fogft.ros.node import SerialisedNode
     from fogft.ros.state_bytes import StateBytes
     from fogft.wire.handshakes import HandshakeLog
@@ -95,6 +96,7 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
         make_node,
         Supervisor(config.run, config.workdir, environ, stdout=handshakes.stdout),
         make_state=StateBytes,
+        define=definition,
         max_in_flight=config.max_in_flight,
         orphan_after_s=config.orphan_after_s,
     )

@@ -82,6 +82,11 @@ class MemoryDomain:
         with self._lock:
             return [s for s in self._servers if (s.name, s.type_name) == (name, type_name)]
 
+    def offered(self, without: Collection[object]) -> dict[str, str]:
+        """Return name -> type of what is served, except by some servers."""
+        with self._lock:
+            return {s.name: s.type_name for s in self._servers if s not in without}
+
     def join(self, server: MemoryServer) -> None:
         """Let a server be found."""
         with self._lock:
@@ -215,6 +220,10 @@ class MemoryNode:
         client = MemoryClient(self._domain, name, type_name)
         self._made.append(client)
         return client
+
+    def offered(self) -> dict[str, str]:
+        """Return name -> type of what is served in the domain, but not by this node."""
+        return self._domain.offered(without=self._made)
 
     def _check(self, type_name: str) -> None:
         self._domain.check_type(type_name)

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from fogft.core import ros_names
 from fogft.core.errors import RosError
 from fogft.ros import transfer
 from fogft.ros.entities import Client, Server
@@ -23,6 +24,7 @@ from fogft.ros.entities import Client, Server
 log = logging.getLogger(__name__)
 
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
+_NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, and proxies
 _NO_LIMIT = -1  # of rcl_wait: until something happens
 
 # A process that proxies must not leave files in ~/.ros/log; it has a log of its own.
@@ -140,6 +142,28 @@ class SerialisedNode:
 
         client: Client = self._create(name, type_name, create)
         return client
+
+    def offered(self) -> dict[str, str]:
+        """Return name -> type of the services that applications offer, as discovery knows them.
+
+        Asked node by node: the list of all names has clients' in it too.
+        """
+        found: dict[str, str] = {}
+        try:
+            nodes = self._node.get_node_names_and_namespaces()
+        except Exception:  # rclpy's InvalidHandle: closed meanwhile
+            return found
+        for name, namespace in nodes:
+            if name.startswith(_NOT_APPLICATIONS):
+                continue
+            try:
+                services = self._node.get_service_names_and_types_by_node(name, namespace)
+            except Exception:  # the node has gone since
+                continue
+            for service, kinds in services:
+                if kinds and ros_names.is_of_application(service, kinds[0]):
+                    found.setdefault(service, kinds[0])
+        return found
 
     def _create(
         self, name: str, type_name: str, create: Callable[[transfer.Transfer, Any], Any]

@@ -9,7 +9,7 @@ Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.ros.memory` (te
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from fogft.core.errors import RosError
@@ -77,6 +77,12 @@ class RosNode(Protocol):
 
         Raises:
             RosError: The type cannot be loaded.
+        """
+
+    def offered(self) -> Mapping[str, str]:
+        """Return name -> type of the services that applications offer in this domain.
+
+        As discovery knows them now, without those of ROS itself and of proxies.
         """
 
     def close(self) -> None:

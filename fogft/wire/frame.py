@@ -14,6 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fogft.core import definitions
+from fogft.core.definitions import Definition
 from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.service_form import LONGEST_S
 from fogft.wire.port import Probe, ProbeAnswer
@@ -223,7 +225,14 @@ def decode_cancel(frame: bytes) -> list[bytes]:
 
 def encode_probe(probe: Probe) -> bytes:
     """Return a probe as compact JSON."""
-    return _to_json({"v": VERSION, "robot": probe.robot, "manager_age_s": probe.manager_age_s})
+    written: dict[str, Any] = {
+        "v": VERSION,
+        "robot": probe.robot,
+        "manager_age_s": probe.manager_age_s,
+    }
+    if probe.describe:
+        written["describe"] = True
+    return _to_json(written)
 
 
 def decode_probe(frame: bytes) -> Probe:
@@ -234,33 +243,50 @@ def decode_probe(frame: bytes) -> Probe:
     """
     raw = _from_json(frame, PROBE_LIMIT)
     age = raw.get("manager_age_s")
-    return Probe(_text(raw, "robot"), None if age is None else _seconds(raw, "manager_age_s"))
+    return Probe(
+        _text(raw, "robot"),
+        None if age is None else _seconds(raw, "manager_age_s"),
+        raw.get("describe") is True,
+    )
 
 
 def encode_probe_answer(answer: ProbeAnswer) -> bytes:
     """Return a probe's answer as compact JSON; a long `detail` is cut.
 
+    Definitions of types are left out where they do not fit.
+
     Raises:
         ValueError: It names too many services for one frame (64 KiB).
     """
-    frame = _to_json(
-        {
-            "v": VERSION,
-            "slot": answer.slot,
-            "generation": answer.generation,
-            "incarnation": answer.incarnation,
-            "ready": sorted(answer.ready),
-            "draining": answer.draining,
-            "at_risk": answer.at_risk,
-            "restarts": answer.restarts,
-            "in_flight": answer.in_flight,
-            "work": dict(answer.work),
-            "detail": answer.detail[:DETAIL_LIMIT].encode(errors="replace").decode(),
-        }
-    )
+    written = _plain_answer(answer)
+    if answer.types:
+        types = {name: definitions.to_plain(of) for name, of in answer.types.items()}
+        frame = _to_json({**written, "types": types})
+        if len(frame) <= PROBE_ANSWER_LIMIT:
+            return frame
+    frame = _to_json(written)
     if len(frame) > PROBE_ANSWER_LIMIT:
         raise ValueError(f"a probe's answer of {len(frame)} bytes")
     return frame
+
+
+def _plain_answer(answer: ProbeAnswer) -> dict[str, Any]:
+    written: dict[str, Any] = {
+        "v": VERSION,
+        "slot": answer.slot,
+        "generation": answer.generation,
+        "incarnation": answer.incarnation,
+        "ready": sorted(answer.ready),
+        "draining": answer.draining,
+        "at_risk": answer.at_risk,
+        "restarts": answer.restarts,
+        "in_flight": answer.in_flight,
+        "work": dict(answer.work),
+        "detail": answer.detail[:DETAIL_LIMIT].encode(errors="replace").decode(),
+    }
+    if answer.offered:
+        written["offered"] = dict(answer.offered)
+    return written
 
 
 def decode_probe_answer(frame: bytes) -> ProbeAnswer:
@@ -290,6 +316,8 @@ def decode_probe_answer(frame: bytes) -> ProbeAnswer:
         in_flight=_count(raw, "in_flight"),
         work=_numbers(raw, "work"),
         detail=_text(raw, "detail"),
+        offered=_texts(raw, "offered"),
+        types=_types(raw),
     )
 
 
@@ -347,6 +375,25 @@ def _numbers(raw: dict[str, Any], key: str) -> dict[str, float]:
     if not isinstance(found, dict):
         raise FrameError(f"`{key}` is not a map of numbers")
     return {_check_text(name, key): _seconds(found, name) for name in found}
+
+
+def _texts(raw: dict[str, Any], key: str) -> dict[str, str]:
+    found = raw.get(key, {})
+    if not isinstance(found, dict):
+        raise FrameError(f"`{key}` is not a map of texts")
+    return {_check_text(name, key): _check_text(value, key) for name, value in found.items()}
+
+
+def _types(raw: dict[str, Any]) -> dict[str, Definition]:
+    found = raw.get("types", {})  # an older replica tells none
+    if not isinstance(found, dict):
+        raise FrameError("`types` is not a map of definitions")
+    try:
+        return {_check_text(k, "types"): definitions.from_plain(v) for k, v in found.items()}
+    except FrameError:
+        raise
+    except ValueError as error:
+        raise FrameError(f"`types`: {error}") from error
 
 
 def _seconds(raw: dict[str, Any], key: str) -> float:

@@ -190,6 +190,10 @@ class MemoryListener:
         self._services = {key: name for name, key in services.items()}
         self._on_request, self._on_probe, self._on_cancel = on_request, on_probe, on_cancel
 
+    def add(self, services: Mapping[str, str]) -> None:
+        """Hear requests for further services too (name -> key)."""
+        self._services |= {key: name for name, key in services.items()}
+
     def request(self, key: str, incoming: MemoryIncoming) -> None:
         """Take a request that arrived."""
         name = self._services.get(key)

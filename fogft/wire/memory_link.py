@@ -183,7 +183,9 @@ class MemoryLink:
             self._next_probe = now + (every_s if self.usable else _FIRST_PROBES_EVERY_S)
             session.asked.began(now)
             self._silence.began(now)
-            probe = Probe(self._dialer.robot, self._dialer.manager_age())
+            known = self._status.probe_answer
+            describe = not self.usable or known is None or not known.types
+            probe = Probe(self._dialer.robot, self._dialer.manager_age(), describe)
             self._wire.post(session, lambda: self._probed(session, probe, now))
 
     def _connect(self) -> None:
@@ -212,6 +214,9 @@ class MemoryLink:
                 f"not {id.short}"
             )
             return
+        known = self._status.probe_answer
+        if not answer.types and known is not None and known.incarnation == answer.incarnation:
+            answer = replace(answer, types=known.types)
         now = self._wire.now
         session.asked.ended()
         self._silence.ended()

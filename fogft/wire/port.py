@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from fogft.core.definitions import Definition
 from fogft.core.model import LinkState, ReplicaId
 from fogft.core.records import SignedRecord
 
@@ -26,10 +27,12 @@ class Probe:
     Attributes:
         manager_age_s: Since the robot last saw a sign of the pool's manager; None if
             it never did.
+        describe: The answer shall tell the definitions of the services' types.
     """
 
     robot: str
     manager_age_s: float | None = None
+    describe: bool = False
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,9 @@ class ProbeAnswer:
         in_flight: Requests that it holds.
         work: What became of requests since its start, by name (`Responder.report`).
         detail: Why it is not ready, in words; empty when it is.
+        offered: Service name -> type of what `run` offers, where it is to be found out.
+        types: Type name -> its definition on the replica. Told only where a probe asks for
+            it; a link keeps what it was told.
     """
 
     slot: int
@@ -58,6 +64,8 @@ class ProbeAnswer:
     in_flight: int = 0
     detail: str = ""
     work: Mapping[str, float] = field(default_factory=dict)
+    offered: Mapping[str, str] = field(default_factory=dict)
+    types: Mapping[str, Definition] = field(default_factory=dict)
 
 
 class Refusal:
@@ -258,6 +266,9 @@ class Listener(Protocol):
             on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
                 block for a moment, which holds up nothing but probes.
         """
+
+    def add(self, services: Mapping[str, str]) -> None:
+        """Hear requests for further services too (name -> key); only after `serve`."""
 
     def revoke(self, names: Collection[str]) -> None:
         """Let the holders of these certificates (common names) in no more. Repeatable."""

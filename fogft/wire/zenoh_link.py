@@ -14,7 +14,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 
 import zenoh
@@ -326,7 +326,10 @@ class ZenohLink:
     def _probe(self, connection: Connection, now: float) -> None:
         self._asked.began(now)
         self._silence.began(now)
-        probe = Probe(self._dialer.robot, self._dialer.manager_age())
+        known = self._probe_answer
+        # Its types are asked for once a connection: it may be another process at each.
+        describe = self._live is not connection or known is None or not known.types
+        probe = Probe(self._dialer.robot, self._dialer.manager_age(), describe)
 
         def heard(content: bytes) -> None:
             self._heard.put(_Heard(connection, content, now, time.monotonic()))
@@ -369,6 +372,9 @@ class ZenohLink:
                 f"`{self._peer.endpoint}` says that it is {answer.slot}.{answer.generation}, "
                 f"not {id.short}"
             )
+        known = self._probe_answer
+        if not answer.types and known is not None and known.incarnation == answer.incarnation:
+            answer = replace(answer, types=known.types)
         self._asked.ended()
         self._silence.ended()
         self._heard_at = heard.at

@@ -157,6 +157,7 @@ class ZenohListener:
         self._chores: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._session: zenoh.Session | None = None
         self._queryables: list[object] = []
+        self._on_request: Callable[[Incoming], None] | None = None
 
     @property
     def endpoint(self) -> str:
@@ -190,8 +191,8 @@ class ZenohListener:
             self._counters,
             also=self._count_handshakes,
         )
-        for name, key in services.items():
-            self._declare(session, key, partial(self._request, name, on_request))
+        self._on_request = on_request
+        self.add(services)
         cancel_key = names.cancel_key(self._id.pool_uid, self._id.slot)
         self._declare(session, cancel_key, partial(self._cancel, on_cancel))
         records_key = names.records_key(self._id.pool_uid, self._id.slot)
@@ -199,6 +200,14 @@ class ZenohListener:
         # Last: who is told that this replica is ready finds every service.
         probe_key = names.probe_key(self._id.pool_uid, self._id.slot)
         self._declare(session, probe_key, partial(self._probe, on_probe))
+
+    def add(self, services: Mapping[str, str]) -> None:
+        """Hear requests for further services too (name -> key)."""
+        session, on_request = self._session, self._on_request
+        if session is None or on_request is None:
+            return  # it is closed
+        for name, key in services.items():
+            self._declare(session, key, partial(self._request, name, on_request))
 
     def _peers(self) -> dict[Address, str]:
         session = self._session

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from fogft.core import names
+from fogft.core.definitions import Definition
 from fogft.core.errors import WireError
 from fogft.core.model import LinkState, ReplicaId
 from fogft.wire.link_window import ATTEMPTS_LIMIT
@@ -369,7 +371,43 @@ def test_a_probe_tells_of_robot_and_manager(world: World, replica: Replica, owne
     dialer = world.dialer(robot="ada", manager_age=lambda: 4.5)
     link = dialer.dial(peer(replica.listener.endpoint), keys(0), owner)
     world.wait_for(lambda: link.usable)
-    assert replica.probes[-1] == Probe("ada", 4.5)
+    asked = replica.probes[-1]
+    assert (asked.robot, asked.manager_age_s) == ("ada", 4.5)
+
+
+def test_definitions_are_asked_for_once_and_kept(
+    world: World, replica: Replica, owner: Owner
+) -> None:
+    """They are long and do not change while a replica lives."""
+    told = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
+    replica.answer = ProbeAnswer(0, 1, "first", frozenset({SERVICE}), types=told)
+    link = world.dialer().dial(peer(replica.listener.endpoint), keys(0), owner)
+    world.wait_for(lambda: link.usable)
+    assert replica.probes[0].describe
+    replica.answer = ProbeAnswer(0, 1, "first", frozenset())
+    world.wait_for(lambda: not link.ready)
+    answer = link.status().probe_answer
+    assert answer is not None
+    assert answer.types == told
+    asked = len(replica.probes)
+    world.wait_for(lambda: len(replica.probes) > asked)
+    assert not replica.probes[-1].describe
+
+
+def test_a_service_can_be_added_to_a_listener_that_serves(
+    world: World, replica: Replica, owner: Owner
+) -> None:
+    key = names.service_key(POOL_UID, 0, "/more", "std_srvs/srv/SetBool")
+    link = world.dialer().dial(peer(replica.listener.endpoint), {**keys(0), "/more": key}, owner)
+    world.wait_for(lambda: link.usable)
+    replica.listener.add({"/more": key})
+    request = b"m" * 16
+    world.wait_for(lambda: link.offer("/more", request, b"CDR.more", 5.0))
+    world.wait_for(lambda: replica.requests)
+    assert replica.requests[0].service == "/more"
+    replica.requests[0].reply(b"CDR.answer")
+    world.wait_for(lambda: owner.answers)
+    assert (owner.answers[0][1].service, owner.answers[0][1].payload) == ("/more", b"CDR.answer")
 
 
 @pytest.mark.parametrize("said", [(1, 1), (0, 2)], ids=["another slot", "another generation"])

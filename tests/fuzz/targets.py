@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.core import holders, membership, records
+from fogft.core.definitions import Definition
 from fogft.core.errors import CredentialError, StateError
 from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.record_set import RecordSet
@@ -153,7 +154,9 @@ def _bundle() -> bytes:
 def targets() -> dict[str, Target]:
     """Return all decoders by name."""
     framed, recorded = (FrameError,), (RecordError,)
-    answer = ProbeAnswer(0, 1, "x", frozenset({"/s"}), detail="why")
+    types = {"a/srv/B": Definition("RIHS01_0", {"request": (("x", "a/C[2]"),), "a/C": ()})}
+    offered = {"/s": "a/srv/B"}
+    answer = ProbeAnswer(0, 1, "x", frozenset({"/s"}), detail="why", types=types, offered=offered)
     plain = [json.dumps(records.to_plain(one)).encode() for one in _records()]
     known = Membership("p", UID, 1, 2, (Member(ReplicaId(UID, 0, 1), "h:1"),), frozenset({ROBOT}))
     greeting = _greeting()

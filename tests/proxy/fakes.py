@@ -33,6 +33,7 @@ class FakeLink:
         self.offered: list[tuple[str, bytes, bytes, float]] = []
         self.forgotten: list[bytes] = []
         self.closed = False
+        self.told: ProbeAnswer | None = None
 
     @property
     def usable(self) -> bool:
@@ -52,7 +53,7 @@ class FakeLink:
 
     def status(self) -> LinkStatus:
         state = LinkState.UP if self.ready else LinkState.SUSPECT
-        return LinkStatus(state, None, 0.0, 0.0, 0.001, 0, 0, 0, "")
+        return LinkStatus(state, self.told, 0.0, 0.0, 0.001, 0, 0, 0, "")
 
     def close(self) -> None:
         self.closed = True
@@ -175,6 +176,7 @@ class FakeNode:
         self.closed = False
         self.alive = True
         self.refuses = ""
+        self.graph: dict[str, str] = {}
 
     def serve(self, name, type_name, on_request) -> FakeServer:
         if self.refuses == name:
@@ -183,8 +185,13 @@ class FakeNode:
         return self.servers[name]
 
     def client(self, name, type_name) -> FakeClient:
+        if self.refuses == name:
+            raise RosError("its type cannot be loaded")
         self.clients[name] = FakeClient()
         return self.clients[name]
+
+    def offered(self) -> dict[str, str]:
+        return dict(self.graph)
 
     def close(self) -> None:
         self.closed = True
@@ -204,6 +211,9 @@ class FakeListener:
         self.services = dict(services)
         self.on_request = on_request
         self.on_probe: Callable[[Probe], ProbeAnswer] = on_probe
+
+    def add(self, services) -> None:
+        self.services |= services
 
     def counters(self):
         return {}

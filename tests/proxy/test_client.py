@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import pytest
 
+from fogft.core.definitions import Definition
 from fogft.core.errors import RosError
 from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.spec import ServiceSpec
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.dispatcher import Dispatcher
-from fogft.wire.port import Refusal
+from fogft.wire.port import ProbeAnswer, Refusal
 from tests.proxy.fakes import UID, Clock, FakeDialer, FakeNode
 
 SET_BOOL = "std_srvs/srv/SetBool"
+OURS = {SET_BOOL: Definition(fields={"request": (("data", "boolean"),)})}
 
 
 def member(slot: int, generation: int = 1, *, port: int = 1, draining: bool = False) -> Member:
@@ -34,6 +36,7 @@ class Scene:
             self.dialer,
             lambda spec, respond, wake: Dispatcher(spec, respond, wake=wake, clock=self.clock),
             clock=self.clock,
+            define=OURS.__getitem__,
         )
         self.proxy.serve([ServiceSpec(name, SET_BOOL) for name in names or ("/s",)])
 
@@ -237,3 +240,34 @@ def test_a_proxy_whose_take_loop_ended_says_so_and_does_not_go_on():
     scene.node.alive = False
     with pytest.raises(RosError):
         scene.proxy.run_once(0)
+
+
+def told(slot: int, kind: str) -> ProbeAnswer:
+    types = {SET_BOOL: Definition(fields={"request": (("data", kind),)})}
+    return ProbeAnswer(slot, 1, "i", frozenset({"/s"}), types=types)
+
+
+def test_a_replica_whose_type_differs_is_not_asked_and_says_which_field():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    for link, kind in zip(scene.dialer.links, ("boolean", "int64"), strict=True):
+        link.told = told(link.peer.id.slot, kind)
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    assert [len(link.offered) for link in scene.dialer.links] == [1, 0]
+    good, bad = scene.proxy.report()["links"]
+    assert (good["differs"], good["ready"], bad["differs"], bad["ready"]) == (
+        False,
+        ["/s"],
+        True,
+        [],
+    )
+    assert "field `request.data` is `boolean` here and `int64` on the replica" in bad["detail"]
+
+
+def test_where_every_type_differs_nothing_is_advertised():
+    scene = Scene()
+    scene.follow(member(0))
+    scene.dialer.links[0].told = told(0, "int64")
+    scene.ready(*scene.dialer.links)
+    assert scene.node.servers == {}

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fogft.core.definitions import difference
 from fogft.core.errors import RosError
 from fogft.proxy.interruption import CANCEL_TYPE, EMPTY_REQUEST
 from fogft.ros import types
+from fogft.ros.definition import definition
 
 from .conftest import SET_BOOL
 
@@ -157,3 +161,29 @@ def test_the_request_of_a_cancel_service_is_what_ros_would_serialise():
     expected = serialize_message(types.load_service_type(CANCEL_TYPE).Request())
     assert bytes(expected)[:4] == EMPTY_REQUEST[:4]
     assert len(expected) == len(EMPTY_REQUEST)
+
+
+def test_a_definition_has_the_hash_and_the_fields_of_the_loaded_code() -> None:
+    found = definition("nav_msgs/srv/GetPlan")
+    assert found.trouble == ""
+    assert found.fields["request"][0] == ("start", "geometry_msgs/PoseStamped")
+    assert found.fields["geometry_msgs/Quaternion"][-1] == ("w", "double")
+    assert re.fullmatch(r"RIHS01_[0-9a-f]{64}\+RIHS01_[0-9a-f]{64}", found.hash)
+
+
+def test_every_installed_type_can_be_described_and_is_the_same_as_itself() -> None:
+    names = types.installed_service_types()
+    assert len(names) > 20
+    for name in names:
+        found = definition(name)
+        assert found.trouble == "", name
+        assert difference(name, found, replace(found, hash="")) == ""
+
+
+def test_two_types_of_two_packages_are_told_apart_by_a_field() -> None:
+    found = difference("a/srv/B", definition(SET_BOOL), definition("std_srvs/srv/Trigger"))
+    assert "field `request.data` (`boolean`) is missing on the replica" in found
+
+
+def test_a_type_that_is_not_here_is_trouble_and_no_exception() -> None:
+    assert "no package `my_msgs`" in definition("my_msgs/srv/Detect").trouble

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.core.definitions import Definition
 from fogft.wire import frame
 from fogft.wire.frame import FrameError
 from fogft.wire.port import Probe, ProbeAnswer
@@ -204,6 +205,17 @@ def test_a_long_detail_is_cut_and_the_answer_still_travels() -> None:
     answer = ProbeAnswer(0, 1, "i", detail="\ud800" + "x" * 100_000)
     decoded = frame.decode_probe_answer(frame.encode_probe_answer(answer))
     assert len(decoded.detail) == frame.DETAIL_LIMIT
+
+
+def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels() -> None:
+    """Health never depends on how long a type is."""
+    large = {"a/srv/B": Definition("h", {"request": (("x" * 70_000, "int32"),)})}
+    small = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
+    for types, told in ((large, {}), (small, small)):
+        answer = ProbeAnswer(0, 1, "i", frozenset({"/s"}), types=types, offered={"/s": "a/srv/B"})
+        decoded = frame.decode_probe_answer(frame.encode_probe_answer(answer))
+        assert (decoded.types, decoded.ready) == (told, {"/s"})
+        assert decoded.offered == {"/s": "a/srv/B"}
 
 
 def test_too_many_services_for_a_frame_are_an_error_at_the_sender() -> None:

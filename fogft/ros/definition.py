@@ -1,0 +1,58 @@
+"""The definition of a service type, as the Python code generated for it tells.
+
+Owns: a type's fields and hash. Not here: comparing two definitions (`fogft.core.definitions`).
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+from fogft.core.definitions import REQUEST, RESPONSE, Definition, Fields, nested
+from fogft.core.errors import RosError
+from fogft.ros.types import load_service_type
+
+
+def definition(type_name: str) -> Definition:
+    """Return what a service type is here. One that cannot be loaded has `trouble`; never raises."""
+    try:
+        service_type = load_service_type(type_name)
+        fields: dict[str, Fields] = {}
+        for part, message in ((REQUEST, service_type.Request), (RESPONSE, service_type.Response)):
+            _add(part, message, fields)
+    except RosError as error:
+        return Definition(trouble=error.message)
+    except Exception as error:  # generated code: anything may go wrong in it
+        return Definition(trouble=f"its fields cannot be read: {error!r}")
+    return Definition(_hash(type_name), fields)
+
+
+def _add(name: str, message: Any, fields: dict[str, Fields]) -> None:
+    """Add a message's fields under a name, then those of what it is made of."""
+    fields[name] = tuple(message.get_fields_and_field_types().items())
+    for _, kind in fields[name]:
+        other = nested(kind)
+        if other and other not in fields:
+            package, _, short = other.partition("/")
+            _add(other, getattr(importlib.import_module(f"{package}.msg"), short), fields)
+
+
+def _hash(type_name: str) -> str:
+    """Return a type's hash from the file that was installed with its code; empty without one.
+
+    That of request and response together: the service's own also covers its event message,
+    which never travels and may change with the distribution.
+    """
+    package, _, short = type_name.split("/")
+    code = Path(str(importlib.import_module(package).__file__)).resolve()
+    for prefix in code.parents:
+        path = prefix / "share" / package / "srv" / f"{short}.json"
+        try:
+            told = json.loads(path.read_text())["type_hashes"]
+            hashes = {one["type_name"]: str(one["hash_string"]) for one in told}
+            return "+".join(hashes[f"{type_name}_{part}"] for part in ("Request", "Response"))
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+    return ""
