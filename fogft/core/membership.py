@@ -16,11 +16,13 @@ from collections.abc import Collection, Iterable, Mapping
 from enum import Enum
 from typing import Any
 
+from fogft.core import topology as topologies
 from fogft.core.errors import StateError
 from fogft.core.holders import holder_of
 from fogft.core.model import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.core.names import POOL_UID_PATTERN, replica_certificate_name
 from fogft.core.spec import PoolSpec
+from fogft.core.topology import Topology
 
 
 class Found(Enum):
@@ -94,20 +96,23 @@ def successor(
     epoch: int,
     members: tuple[Member, ...],
     revoked: Collection[str] = (),
+    topology: Topology | None = None,
 ) -> Membership | None:
     """Return the next membership to write, or None when nothing would change.
 
     What was revoked stays revoked, whether or not it is named again.
     """
+    topology = topology or Topology()
     if current is None or current.pool_uid != pool_uid:
-        return Membership(pool, pool_uid, epoch, 1, members, frozenset(revoked))
+        return Membership(pool, pool_uid, epoch, 1, members, frozenset(revoked), topology)
     if epoch < current.epoch:
         return None  # a manager out of office writes nothing
     all_revoked = current.revoked | frozenset(revoked)
-    if epoch == current.epoch and (members, all_revoked) == (current.members, current.revoked):
+    now = (current.members, current.revoked, current.topology)
+    if epoch == current.epoch and (members, all_revoked, topology) == now:
         return None
     version = current.version + 1 if epoch == current.epoch else 1
-    return Membership(pool, pool_uid, epoch, version, members, all_revoked)
+    return Membership(pool, pool_uid, epoch, version, members, all_revoked, topology)
 
 
 def to_dict(membership: Membership) -> dict[str, Any]:
@@ -127,6 +132,7 @@ def to_dict(membership: Membership) -> dict[str, Any]:
             for m in membership.members
         ],
         "revoked": sorted(membership.revoked),
+        "topology": topologies.to_plain(membership.topology),
     }
     return {**content, "checksum": _checksum(content)}
 
@@ -143,13 +149,21 @@ def from_dict(raw: Any) -> Membership:
             raise ValueError("its checksum is wrong")
         parts = {key: content[key] for key in ("pool", "pool_uid", "epoch", "version", "members")}
         parts["revoked"] = content.get("revoked", ())  # older versions knew none
+        parts["topology"] = content.get("topology")
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error
     return from_parts(**parts)
 
 
 def from_parts(
-    *, pool: Any, pool_uid: Any, epoch: Any, version: Any, members: Any, revoked: Any = ()
+    *,
+    pool: Any,
+    pool_uid: Any,
+    epoch: Any,
+    version: Any,
+    members: Any,
+    revoked: Any = (),
+    topology: Any = None,
 ) -> Membership:
     """Return a membership from plain data.
 
@@ -166,6 +180,7 @@ def from_parts(
             version=_count(version),
             members=tuple(_member(pool_uid, entry) for entry in members),
             revoked=frozenset(_revoked(pool_uid, name) for name in revoked),
+            topology=Topology() if topology is None else topologies.from_plain(topology),
         )
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+from fogft.core.topology import Topology
+
 
 @dataclass(frozen=True, order=True)
 class ReplicaId:
@@ -188,11 +190,13 @@ class Member:
 
     Attributes:
         endpoint: ``host:port``; empty where it is not known yet, or the replica dials out.
+        gateway: The gateway's name, where that stands in place of replicas; empty for a replica.
     """
 
     id: ReplicaId
     endpoint: str
     draining: bool = False
+    gateway: str = ""
 
 
 @dataclass(frozen=True)
@@ -203,6 +207,7 @@ class Membership:
         epoch: The writing manager's lease; then `version` counts its writes. A lower
             (epoch, version) never replaces a higher one.
         revoked: Common names of certificates that are no good any more. Only ever grows.
+        topology: Who talks through whom.
     """
 
     pool: str
@@ -211,3 +216,4 @@ class Membership:
     version: int
     members: tuple[Member, ...] = field(default_factory=tuple)
     revoked: frozenset[str] = frozenset()
+    topology: Topology = field(default_factory=Topology)

@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import re
+from typing import TYPE_CHECKING
 
-from fogft.core.model import ReplicaId
+if TYPE_CHECKING:
+    from fogft.core.model import ReplicaId
 
 REQUEST_ID_BYTES = 16
+GATEWAY_SLOTS = 1 << 32  # from here on, slots are gateways
 POOL_UID_PATTERN = re.compile(r"[0-9a-f]{16}")
 POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
@@ -67,6 +70,16 @@ def robot_certificate_name(pool_uid: str, robot: str, generation: int = 1) -> st
 def gateway_certificate_name(pool_uid: str, gateway: str, generation: int = 1) -> str:
     """Return the common name of a gateway's certificate."""
     return f"gateway.{gateway}.{generation}.{pool_uid}"
+
+
+def gateway_slot(gateway: str) -> int:
+    """Return the slot of a gateway, which is like a replica to those who talk to it.
+
+    Such slots lie above all others. They hold 32 bits of a hash of the name, so that no list of
+    names and numbers has to be kept; the pool file's reader refuses two names that share one.
+    """
+    digest = hashlib.sha256(f"gateway {gateway}".encode()).digest()
+    return GATEWAY_SLOTS + int.from_bytes(digest[:4], "big")
 
 
 def rendezvous_certificate_name(pool_uid: str, rendezvous: str, generation: int = 1) -> str:

@@ -99,7 +99,8 @@ def dial_in(record: Record) -> str:
 def admission_content(membership: Membership) -> dict[str, Any]:
     """Return a membership as the content of the manager's admission record."""
     whole = memberships.to_dict(membership)
-    return {"name": whole["pool"], "members": whole["members"]}
+    content = {"name": whole["pool"], "members": whole["members"]}
+    return {**content, "topology": whole["topology"]} if membership.topology else content
 
 
 def admission(record: Record) -> Membership:
@@ -115,6 +116,7 @@ def admission(record: Record) -> Membership:
             epoch=record.generation,
             version=record.sequence,
             members=record.content.get("members"),
+            topology=record.content.get("topology"),
         )
     except StateError as error:
         raise RecordError("malformed", error.message) from error
