@@ -28,6 +28,7 @@ from fogft.app.looking import (
 from fogft.app.parts import (
     examples,
     init,
+    run_gateway,
     run_manager,
     run_proxy,
     run_rendezvous,
@@ -73,6 +74,7 @@ __all__ = [
     "revoke_credentials",
     "rotate_replicas",
     "rotate_robot",
+    "run_gateway",
     "run_manager",
     "run_proxy",
     "run_rendezvous",

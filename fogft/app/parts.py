@@ -73,3 +73,10 @@ def run_rendezvous(config: Path, *, listen: str | None = None) -> None:
     from fogft.pool import rendezvous
 
     rendezvous.run(rendezvous.read_config(config, listen))
+
+
+def run_gateway(config: Path, *, listen: str | None = None) -> None:
+    """Run a gateway until a signal ends it."""
+    from fogft.proxy import gateway_process
+
+    gateway_process.run(config, listen=listen)

@@ -1,6 +1,7 @@
-"""``fogft proxy | serve | manager | rendezvous``: one part of a pool, by hand, in the foreground.
+"""One part of a pool, by hand, in the foreground: proxy, serve, manager, rendezvous, gateway.
 
-`fogft up` starts them all. These are for a service manager, a container, a debugger.
+`fogft up` starts what a pool on its own needs. These are for a service manager, a container, a
+debugger.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Config = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the application."""
-    for command in (proxy, serve, manager, rendezvous):
+    for command in (proxy, serve, manager, rendezvous, gateway):
         app.command(command.__name__, cls=Command)(command)
 
 
@@ -119,7 +120,7 @@ def rendezvous(
         ),
     ] = None,
 ) -> None:
-    """Run a rendezvous: it tells robots and replicas of a pool where the others are.
+    """Run a rendezvous: it tells robots and replicas where others are.
 
     It needs a port that all can reach and carries no requests. Run two, on two machines.
 
@@ -130,3 +131,25 @@ def rendezvous(
     from fogft import app
 
     app.run_rendezvous(config, listen=listen)
+
+
+def gateway(
+    config: Config,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Run a gateway: robots ask it once, and it asks all replicas.
+
+    Run it where the uplink is wide: on a machine of its own, or on a replica's.
+
+    \b
+    Example:
+      fogft gateway --config gateway.yaml --listen 0.0.0.0:7470
+    """
+    from fogft import app
+
+    app.run_gateway(config, listen=listen)

@@ -11,7 +11,7 @@ SECTIONS = {
     "Look": ("plan", "status", "logs", "doctor"),
     "Change what runs": ("scale", "drain", "exclude", "include", "credentials"),
     "Try what happens when": ("simulate", "chaos"),
-    "Run one part by hand": ("proxy", "serve", "manager", "rendezvous"),
+    "Run one part by hand": ("proxy", "serve", "manager", "rendezvous", "gateway"),
 }
 
 

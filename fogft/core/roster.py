@@ -15,8 +15,9 @@ from typing import Any
 
 from fogft.core import membership as memberships
 from fogft.core.errors import StateError
-from fogft.core.holders import holder_of
-from fogft.core.model import Member, Membership
+from fogft.core.holders import Holder, holder_of
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.names import gateway_slot
 from fogft.core.records import COUNT_LIMIT, Record, RecordError, RecordKind
 
 SERVICES_LIMIT = 256
@@ -168,6 +169,26 @@ def located(membership: Membership, slots: Iterable[Record]) -> Membership:
         members=tuple(
             _located(m, said.get((m.id.slot, m.id.generation))) for m in membership.members
         ),
+    )
+
+
+def gateways_of(membership: Membership, holder: Holder) -> tuple[Member, ...] | None:
+    """Return the gateways that somebody talks to, as members; None for the replicas.
+
+    While a gateway's certificate is being replaced there are two of it, one of which answers.
+    """
+    gateways = membership.topology.neighbours(holder)
+    if not gateways:
+        return None
+    uid = membership.pool_uid
+    return tuple(
+        Member(
+            ReplicaId(uid, gateway_slot(gateway.name), generation),
+            gateway.endpoint,
+            gateway=gateway.name,
+        )
+        for gateway in gateways
+        for generation in gateway.generations
     )
 
 

@@ -61,9 +61,15 @@ def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> 
 
 
 def proxy_config(
-    paths: PoolPaths, identity: Identity, spec: PoolSpec, *, robot: str = "", stem: str = "robot"
+    paths: PoolPaths,
+    identity: Identity,
+    spec: PoolSpec,
+    *,
+    robot: str = "",
+    stem: str = "robot",
+    file: str = "proxy.yaml",
 ) -> str:
-    """Return a client proxy's configuration.
+    """Return a client proxy's configuration, or a gateway's.
 
     Args:
         paths: How its files are called; where they are does not matter.
@@ -71,9 +77,10 @@ def proxy_config(
         spec: Its services.
         robot: The robot's name; empty for this machine's.
         stem: How its certificate and key are called.
+        file: The template.
     """
     return templates.render(
-        "proxy.yaml",
+        file,
         {
             "pool": identity.name,
             "pool_uid": identity.uid,
@@ -89,7 +96,8 @@ def proxy_config(
             "suspect_after_s": spec.health.suspect_after_s,
             "rendezvous": list(spec.rendezvous),
             "records": paths.records.name,
-            "revocations": paths.revocations.name,
+            # A gateway's replicas hear of revocations from a rendezvous.
+            **({"revocations": paths.revocations.name} if file == "proxy.yaml" else {}),
             "dial_in": "" if robot else spec.dial_in,  # that is where this machine is
         },
     )

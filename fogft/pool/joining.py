@@ -32,7 +32,9 @@ from fogft.pool.store import PoolStore
 
 FILE_LIMIT = 512 << 10
 _USED_LIMIT = 10_000
-_COMMANDS = {Role.REPLICA: "serve", Role.RENDEZVOUS: "rendezvous"}  # all others: `proxy`
+# All others: `proxy`.
+_COMMANDS = {Role.REPLICA: "serve", Role.RENDEZVOUS: "rendezvous", Role.GATEWAY: "gateway"}
+_FLAT = (Role.REPLICA, Role.RENDEZVOUS)  # their credentials lie beside their configuration
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Joined:
 
     Attributes:
         config: The configuration to start with: ``fogft <command> --config <config>``.
-        command: ``proxy``, ``serve`` or ``rendezvous``.
+        command: ``proxy``, ``serve``, ``gateway`` or ``rendezvous``.
     """
 
     pool: str
@@ -78,7 +80,7 @@ def issue(
 def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str, str]:
     identity, spec = store.identity(), store.spec()
     stem = holder.role.value
-    folder = "" if holder.role in _COMMANDS else "credentials/"
+    folder = "" if holder.role in _FLAT else "credentials/"
     files = {
         f"{folder}ca.crt": credential.authority_pem.decode(),
         f"{folder}{stem}.key": credential.key_pem.decode(),
@@ -89,8 +91,9 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
     elif holder.role is Role.RENDEZVOUS:
         files["rendezvous.yaml"] = templates.render("rendezvous.yaml", {"pool_uid": identity.uid})
     else:
-        files["proxy.yaml"] = configuration.proxy_config(
-            PoolPaths(Path()), identity, spec, robot=holder.name, stem=stem
+        file = f"{_COMMANDS.get(holder.role, 'proxy')}.yaml"
+        files[file] = configuration.proxy_config(
+            PoolPaths(Path()), identity, spec, robot=holder.name, stem=stem, file=file
         )
         membership = store.membership()
         if membership is not None:

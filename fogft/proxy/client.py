@@ -13,20 +13,23 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 from fogft.core import names
+from fogft.core.definitions import Definition
 from fogft.core.errors import RosError
 from fogft.core.hedging import NEVER
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.records import SignedRecord
-from fogft.core.spec import ServiceSpec
+from fogft.core.spec import HedgingMode, ServiceSpec
 from fogft.proxy.dispatcher import Dispatcher, key_of
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.sameness import Define, Sameness
+from fogft.proxy.seen_through import best_of, seen_through
 from fogft.proxy.voting import VotingDispatcher
 from fogft.ros.port import RosClient, RosNode, RosServer
-from fogft.wire.port import Answer, Dialer, Link, Peer
+from fogft.wire.port import Answer, Behind, Dialer, Link, Peer
 
 log = logging.getLogger(__name__)
 
@@ -99,6 +102,7 @@ class ClientProxy:
         self._members: dict[ReplicaId, Member] = {}
         self._version = (0, 0)
         self._membership: Membership | None = None
+        self._through_gateways = False
         self._wake = threading.Event()
         self._next_look = NEVER
         self._changed = False  # set before the event, so that it is not missed
@@ -138,14 +142,15 @@ class ClientProxy:
             if service.server is not None:
                 service.server.respond(handle, payload)
 
-        service = _Service(spec, self._make_dispatcher(spec, respond, self._wake.set))
+        make = self._make_dispatcher
+        service = _Service(spec, make(self._here(spec), respond, self._wake.set))
         if spec.fallback is not None:
             self._adopt(service)
         return service
 
     def _adopt(self, service: _Service) -> None:
         """Have the dispatcher follow its service's spec, with a client of the fallback."""
-        spec, dispatcher = service.spec, service.dispatcher
+        spec, dispatcher = self._here(service.spec), service.dispatcher
         if isinstance(dispatcher, OrderedDispatcher):
             dispatcher.adopt(spec)
             return
@@ -161,6 +166,15 @@ class ClientProxy:
                 old.close()
         dispatcher.adopt(spec, service.fallback)
 
+    def _here(self, spec: ServiceSpec) -> ServiceSpec:
+        """Return a service's policy as it is here: a request goes to one gateway, not to all.
+
+        The gateway sends it to all replicas. Another gateway is asked where the first is late.
+        """
+        if self._through_gateways and spec.hedging is HedgingMode.ALL:
+            return replace(spec, hedging=HedgingMode.ADAPTIVE)
+        return spec
+
     # -- membership -----------------------------------------------------------------------
 
     def follow(self, membership: Membership) -> bool:
@@ -173,6 +187,11 @@ class ClientProxy:
             self._version = version
             self._membership = membership
             members = {} if self._shut_out(membership) else _good_members(membership)
+            through = any(member.gateway for member in members.values())
+            if through != self._through_gateways:
+                self._through_gateways = through
+                for service in self._services.values():
+                    self._adopt(service)
             for id in [id for id in self._links if id not in members]:
                 self._drop(id)
             for id, member in members.items():
@@ -205,13 +224,14 @@ class ClientProxy:
     def _redial(self, id: ReplicaId) -> None:
         member = self._members[id]
         old = self._links.get(id)
-        peer = Peer(id, member.endpoint, names.replica_certificate_name(id))
+        peer = Peer(id, member.endpoint, names.member_certificate_name(member))
         keys = {
             s.spec.name: names.service_key(self._pool_uid, id.slot, s.spec.name, s.spec.type)
             for s in self._services.values()
         }
         self._links[id] = self._dialer.dial(peer, keys, self)
-        log.info("link_dialled replica=%s endpoint=%s", id.short, member.endpoint)
+        who = f"gateway={member.gateway}" if member.gateway else f"replica={id.short}"
+        log.info("link_dialled %s endpoint=%s", who, member.endpoint)
         if old is not None:
             old.close()
 
@@ -331,16 +351,46 @@ class ClientProxy:
     def report(self) -> dict[str, Any]:
         """Return links and services as `proxy-status.json` has them."""
         with self._lock:
-            links = [self._link_report(link) for _, link in sorted(self._links.items())]
+            links, gateways = self._link_reports()
             services: Mapping[str, Any] = {
                 name: service.dispatcher.report() for name, service in self._services.items()
             }
         return {
             "links": links,
+            "gateways": gateways,
             "services": services,
             "uplink_suspected": self.uplink_suspected,
             "certificate": self._dialer.certificate(),
         }
+
+    def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """Return the links to replicas, those behind gateways included, and those to gateways."""
+        replicas, gateways, behind = [], [], []
+        for id, link in sorted(self._links.items()):
+            member = self._members.get(id)
+            report = self._link_report(link)
+            if member is None or not member.gateway:
+                replicas.append(report)
+                continue
+            gateways.append({"name": member.gateway, "endpoint": member.endpoint, **report})
+            behind += seen_through(link.status(), member.gateway)
+        return [*replicas, *best_of(behind)], gateways
+
+    def behind(self) -> tuple[Behind, ...]:
+        """Return what is seen of each replica, as a gateway tells its robots."""
+        with self._lock:
+            links, _ = self._link_reports()
+        return tuple(Behind.of(report) for report in links)
+
+    def types_behind(self) -> dict[str, Definition]:
+        """Return the definitions of types as replicas told them, as a gateway passes them on."""
+        answers = [link.status().probe_answer for link in list(self._links.values())]
+        return {name: told for a in answers if a is not None for name, told in a.types.items()}
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that at least one link calls ready."""
+        return frozenset(name for link in list(self._links.values()) for name in link.ready)
 
     def _link_report(self, link: Link) -> dict[str, Any]:
         status = link.status()
@@ -393,7 +443,7 @@ def _good_members(membership: Membership) -> dict[ReplicaId, Member]:
     return {
         member.id: member
         for member in membership.members
-        if names.replica_certificate_name(member.id) not in membership.revoked
+        if names.member_certificate_name(member) not in membership.revoked
     }
 
 

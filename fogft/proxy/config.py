@@ -19,6 +19,8 @@ from fogft.core.service_form import from_plain, seconds
 from fogft.core.spec import ServiceSpec
 from fogft.wire.frame import ROBOT_BYTES_LIMIT
 
+DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
+
 
 @dataclass(frozen=True)
 class CredentialFiles:
@@ -61,6 +63,18 @@ class ClientProxyConfig:
 
 
 @dataclass(frozen=True)
+class GatewayConfig:
+    """All that `fogft gateway` needs to know: a client proxy's, and where robots reach it.
+
+    Attributes:
+        listen: ``host:port``.
+    """
+
+    client: ClientProxyConfig
+    listen: str
+
+
+@dataclass(frozen=True)
 class ServerProxyConfig:
     """All that `fogft serve` needs to know.
 
@@ -99,24 +113,42 @@ def read_client(path: Path) -> ClientProxyConfig:
         StateError: It cannot be read, or a key is missing or of the wrong type.
     """
     with _Reading(path) as (raw, base):
-        return ClientProxyConfig(
-            pool=str(raw["pool"]),
-            pool_uid=_uid(raw["pool_uid"]),
-            robot=_robot(raw["robot"]),
-            membership=base / raw["membership"],
-            status=base / raw["status"],
-            lease=base / raw["lease"],
-            lock=base / raw["lock"],
-            credentials=_credentials(raw["credentials"], base),
-            services=tuple(from_plain(s) for s in raw["services"]),
-            suspect_after_s=seconds((raw.get("health") or {}).get("suspect_after_s") or 2.0),
-            domain_id=_optional_int(raw.get("domain_id")),
-            tell_losers=bool(raw.get("tell_losers", True)),
-            rendezvous=_endpoints(raw.get("rendezvous")),
-            records=base / raw["records"] if raw.get("records") else None,
-            revocations=base / raw["revocations"] if raw.get("revocations") else None,
-            dial_in=_endpoint(raw.get("dial_in") or ""),
-            dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
+        return _client(raw, base)
+    raise AssertionError("unreachable")
+
+
+def _client(raw: Mapping[str, Any], base: Path) -> ClientProxyConfig:
+    return ClientProxyConfig(
+        pool=str(raw["pool"]),
+        pool_uid=_uid(raw["pool_uid"]),
+        robot=_robot(raw["robot"]),
+        membership=base / raw["membership"],
+        status=base / raw["status"],
+        lease=base / raw["lease"],
+        lock=base / raw["lock"],
+        credentials=_credentials(raw["credentials"], base),
+        services=tuple(from_plain(s) for s in raw["services"]),
+        suspect_after_s=seconds((raw.get("health") or {}).get("suspect_after_s") or 2.0),
+        domain_id=_optional_int(raw.get("domain_id")),
+        tell_losers=bool(raw.get("tell_losers", True)),
+        rendezvous=_endpoints(raw.get("rendezvous")),
+        records=base / raw["records"] if raw.get("records") else None,
+        revocations=base / raw["revocations"] if raw.get("revocations") else None,
+        dial_in=_endpoint(raw.get("dial_in") or ""),
+        dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
+    )
+
+
+def read_gateway(path: Path, listen: str | None = None) -> GatewayConfig:
+    """Read a gateway's configuration; `listen` replaces what it says.
+
+    Raises:
+        StateError: It cannot be read, or a key is missing or of the wrong type.
+    """
+    with _Reading(path) as (raw, base):
+        return GatewayConfig(
+            client=_client({**raw, "robot": raw["gateway"]}, base),
+            listen=listen or str(raw.get("listen") or DEFAULT_GATEWAY_LISTEN),
         )
     raise AssertionError("unreachable")
 

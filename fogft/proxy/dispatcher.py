@@ -99,9 +99,15 @@ class Dispatcher:
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to whom the policy chooses."""
+        self.forward(os.urandom(REQUEST_ID_BYTES), payload, handle, self.spec.timeout_s)
+
+    def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
+        """Do the same for a request that has its id, and so much time left; whether it was taken.
+
+        Raises:
+            ValueError: A request with this id is under way.
+        """
         now = self._clock()
-        request = os.urandom(REQUEST_ID_BYTES)
-        timeout_s = self.spec.timeout_s
         count = self._outcomes.count
         with self._lock:
             count["received"] += 1
@@ -127,7 +133,7 @@ class Dispatcher:
                     soon = min(soon, self._rescuer.submitted(request, now, able=bool(able)))
         if turned_away:
             self._log_rarely("request_turned_away", turned_away, "pending is full")
-            return
+            return False
         for replica in chosen:
             if not links[replica].offer(self.spec.name, request, payload, timeout_s):
                 self._declined(request, replica)
@@ -136,6 +142,18 @@ class Dispatcher:
             self._forget(request, chosen)
         if soon < self._next_look:
             self._wake()
+        return True
+
+    def cancel(self, request: bytes) -> None:
+        """End a request that its caller no longer wants; unknown ids are fine."""
+        with self._lock:
+            pending = self._requests.close(request)
+            if pending is None:
+                return
+            replicas = tuple(pending.open)
+            self._stop(request, pending, self._clock())
+            self._outcomes.count["cancelled"] += 1
+        self._forget(request, replicas)
 
     def _declined(self, request: bytes, replica: int) -> None:
         with self._lock:

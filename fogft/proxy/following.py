@@ -19,7 +19,7 @@ from typing import Any
 from fogft import disk
 from fogft.core import membership as memberships
 from fogft.core import roster
-from fogft.core.holders import Role, holder_of
+from fogft.core.holders import Holder, Role, holder_of
 from fogft.core.model import Member, Membership
 from fogft.core.records import RecordKind
 from fogft.proxy.config import ClientProxyConfig
@@ -96,8 +96,7 @@ class Following:
         self._changed.set()
 
     def _announce(self, client: RendezvousClient) -> None:
-        ours = self._config.credentials
-        holder = holder_of(common_name(Signer(ours.certificate, ours.key).certificate))
+        holder = self._holder()
         kind = RecordKind.GATEWAY if holder.role is Role.GATEWAY else RecordKind.ROBOT
         content = {"dial_in": self._config.dial_in}
         client.publish(kind, holder.name, holder.generation, content)
@@ -126,9 +125,13 @@ class Following:
             return None
         slots = known.of(RecordKind.SLOT)
         located = roster.located(latest, slots) if slots else latest
-        return replace(
-            located, members=self._reached(located), revoked=located.revoked | known.revoked
-        )
+        gateways = roster.gateways_of(latest, self._holder())
+        members = self._reached(located) if gateways is None else gateways
+        return replace(located, members=members, revoked=located.revoked | known.revoked)
+
+    def _holder(self) -> Holder:
+        ours = self._config.credentials
+        return holder_of(common_name(Signer(ours.certificate, ours.key).certificate))
 
     def _read(self) -> None:
         raw = disk.read_json(self._config.membership)

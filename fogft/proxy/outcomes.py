@@ -17,7 +17,7 @@ from fogft.core.model import ReplicaId
 _LATENCIES_KEPT = 2000
 _COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
-    *("fallback", "fallback_failed", "turned_away", "undelivered"),
+    *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
 )
 
 
@@ -29,7 +29,8 @@ class Outcomes:
             (``answered``, ``fallback``, ``silent``, ``empty``, ``turned_away``); calls of the
             fallback that came to nothing (``fallback_failed``); answers that came too late
             to be used (``late``); responses that were not ok (``rejected``); responses that
-            ROS did not take (``undelivered``).
+            ROS did not take (``undelivered``); requests that a gateway's caller took back
+            (``cancelled``).
         refused: Refusals by reason.
         trace: How each request ended, until somebody takes it; None where it is not wanted.
     """

@@ -11,14 +11,15 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from fogft.core import definitions
 from fogft.core.definitions import Definition
+from fogft.core.model import LinkState
 from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.service_form import LONGEST_S
-from fogft.wire.port import Probe, ProbeAnswer
+from fogft.wire.port import Behind, Probe, ProbeAnswer
 
 VERSION = 1
 TOKEN_BYTES = 8
@@ -27,6 +28,8 @@ REASON_LIMIT = 64
 PROBE_LIMIT = 1024
 PROBE_ANSWER_LIMIT = 65536
 DETAIL_LIMIT = 500
+BEHIND_LIMIT = 128
+BEHIND_DETAIL_LIMIT = 100
 REMAINING_LIMIT_S = LONGEST_S
 CANCEL_LIMIT = 4096
 _CANCEL_BYTES_LIMIT = 1 + CANCEL_LIMIT * REQUEST_ID_BYTES
@@ -286,6 +289,8 @@ def _plain_answer(answer: ProbeAnswer) -> dict[str, Any]:
     }
     if answer.offered:
         written["offered"] = dict(answer.offered)
+    if answer.behind:
+        written["behind"] = [_behind_plain(one) for one in answer.behind]
     return written
 
 
@@ -296,29 +301,75 @@ def decode_probe_answer(frame: bytes) -> ProbeAnswer:
         FrameError: It is not one.
     """
     raw = _from_json(frame, PROBE_ANSWER_LIMIT)
-    ready = raw.get("ready")
-    if not isinstance(ready, list):
-        raise FrameError("`ready` is not a list of names")
-    draining = raw.get("draining")
-    if not isinstance(draining, bool):
-        raise FrameError("`draining` is neither true nor false")
-    at_risk = raw.get("at_risk", False)
-    if not isinstance(at_risk, bool):
-        raise FrameError("`at_risk` is neither true nor false")
     return ProbeAnswer(
         slot=_count(raw, "slot"),
         generation=_count(raw, "generation"),
         incarnation=_text(raw, "incarnation"),
-        ready=frozenset(_check_text(name, "ready") for name in ready),
-        draining=draining,
-        at_risk=at_risk,
+        ready=_ready(raw),
+        draining=_truth(raw, "draining"),
+        at_risk=_truth(raw, "at_risk", False),
         restarts=_count(raw, "restarts"),
         in_flight=_count(raw, "in_flight"),
         work=_numbers(raw, "work"),
         detail=_text(raw, "detail"),
         offered=_texts(raw, "offered"),
         types=_types(raw),
+        behind=_behind(raw.get("behind", [])),
     )
+
+
+def _behind_plain(one: Behind) -> dict[str, Any]:
+    detail = one.detail[:BEHIND_DETAIL_LIMIT].encode(errors="replace").decode()
+    return {
+        **asdict(one),
+        "state": one.state.value,
+        "ready": sorted(one.ready),
+        "silent_for_s": round(one.silent_for_s, 3),
+        "rtt_s": None if one.rtt_s is None else round(one.rtt_s, 6),
+        "detail": detail,
+    }
+
+
+def _behind(raw: Any) -> tuple[Behind, ...]:
+    if not isinstance(raw, list) or len(raw) > BEHIND_LIMIT:
+        raise FrameError(f"`behind` is not a list of at most {BEHIND_LIMIT}")
+    return tuple(_one_behind(one) for one in raw)
+
+
+def _one_behind(raw: Any) -> Behind:
+    if not isinstance(raw, dict):
+        raise FrameError("`behind` holds what is no object")
+    try:
+        state = LinkState(raw.get("state"))
+    except ValueError as error:
+        raise FrameError("`state` is none") from error
+    return Behind(
+        slot=_count(raw, "slot"),
+        generation=_count(raw, "generation"),
+        state=state,
+        ready=_ready(raw),
+        draining=_truth(raw, "draining"),
+        at_risk=_truth(raw, "at_risk"),
+        silent_for_s=_seconds(raw, "silent_for_s"),
+        rtt_s=None if raw.get("rtt_s") is None else _seconds(raw, "rtt_s"),
+        restarts=_count(raw, "restarts"),
+        detail=_text(raw, "detail"),
+        through=_text(raw, "through"),
+    )
+
+
+def _ready(raw: dict[str, Any]) -> frozenset[str]:
+    ready = raw.get("ready")
+    if not isinstance(ready, list):
+        raise FrameError("`ready` is not a list of names")
+    return frozenset(_check_text(name, "ready") for name in ready)
+
+
+def _truth(raw: dict[str, Any], key: str, default: Any = None) -> bool:
+    value = raw.get(key, default)
+    if not isinstance(value, bool):
+        raise FrameError(f"`{key}` is neither true nor false")
+    return value
 
 
 def _check_version(version: Any) -> None:

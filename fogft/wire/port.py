@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 from fogft.core.definitions import Definition
 from fogft.core.model import LinkState, ReplicaId
@@ -36,6 +36,45 @@ class Probe:
 
 
 @dataclass(frozen=True)
+class Behind:
+    """What a gateway sees of one replica behind it. Durations in seconds.
+
+    Attributes:
+        through: The gateways on the way, beginning with the one that is asked, and its name
+            left out: ``lab`` or ``lab/edge``; empty for none.
+    """
+
+    slot: int
+    generation: int
+    state: LinkState
+    ready: frozenset[str] = frozenset()
+    draining: bool = False
+    at_risk: bool = False
+    silent_for_s: float = 0.0
+    rtt_s: float | None = None
+    restarts: int = 0
+    detail: str = ""
+    through: str = ""
+
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> Behind:
+        """Return one from what a client proxy reports of a link."""
+        return cls(
+            slot=report["slot"],
+            generation=report["generation"],
+            state=LinkState(report["state"]),
+            ready=frozenset(report["ready"]),
+            draining=report["draining"],
+            at_risk=report["at_risk"],
+            silent_for_s=report["silent_for_s"],
+            rtt_s=report["rtt_s"],
+            restarts=report["restarts"],
+            detail=report["detail"],
+            through=report.get("through", ""),
+        )
+
+
+@dataclass(frozen=True)
 class ProbeAnswer:
     """What a replica says of itself with each probe.
 
@@ -52,6 +91,7 @@ class ProbeAnswer:
         offered: Service name -> type of what `run` offers, where it is to be found out.
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
+        behind: The replicas behind a gateway.
     """
 
     slot: int
@@ -66,6 +106,7 @@ class ProbeAnswer:
     work: Mapping[str, float] = field(default_factory=dict)
     offered: Mapping[str, str] = field(default_factory=dict)
     types: Mapping[str, Definition] = field(default_factory=dict)
+    behind: tuple[Behind, ...] = ()
 
 
 class Refusal:

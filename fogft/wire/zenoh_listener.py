@@ -127,6 +127,7 @@ class ZenohListener:
         id: Which replica this is: it hears the keys of its slot only.
         settings: Zenoh's times.
         handshakes: Tells which handshakes were refused; None where they need not be counted.
+        certificate_name: The common name of its certificate, where that is not the replica's.
 
     Raises:
         WireError: `listen` is not ``host:port``.
@@ -140,6 +141,7 @@ class ZenohListener:
         *,
         settings: LinkSettings | None = None,
         handshakes: HandshakeLog | None = None,
+        certificate_name: str = "",
     ) -> None:
         self._endpoint = _with_port(listen)
         self._handshakes = handshakes
@@ -149,7 +151,9 @@ class ZenohListener:
             self._endpoint, id, credentials, settings or LinkSettings()
         )
         self._guests = Guests(
-            id.pool_uid, names.replica_certificate_name(id), LazyVerifier(credentials.ca)
+            id.pool_uid,
+            certificate_name or names.replica_certificate_name(id),
+            LazyVerifier(credentials.ca),
         )
         self._records = RecordSet(id.pool_uid, LazyVerifier(credentials.ca))
         self._counters = Counters()

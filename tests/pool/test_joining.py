@@ -20,7 +20,7 @@ from fogft.pool import bundle, credentials, joining, rendezvous
 from fogft.pool.bundle import Label
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import Identity, PoolStore, write_identity
-from fogft.proxy.config import read_client, read_server
+from fogft.proxy.config import read_client, read_gateway, read_server
 
 UID, NOW = "0123456789abcdef", 2e9
 PASSPHRASE = "correct-horse-battery"
@@ -95,6 +95,19 @@ def test_a_rendezvous_joins_too(store: PoolStore, tmp_path: Path) -> None:
     assert (said.common_name, said.role) == (f"rendezvous.meet.1.{UID}", "rendezvous")
     assert config.credentials.key.exists()
     assert config.credentials.ca.exists()
+
+
+def test_a_gateway_joins_too(store: PoolStore, tmp_path: Path) -> None:
+    """With all that it listens and asks with, and the membership as it was."""
+    path = tmp_path / "edge.join"
+    path.write_bytes(issued(store, Role.GATEWAY, "edge"))
+    joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
+    assert (joined.command, joined.holder.role) == ("gateway", Role.GATEWAY)
+    config = read_gateway(joined.config)
+    assert (config.client.robot, config.listen) == ("edge", "0.0.0.0:7470")
+    assert from_dict(json.loads(config.client.membership.read_text())) == MEMBERSHIP
+    said = credentials.describe(config.client.credentials.certificate)
+    assert said.common_name == f"gateway.edge.1.{UID}"
 
 
 def test_it_is_good_for_one_time(file: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 from fogft.core import membership, names
 from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.topology import Topology
 from fogft.pool import credentials
 
 UID = "0123456789abcdef"
@@ -157,10 +158,12 @@ class Robot:
             self.follow(*replicas)
         self.process = parts.start("proxy", self._config)
 
-    def follow(self, *replicas: Replica) -> None:
+    def follow(self, *replicas: Replica, topology: Topology | None = None) -> None:
         """Write the membership, whole, as a manager would."""
         members = tuple(Member(r.id, r.endpoint) for r in replicas)
-        wanted = Membership("p", UID, 1, self._parts.next_version(), members)
+        wanted = Membership(
+            "p", UID, 1, self._parts.next_version(), members, topology=topology or Topology()
+        )
         new = self._members.with_suffix(".new")
         new.write_text(json.dumps(membership.to_dict(wanted)))
         os.replace(new, self._members)

@@ -1,0 +1,201 @@
+"""Gateways, echoing replicas and robots without ROS as processes; the test is the manager."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fogft.core import membership, names
+from fogft.core.holders import Role
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.topology import Gateway, Topology
+from tests.wire.namespaces import inside
+from tests.wire.rendezvous_pool import free_port
+from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, Files, ReplicaProcess, wait_for
+
+ROOT = Path(__file__).parents[2]
+
+
+class GatewayPool:
+    """A pool of processes that talk to each other as a topology says.
+
+    Args:
+        timeout_s: Of its only service.
+        services: Further keys of that service, as in a configuration file.
+    """
+
+    def __init__(self, folder: Path, *, timeout_s: float = 30.0, services: str = "") -> None:
+        self.authority = Authority(folder)
+        self.folder = folder
+        self._service = f"{{name: {SERVICE}, type: {TYPE}, timeout_s: {timeout_s}{services}}}"
+        self._version = 1
+        self._files: list[Path] = []
+        self._members: dict[int, Member] = {}
+        self.topology = Topology()
+        self.processes: list[Process] = []
+        self.replicas: dict[int, ReplicaProcess] = {}
+
+    def replica(self, slot: int, *, where: str = "", host: str = "127.0.0.1", **given: Any) -> None:
+        """Start an echoing replica and let it in."""
+        endpoint = f"{host}:{free_port() if not where else 7447 + slot}"
+        with _inside(where):
+            made = ReplicaProcess(
+                self.authority.replica(slot), endpoint=endpoint, slot=slot, **given
+            )
+        self.replicas[slot] = made
+        self._members[slot] = Member(ReplicaId(POOL_UID, slot, 1), endpoint)
+
+    def gateway(
+        self, name: str, *, listen: str = "", where: str = "", generation: int = 1
+    ) -> Process:
+        common_name = names.gateway_certificate_name(POOL_UID, name, generation)
+        return Process(
+            self, name, "gateway", self.authority.issue(common_name, Role.GATEWAY),
+            extra=f"listen: {listen or f'127.0.0.1:{free_port()}'}\n", where=where,
+        )  # fmt: skip
+
+    def robot(self, name: str, *, where: str = "", extra: str = "") -> Robot:
+        return Robot(self, name, "robot", self.authority.robot(name), extra=extra, where=where)
+
+    def lay_out(
+        self,
+        gateways: Mapping[str, tuple[str, Sequence[str]]],
+        robots: Mapping[str, Sequence[str]],
+        *,
+        generations: tuple[int, ...] = (1,),
+    ) -> None:
+        """Tell everybody the topology: gateway -> endpoint and what it goes through."""
+        self.topology = Topology(
+            tuple(Gateway(n, at, tuple(ups), generations) for n, (at, ups) in gateways.items()),
+            {name: tuple(through) for name, through in robots.items()},
+        )
+        self.publish()
+
+    def publish(self) -> None:
+        """Write the membership for everybody."""
+        self._version += 1
+        members = tuple(self._members.values())
+        for path in self._files:
+            self.write_membership(path, members)
+
+    def write_membership(self, path: Path, members: tuple[Member, ...] | None = None) -> None:
+        members = tuple(self._members.values()) if members is None else members
+        wanted = Membership(
+            "p", POOL_UID, 1, self._version, members, topology=self.topology
+        )
+        new = path.with_suffix(".new")
+        new.write_text(json.dumps(membership.to_dict(wanted)))
+        os.replace(new, path)
+
+    def config(self, stem: str, role: str, files: Files, extra: str) -> Path:
+        path = self.folder / f"{stem}.yaml"
+        members = self.folder / f"{stem}-members.json"
+        self._files.append(members)
+        path.write_text(
+            f'pool: p\npool_uid: "{POOL_UID}"\n{role}: {stem}\nmembership: {members.name}\n'
+            f"status: {stem}-status.json\nlease: lease.json\nlock: {stem}.lock\n"
+            f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, "
+            f"key: {files.key}}}\nservices: [{self._service}]\n{extra}"
+        )
+        self.write_membership(members)
+        return path
+
+    def ran(self) -> int:
+        """Return how many requests reached replicas."""
+        return sum(replica.count("requests") for replica in self.replicas.values())
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.kill()
+        for replica in self.replicas.values():
+            replica.kill()
+
+
+class Process:
+    """A gateway's process."""
+
+    def __init__(
+        self, pool: GatewayPool, name: str, role: str, files: Files, *, extra: str, where: str
+    ) -> None:  # fmt: skip
+        self.name = name
+        self.files = files
+        self._where = where
+        self._log = pool.folder / f"{name}.log"
+        self._status = pool.folder / f"{name}-status.json"
+        self._config = pool.config(name, role, files, extra)
+        pool.processes.append(self)
+        self.start()
+
+    def command(self) -> list[str]:
+        return [sys.executable, "-m", "fogft", "gateway", "--config", str(self._config)]
+
+    def start(self) -> None:
+        with _inside(self._where), self._log.open("ab") as log:
+            self.process = subprocess.Popen(
+                self.command(), cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=log, text=True,
+            )  # fmt: skip
+
+    def report(self) -> dict[str, Any]:
+        try:
+            return dict(json.loads(self._status.read_text()))
+        except FileNotFoundError:
+            return {}
+
+    def endpoint(self) -> str:
+        """Return where it listens, once it does."""
+        wait_for(lambda: self.report().get("endpoint") or self.process.poll() is not None)
+        assert self.process.poll() is None, self._log.read_text()
+        return str(self.report()["endpoint"])
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        for stream in (self.process.stdin, self.process.stdout):
+            if stream is not None:
+                stream.close()
+
+
+class Robot(Process):
+    """A client proxy without ROS; see `plain_robot`."""
+
+    def command(self) -> list[str]:
+        return [sys.executable, "-m", "tests.proxy.plain_robot", str(self._config)]
+
+    def tell(self, **command: Any) -> dict[str, Any]:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+        line = self.process.stdout.readline()
+        assert line, self._log.read_text()
+        return dict(json.loads(line))
+
+    def ready(self, count: int = 1) -> bool:
+        """Whether so many gateways, or replicas, answer it, and it serves."""
+        told = self.tell()
+        report = told["report"]
+        up = [one for one in report["gateways"] or report["links"] if one["ready"]]
+        return len(up) >= count and bool(told["services"])
+
+    def ask(self, count: int, size: int = 8) -> None:
+        self.tell(ask=count, bytes=size)
+
+    def all_right(self) -> None:
+        """Wait until each request has its own answer, once."""
+        wait_for(lambda: (told := self.tell())["right"] == told["asked"] or told["wrong"])
+        assert not self.tell()["wrong"]
+
+    def sent(self) -> int:
+        """Return how many copies of requests it has sent."""
+        return int(self.tell()["report"]["services"][SERVICE]["sent"])
+
+
+def _inside(where: str) -> contextlib.AbstractContextManager[None]:
+    return inside(where) if where else contextlib.nullcontext()

@@ -1,0 +1,114 @@
+"""A client proxy without ROS, as a process: its callers are commands on standard input.
+
+Each command is a JSON line and is answered by one:
+``{"ask": N, "bytes": B, "service": NAME}`` asks N requests of B bytes at once;
+``{}`` tells how many were asked and rightly answered, what was wrong, and the proxy's report.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.proxy.client import ClientProxy
+from fogft.proxy.config import read_client
+from fogft.proxy.dispatcher import Dispatcher
+from fogft.proxy.following import Following
+from fogft.wire.zenoh_link import ZenohDialer
+
+
+class Callers:
+    """Stands in for ROS: asks, and checks that each answer is its own request's."""
+
+    alive = True
+
+    def __init__(self) -> None:
+        self._ask: dict[str, Callable[[bytes, Any], None]] = {}
+        self._lock = threading.Lock()
+        self._open: dict[int, bytes] = {}
+        self.asked = self.right = 0
+        self.wrong: list[int] = []
+        self.slowest_s = 0.0
+        self._began: dict[int, float] = {}
+
+    def serve(self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]) -> Callers:
+        self._ask[name] = on_request
+        return self
+
+    def client(self, name: str, type_name: str) -> Any:
+        raise RosError("there is no ROS here")
+
+    def close(self) -> None:
+        pass
+
+    def ask(self, count: int, size: int, service: str) -> None:
+        for _ in range(count):
+            self.asked += 1
+            number = self.asked
+            payload = number.to_bytes(8, "big") * max(size // 8, 1)
+            self._open[number] = payload
+            self._began[number] = time.monotonic()
+            self._ask[service](payload, number)
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        with self._lock:
+            expected = self._open.pop(handle, None)
+            took_s = time.monotonic() - self._began.pop(handle, 0.0)
+            self.slowest_s = max(self.slowest_s, took_s)
+            if expected == payload:
+                self.right += 1
+            else:
+                self.wrong.append(handle)
+
+    def report(self) -> dict[str, Any]:
+        return {
+            "services": sorted(self._ask),
+            "asked": self.asked,
+            "right": self.right,
+            "wrong": self.wrong,
+            "slowest_s": self.slowest_s,
+        }
+
+
+def main() -> None:
+    config = read_client(Path(sys.argv[1]))
+    callers = Callers()
+    dialer = ZenohDialer(
+        config.credentials,
+        robot=config.robot,
+        pool_uid=config.pool_uid,
+        suspect_after_s=config.suspect_after_s,
+    )
+    proxy = ClientProxy(
+        config.pool_uid,
+        callers,
+        dialer,
+        lambda spec, respond, wake: Dispatcher(spec, respond, wake=wake),
+    )
+    proxy.serve(config.services)
+    following = Following(config)
+
+    def keep() -> None:
+        while True:
+            proxy.run_once()
+            membership = following.look()
+            if membership is not None:
+                proxy.follow(membership)
+
+    threading.Thread(target=keep, daemon=True).start()
+    for line in sys.stdin:
+        command = json.loads(line)
+        if "ask" in command:
+            service = command.get("service", config.services[0].name)
+            callers.ask(command["ask"], command.get("bytes", 8), service)
+        print(json.dumps({**callers.report(), "report": proxy.report()}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
