@@ -286,6 +286,10 @@ class NoRos:
         """
         raise RosError(f"a gateway calls no ROS service, so not `{name}` either")
 
+    def offered(self) -> Mapping[str, str]:
+        """Return nothing: applications offer nothing here."""
+        return {}
+
     def close(self) -> None:
         """Nothing to close."""
 

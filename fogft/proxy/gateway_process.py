@@ -107,7 +107,7 @@ class _Gateway:
     def _make_dispatcher(
         self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
     ) -> Dispatcher:
-        dispatcher = Dispatcher(spec, self._forwarder.respond, is_ok=_ok_field(spec), wake=wake)
+        dispatcher = Dispatcher(spec, self._forwarder.respond, ok_of=_ok_of(spec.type), wake=wake)
         self._forwarder.use(spec.name, dispatcher)
         return dispatcher
 
@@ -229,17 +229,19 @@ def _passed_on(service: ServiceSpec) -> ServiceSpec:
     return replace(service, on_timeout=OnTimeout.SILENT, fallback=None)
 
 
-def _ok_field(spec: ServiceSpec) -> Callable[[bytes], bool] | None:
-    """Return what judges a response; None where all are good, or the type is not known here."""
-    if not spec.ok_field:
-        return None
-    try:
-        from fogft.ros import types
+def _ok_of(type_name: str) -> Callable[[str], Callable[[bytes], bool]]:
+    """Return what finds whether a response is ok; all are where the type is not known here."""
 
-        return types.bool_field(spec.type, spec.ok_field)
-    except (FogftError, ImportError) as error:
-        log.warning(
-            "ok_field_not_judged service=%s reason=%r effect='the first response is returned'",
-            spec.name, str(error),
-        )  # fmt: skip
-        return None
+    def ok_of(field: str) -> Callable[[bytes], bool]:
+        try:
+            from fogft.ros import types
+
+            return types.bool_field(type_name, field)
+        except (FogftError, ImportError) as error:
+            log.warning(
+                "ok_field_not_judged type=%s reason=%r effect='the first response is returned'",
+                type_name, str(error),
+            )  # fmt: skip
+            return lambda payload: True
+
+    return ok_of

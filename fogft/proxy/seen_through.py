@@ -40,6 +40,9 @@ def _report(status: LinkStatus, gateway: str, one: Behind) -> dict[str, Any]:
         "ready": sorted(one.ready) if up else [],
         "draining": one.draining,
         "at_risk": one.at_risk,
+        "disagrees": False,
+        "differs": False,
+        "offered": {},
         "heard_age_s": None
         if one.state is LinkState.CONNECTING or heard is None
         else heard + one.silent_for_s,

@@ -86,9 +86,7 @@ class GatewayPool:
 
     def write_membership(self, path: Path, members: tuple[Member, ...] | None = None) -> None:
         members = tuple(self._members.values()) if members is None else members
-        wanted = Membership(
-            "p", POOL_UID, 1, self._version, members, topology=self.topology
-        )
+        wanted = Membership("p", POOL_UID, 1, self._version, members, topology=self.topology)
         new = path.with_suffix(".new")
         new.write_text(json.dumps(membership.to_dict(wanted)))
         os.replace(new, path)
