@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 DEFAULT_FILE = Path("pool.yaml")
 LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
+ROLLED_BACK = "rolled back"  # `fogft.core.rollout.UpdateState`
 HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
 
 
@@ -87,7 +88,9 @@ def up(
 ) -> None:
     """Start a pool, or make a running one as its file says now.
 
-    Returns once every service answers. Replicas that still start do so in the background.
+    Returns once every service answers. Replicas that still start do so in the background. A
+    changed file whose replicas have to be replaced is waited for: `up` fails where the update
+    is stopped and rolled back.
 
     \b
     Example:
@@ -107,17 +110,27 @@ def up(
         output.say("it had no manager: one was started, and takes over what runs")
     name = order.spec.name
     wanted = {service.name for service in order.spec.services}
+    awaited = order.digest if order.preview.replaces_replicas or order.preview.rolled_back else ""
+
+    def is_over(seen: Seen) -> bool:
+        if awaited not in ("", seen.status.applied):
+            return False
+        if is_updating(seen, awaited):
+            return keeps_ending(seen)
+        if gave_up(seen) or is_answering(seen, wanted, applied_at):
+            return True
+        return keeps_ending(seen) or differs(seen)
+
     try:
-        seen, _ = progress.wait(
-            lambda: managed(name),
-            lambda seen: (
-                is_answering(seen, wanted, applied_at) or keeps_ending(seen) or differs(seen)
-            ),
-            limit_s,
-        )
+        seen, _ = progress.wait(lambda: managed(name), is_over, limit_s)
     except KeyboardInterrupt:
         output.say(f"interrupted: `{name}` goes on starting; `fogft down {name}` ends it")
         raise typer.Exit(130) from None
+    if why := gave_up(seen):
+        raise FogftError(
+            f"`{name}` was not updated: {why}",
+            "see `fogft logs`; change the file and `fogft up` it again: this one is not retried",
+        )
     if keeps_ending(seen):
         raise not_answering(seen, "does not answer: `run` ends again and again")
     if differs(seen):
@@ -130,8 +143,8 @@ def up(
         return
     missing = max(0, status.target - status.ready)
     rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
-    if order.preview.replaces_replicas and not missing:
-        rest = "; `fogft status` shows them being replaced"
+    if is_updating(seen, awaited):
+        rest = "; the update goes on, see `fogft status`"
     output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
 
 
@@ -176,6 +189,19 @@ def is_answering(seen: Seen, services: set[str], since: float) -> bool:
         and status.proxy_alive
         and {service.name for service in status.services} == services == ready
     )
+
+
+def is_updating(seen: Seen, file: str) -> bool:
+    """Whether an update to the file of this digest is yet to end; empty for no update."""
+    if not file:
+        return False
+    update = seen.status.update
+    return seen.status.applied != file or (update is not None and update.state != ROLLED_BACK)
+
+
+def gave_up(seen: Seen) -> str:
+    """Return why the file that was applied last was given up; empty where it was not."""
+    return seen.status.update.fault if seen.status.update is not None else ""
 
 
 def keeps_ending(seen: Seen) -> bool:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from fogft.cli import output
 
 if TYPE_CHECKING:
+    from fogft.core.spec import PoolSpec
     from fogft.pool.preview import Preview
     from fogft.pool.seen import Seen
 
@@ -38,13 +39,27 @@ def announce(preview: Preview) -> None:
         for change in preview.changes:
             output.say(f"  {change}")
         if preview.replaces_replicas:
-            output.say("  so its replicas are replaced one after the other, new before old")
+            order = "new before old" if preview.new_before_old else "old before new"
+            output.say(f"  so its replicas are replaced one after the other, {order}")
+            if not preview.new_before_old:
+                output.say(f"  {_no_room(spec)}")
         if preview.costs_money and preview.launches:
             output.say(f"  at the prices of now all of it costs ${preview.usd_per_hour:.3f}/h")
-    else:
+    elif not preview.rolled_back:
         output.say(f"pool `{spec.name}` is as its file says; nothing changes")
     for note in preview.notes:
         output.warn(note)
+
+
+def _no_room(spec: PoolSpec) -> str:
+    """Say why a replica ends before its successor exists, and what that means."""
+    if spec.max_surge == 0:
+        why = "`max_surge` is 0"
+    else:
+        why = f"${spec.max_usd_per_hour:g}/h (`max_usd_per_hour`) has no room for both"
+    if spec.replicas == 1:
+        return f"{why}, and a single replica is not ended before: it stays as it is"
+    return f"{why}: meanwhile one fewer answers"
 
 
 def _say_launches(preview: Preview) -> None:

@@ -166,6 +166,17 @@ class Buyer:
                 self.sacrificed.append((standing, f"{standing.why}, and the budget has no room"))
                 return
 
+    def fits_beside(self, need: Need) -> bool:
+        """Whether the budget has room for a successor beside the one that it replaces."""
+        return self._choose(need, self.budget)[0].offer is not None
+
+    def fits_instead(self, need: Need, old: Standing) -> bool:
+        """Whether there is room for a successor once the one that it replaces is gone."""
+        if self.cap is None:
+            return True
+        left = self.cap - self._spent + self._price(old)
+        return self._choose(need, left)[0].offer is not None
+
     def _next_generation(self, slot: int) -> int:
         listed = [s.id.generation for s in self.census.everyone() if s.slot == slot]
         known = [self.history.generation(slot), self.intent.drained.get(slot, 0)]

@@ -43,7 +43,7 @@ def take_census(
             census.lost.append(standing)
         elif why := _unwanted(spec, intent, judged, size):
             standing = Standing(judged, record, why)
-            if _is_young(standing, health):
+            if _is_young(standing, health) or _never_served(standing, health):
                 census.aborted.append(standing)
             else:
                 census.replaced.append(standing)
@@ -82,7 +82,7 @@ def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged, size: Size) -> str
         f"excluded location {location}": intent.is_excluded(location),
         judged.why: judged.verdict in (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES),
         "its group is not in the pool file": not any(g.owns(slot) for g in size.groups),
-        "outdated by a change of the pool file": machine.spec_hash != replica_hash(spec, slot),
+        "outdated by another version": machine.spec_hash != replica_hash(spec, slot),
     }
     return next((why for why, holds in reasons.items() if holds), "")
 
@@ -93,3 +93,11 @@ def _is_young(standing: Standing, health: Health) -> bool:
         return True
     known = health.links_known and not health.uplink_suspected
     return known and not standing.ever_ready and not standing.answers
+
+
+def _never_served(standing: Standing, health: Health) -> bool:
+    """Whether an outdated one answers probes and has never had a service ready: it is no loss."""
+    known = health.links_known and not health.uplink_suspected
+    link = standing.judged.link
+    served = standing.ever_ready or (link is not None and bool(link.ready))
+    return known and not served and standing.reason.startswith("outdated")

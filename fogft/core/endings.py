@@ -10,7 +10,7 @@ Not here: why a replica should go (`planner`, `health`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from fogft.core.health import Health, Judged, Verdict
@@ -164,10 +164,14 @@ def choose_endings(
     now: float,
     drain_limit_s: float,
     dear_first: bool = False,
+    held: Collection[ReplicaId] = (),
+    first: Standing | None = None,
 ) -> Endings:
     """Choose who ends of those that are lost, replaced or too many.
 
     Args:
+        held: Outdated ones that stay until a newcomer has proved itself.
+        first: One that makes room for its successor: it ends although it is missed.
         dear_first: The pool is over its cap: of those that are too many the dearest go first.
     """
     chooser = _Chooser(wanted, census, now, drain_limit_s)
@@ -182,8 +186,11 @@ def choose_endings(
     chooser.end_some(expendable, len(census.good) - wanted, "not wanted")
     left = len(census.good) + len(census.replaced) - chooser.counted_out - wanted
     ready_slots = {s.slot for s in census.good if s.judged.serving}
+    if first is not None:
+        chooser.make_room(first)
+        left -= 1
     replaced = sorted(
-        census.replaced,
+        (s for s in census.replaced if s is not first and s.id not in held),
         key=lambda s: (
             s.judged.may_serve,
             s.draining_since is None,
@@ -253,6 +260,10 @@ class _Chooser:
             count -= 1
             self.counted_out += 1
             self._go(standing, f"{reason}: {standing.why}" if standing.why else reason)
+
+    def make_room(self, standing: Standing) -> None:
+        """End one before its successor exists."""
+        self._go(standing, f"replaced, old before new: {standing.why}")
 
     def _go(self, standing: Standing, why: str) -> None:
         self._pillars.discard(standing.id)

@@ -119,7 +119,8 @@ def replica_hash(spec: PoolSpec, slot: int) -> str:
     """Return the hash that a replica in this slot should have; see `PoolSpec.replica_hash`."""
     key = "hash", slot // BLOCK
     if key not in spec.derived:
-        spec.derived[key] = spec.hash_with(services_at(spec, slot))
+        group = group_at(spec, slot)
+        spec.derived[key] = spec.hash_with(group.services, group.resources)
     return str(spec.derived[key])
 
 

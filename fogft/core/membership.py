@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Collection, Iterable, Mapping
 from enum import Enum
 from typing import Any
@@ -23,6 +24,8 @@ from fogft.core.model import Machine, MachinePhase, Member, Membership, ReplicaI
 from fogft.core.names import POOL_UID_PATTERN, replica_certificate_name
 from fogft.core.spec import PoolSpec
 from fogft.core.topology import Topology
+
+VERSION = re.compile(r"[\w.-]{0,64}", re.ASCII)
 
 
 class Found(Enum):
@@ -58,6 +61,7 @@ def members_of(
             machine.id,
             "" if found is Found.BY_DOOR else machine.endpoint or "",
             machine.id in draining or machine.notice,
+            version=machine.spec_hash,
         )
         for machine in sorted(machines, key=lambda m: m.id)
         if machine.id.pool_uid == pool_uid
@@ -128,6 +132,7 @@ def to_dict(membership: Membership) -> dict[str, Any]:
                 "generation": m.id.generation,
                 "endpoint": m.endpoint,
                 "draining": m.draining,
+                "version": m.version,
             }
             for m in membership.members
         ],
@@ -206,7 +211,10 @@ def _member(uid: str, entry: Mapping[str, Any]) -> Member:
     if not isinstance(entry["draining"], bool):
         raise TypeError("draining is not true or false")
     id = ReplicaId(uid, _count(entry["slot"]), _count(entry["generation"]))
-    return Member(id, endpoint, entry["draining"])
+    version = _text(entry.get("version", ""))  # older managers wrote none
+    if not VERSION.fullmatch(version):
+        raise ValueError(f"`{version:.40}` is not a version")
+    return Member(id, endpoint, entry["draining"], version=version)
 
 
 def _revoked(uid: str, entry: Any) -> str:

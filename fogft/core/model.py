@@ -141,6 +141,8 @@ class LinkReport:
         silent_for_s: How long probes have gone unanswered; 0 while they are answered.
         rtt_s: Round trip of the last probe.
         restarts: How often the server proxy restarted the user's `run` command.
+        answered: How many requests it has answered well, first or not.
+        failed: How many came to a crash, a refusal or a response that was not ok.
         detail: Last error in words (connection refused, wrong certificate, ...).
         differs: A service's type is not the same there as on the robot, or cannot be loaded.
         offered: Name and type of each service that `run` offers, where that is found out.
@@ -158,6 +160,8 @@ class LinkReport:
     in_flight: int = 0
     won: int = 0
     restarts: int = 0
+    answered: int = 0
+    failed: int = 0
     detail: str = ""
     differs: bool = False
     offered: tuple[tuple[str, str], ...] = ()
@@ -191,12 +195,14 @@ class Member:
     Attributes:
         endpoint: ``host:port``; empty where it is not known yet, or the replica dials out.
         gateway: The gateway's name, where that stands in place of replicas; empty for a replica.
+        version: What it runs (`Machine.spec_hash`); empty where it is not known.
     """
 
     id: ReplicaId
     endpoint: str
     draining: bool = False
     gateway: str = ""
+    version: str = ""
 
 
 @dataclass(frozen=True)

@@ -41,9 +41,18 @@ def part(census: Census, groups: Sequence[Group], group: Group) -> Census:
 
 
 def needed_launches(
-    groups: Sequence[Group], counts: Sequence[int], census: Census, history: History
+    groups: Sequence[Group],
+    counts: Sequence[int],
+    census: Census,
+    history: History,
+    *,
+    settling: bool = False,
 ) -> Iterator[Need]:
-    """Yield the launches called for, over all groups."""
+    """Yield the launches called for, over all groups.
+
+    Args:
+        settling: A newcomer has yet to prove itself: no further one is replaced meanwhile.
+    """
     missing = [
         need
         for group, wanted in zip(groups, counts, strict=True)
@@ -51,7 +60,7 @@ def needed_launches(
     ]
     yield from missing
     one_is_coming = any(not s.ever_ready for s in census.good)
-    if missing or one_is_coming or census.ending:
+    if missing or one_is_coming or census.ending or settling:
         return
     for standing in census.replaced:
         group = home(groups, standing.slot)

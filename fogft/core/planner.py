@@ -15,15 +15,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from fogft.core import migration
+from fogft.core import migration, rollout
 from fogft.core.buying import Buyer, PlannedLaunch
 from fogft.core.census import take_census
-from fogft.core.endings import Census, Endings, choose_endings
+from fogft.core.endings import Census, Endings, Standing, choose_endings
 from fogft.core.health import Health, Verdict, judge
 from fogft.core.history import History
 from fogft.core.intent import Intent
 from fogft.core.model import Observed, ReplicaId
-from fogft.core.needs import needed_launches, part
+from fogft.core.needs import Need, home, needed_launches, part
 from fogft.core.placement import EPSILON_USD
 from fogft.core.sizing import Size, size
 from fogft.core.spec import PoolSpec
@@ -93,7 +93,8 @@ def plan(
     counts, excess = _within_cap(sized, census)
     wanted = sum(counts)
     buyer = Buyer(spec, intent, observed, history, census, sized.groups, sized.max_usd_per_hour)
-    needs = list(needed_launches(sized.groups, counts, census, history))
+    settling = rollout.is_settling(census, observed.now)
+    needs = list(needed_launches(sized.groups, counts, census, history, settling=settling))
     may_move = not needs and len(census.good) == wanted and spec.max_surge > 0
     if may_move and migration.is_quiet(census, health):
         found = migration.mover(buyer, observed.now)
@@ -101,9 +102,13 @@ def plan(
             census.good.remove(found.standing)
             census.replaced.append(replace(found.standing, reason=found.why))
             needs = list(needed_launches(sized.groups, counts, census, history))
+    room = wanted + spec.max_surge - census.live
+    first: Standing | None = None
     for need in needs:
-        if not buyer.buy(need, room=wanted + spec.max_surge - census.live):
+        if not buyer.buy(need, room=room):
+            first = _first_to_go(need, buyer, wanted, spec.max_surge)
             break
+    held = [s.id for s in census.replaced if rollout.is_outdated(s) and not s.draining_since]
     endings = Endings()
     for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
         endings += choose_endings(
@@ -114,6 +119,8 @@ def plan(
             now=observed.now,
             drain_limit_s=drain_limit_s,
             dear_first=bool(excess),
+            held=held if settling else (),
+            first=first if first is not None and home(sized.groups, first.slot) is group else None,
         )
     ends = [PlannedEnd(s.id, s.why) for s in (*census.failed, *census.aborted)]
     ends += [PlannedEnd(s.id, why) for s, why in endings.now]
@@ -129,6 +136,24 @@ def plan(
         notes=tuple(dict.fromkeys(notes)),
         health=health,
     )
+
+
+def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Standing | None:
+    """Return the outdated one that has to end before its successor can be launched, if it may."""
+    old = need.replaces
+    if old is None or not rollout.is_outdated(old) or old not in buyer.census.replaced:
+        return None
+    fits = buyer.fits_instead(need, old)
+    if not fits or (max_surge and buyer.fits_beside(need)):
+        return None
+    if not rollout.may_go_first(old, buyer.census, wanted):
+        buyer.notes.append(
+            f"slot {need.slot} is not updated: there is no room for both, and no other one that "
+            "answers meanwhile; raise `max_usd_per_hour` or `max_surge`"
+        )
+        return None
+    buyer.notes.append(f"slot {need.slot}: no room for both, so old before new")
+    return old
 
 
 def _within_cap(sized: Size, census: Census) -> tuple[Sequence[int], list[str]]:

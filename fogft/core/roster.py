@@ -196,7 +196,8 @@ def _located(member: Member, state: SlotState | None) -> Member:
     if state is None:
         return member
     endpoint = state.endpoint or member.endpoint or state.observed_endpoint
-    return Member(member.id, "" if state.dials_out else endpoint, member.draining or state.draining)
+    draining = member.draining or state.draining
+    return replace(member, endpoint="" if state.dials_out else endpoint, draining=draining)
 
 
 def _endpoint(value: Any) -> str:

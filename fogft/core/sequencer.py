@@ -12,11 +12,12 @@ Protocol and its argument: docs/design/state.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
 from fogft.core import ordering
+from fogft.core.office import Office
 from fogft.core.ordered_log import Checkpoint, OrderedLog
 from fogft.core.ordering import START, Op, Position, Promise
 
@@ -65,12 +66,29 @@ class _Peer:
     checked_at: float = 0.0
 
 
+@dataclass(frozen=True)
+class Handover:
+    """From what a term begins in which another version takes office.
+
+    Attributes:
+        version: The one that takes it.
+        at: The state that it takes over: every number given before has been applied there.
+        state: Its bytes.
+    """
+
+    version: str
+    at: Position
+    state: bytes
+
+
 class Sequencer:
     """One term of a sequencer.
 
     Args:
         epoch: This term, above every earlier one.
         mark: The position of the last answer that was returned, in whatever term.
+        holder: The version that returned it; None where nobody knows.
+        begin: What the term begins from, where a version takes over from another.
         log_entries: Requests kept at most.
         log_bytes: Their bytes at most.
     """
@@ -80,6 +98,8 @@ class Sequencer:
         epoch: int,
         *,
         mark: Position = START,
+        holder: str | None = None,
+        begin: Handover | None = None,
         log_entries: int = 8192,
         log_bytes: int = 64 << 20,
     ) -> None:
@@ -87,9 +107,18 @@ class Sequencer:
         self.mark = mark
         self.base: Position | None = None  # None until the term has begun
         self.log: OrderedLog | None = None
+        self.office = Office(begin.version if begin else holder)
+        self.handover: Handover | None = None  # this term's end: the next begins from it
+        self._begin = begin
+        self._change_to: str | None = None  # no number is given meanwhile
+        self._versions: Mapping[int, str] = {}
+        self._leaving: frozenset[int] = frozenset()
         self.deposed_by: int | None = None
         self.held_by = ""  # another robot whose order the replicas obey
         self._bounds = (log_entries, log_bytes)
+        if begin is not None:
+            self._begin_at(begin.at)
+            self._take_checkpoint_of(begin)
         self._peers: dict[int, _Peer] = {}
         self._out: list[Order] = []
         self._unanswered: dict[int, None] = {}
@@ -101,8 +130,17 @@ class Sequencer:
 
     @property
     def ready(self) -> bool:
-        """Whether a number given now is sent to somebody at once."""
-        return any(peer.phase is Phase.JOINED for peer in self._peers.values())
+        """Whether a number given now is sent at once to somebody whose answer counts."""
+        return any(
+            peer.phase is Phase.JOINED and self._counts(replica)
+            for replica, peer in self._peers.items()
+        )
+
+    def _version(self, replica: int) -> str:
+        return self._versions.get(replica, "")
+
+    def _counts(self, replica: int) -> bool:
+        return self.office.believes(self._version(replica))
 
     @property
     def sends(self) -> bool:
@@ -113,6 +151,11 @@ class Sequencer:
     def joined(self) -> list[int]:
         """The replicas that apply what is sent to them."""
         return [replica for replica, peer in self._peers.items() if peer.phase is Phase.JOINED]
+
+    @property
+    def changing(self) -> bool:
+        """Whether another version is to take over as soon as all is answered."""
+        return self._change_to is not None
 
     @property
     def stranded(self) -> bool:
@@ -131,7 +174,7 @@ class Sequencer:
     def submit(self, payload: bytes) -> int | None:
         """Number a request and order it applied; None while the term has not begun or is full."""
         log = self.log
-        if log is None or self.deposed_by is not None:
+        if log is None or self.deposed_by is not None or self._change_to is not None:
             return None
         if not log.has_room(len(payload)) and not self._make_room(len(payload)):
             return None
@@ -150,9 +193,24 @@ class Sequencer:
         """Nobody waits for the answer to this number any more. It is applied all the same."""
         self._unanswered.pop(index, None)
 
-    def reach(self, replicas: Iterable[int], now: float) -> None:
-        """Set which replicas can be sent to; new ones are claimed at once."""
+    def reach(
+        self,
+        replicas: Iterable[int],
+        now: float,
+        *,
+        versions: Mapping[int, str] | None = None,
+        leaving: Iterable[int] = (),
+    ) -> None:
+        """Set which replicas can be sent to; new ones are claimed at once.
+
+        Args:
+            replicas: Them.
+            now: In seconds.
+            versions: What each runs; all the same unless told.
+            leaving: Those that are to go soon.
+        """
         wanted = set(replicas)
+        self._versions, self._leaving = versions or {}, frozenset(leaving)
         for replica in [r for r in self._peers if r not in wanted]:
             self._drop(replica)
         for replica in sorted(wanted - self._peers.keys()):
@@ -178,7 +236,77 @@ class Sequencer:
             elif peer.phase is Phase.JOINED:
                 self._feed(replica, peer)
                 self._check(replica, peer, now)
+        self._see_to_office(now)
         self._see_to_checkpoint(now)
+
+    # -- versions -------------------------------------------------------------------------
+
+    def _see_to_office(self, now: float) -> None:
+        """Have a version take over: by a handover, or because nobody is left in office."""
+        joined = self.joined
+        standing = [self._version(r) for r in joined]
+        self.office.look(standing, now)
+        if self.base is None:
+            self._find_base()
+        elif (heir := self.office.successor(standing)) is not None:
+            self.office.holder = heir
+            self._change_to = None
+            for replica in joined:
+                if self._counts(replica):
+                    self._recall(replica, self._peers[replica], self._peers[replica].next)
+        elif self.handover is None:
+            staying = [self._version(r) for r in joined if r not in self._leaving]
+            self._change_to = self.office.wish(staying)
+            self._prepare_handover(now)
+
+    def _prepare_handover(self, now: float) -> None:
+        """Ask for the state after the last number, once that has been answered."""
+        log = self.log
+        if self._change_to is None or log is None or self._unanswered:
+            return
+        donors = [
+            (r in self._leaving, p.won, r)
+            for r, p in self._peers.items()
+            if p.phase is Phase.JOINED and self._counts(r) and p.acked >= log.last and not p.open
+        ]
+        if donors and self._asked_for_checkpoint is None and now >= self._checkpoint_at:
+            self._ask_for_checkpoint(min(donors)[-1], now)
+
+    def _find_base(self) -> None:
+        for replica, peer in self._peers.items():
+            if self.base is None and peer.phase is Phase.CLAIMED:
+                self._lead(replica, peer)
+
+    def _lead(self, replica: int, peer: _Peer) -> bool:
+        """Begin the term from the state of a replica, if it may be."""
+        promise = peer.promise
+        if promise is None or not promise.sound or promise.position < self.mark:
+            return False
+        if not self.office.may_lead(self._version(replica)):
+            return False
+        self.office.holder = self._version(replica)
+        self._begin_at(promise.position)
+        for other, known in self._peers.items():
+            if known.phase is Phase.CLAIMED:
+                self._bring(other, known)
+        return True
+
+    def _begin_at(self, position: Position) -> None:
+        entries, size = self._bounds
+        self.base = position
+        self.log = OrderedLog(position.index, entries_limit=entries, bytes_limit=size)
+
+    def _take_checkpoint_of(self, begin: Handover) -> None:
+        assert self.log is not None
+        self.log.keep(Checkpoint(begin.at.index, begin.state))
+
+    def _has_own_state(self, replica: int, at: Position) -> bool:
+        """Whether a replica's state is one that this term knows, and not one it stood by with."""
+        if at.epoch == self.epoch:
+            return True
+        if self._begin is not None and self._counts(replica):
+            return False  # of the version that took over: it begins from what was handed over
+        return at == self.base
 
     def _check(self, replica: int, peer: _Peer, now: float) -> None:
         """Ask an idle replica where it stands: no request would tell that its service died."""
@@ -213,7 +341,7 @@ class Sequencer:
         return False
 
     def _applied(self, peer: _Peer | None, replica: int, index: int) -> bool:
-        first = index in self._unanswered
+        first = index in self._unanswered and self._counts(replica)
         if first:
             del self._unanswered[index]
             # Answers to later numbers imply all earlier ones; a mark never goes back.
@@ -236,15 +364,10 @@ class Sequencer:
         peer.phase = Phase.CLAIMED
         peer.promise = promise
         self.held_by = ""
-        if self.base is None and promise.sound and promise.position >= self.mark:
-            self.base = promise.position
-            entries, size = self._bounds
-            self.log = OrderedLog(promise.position.index, entries_limit=entries, bytes_limit=size)
-            for other, known in self._peers.items():
-                if known.phase is Phase.CLAIMED:
-                    self._bring(other, known)
-        else:
+        if self.base is not None:
             self._bring(replica, peer)
+        else:
+            self._lead(replica, peer)
 
     def _bring(self, replica: int, peer: _Peer, *, waited: bool = False) -> None:
         """Let a claimed replica join, from its own state or from the checkpoint.
@@ -256,7 +379,7 @@ class Sequencer:
         if log is None or promise is None or peer.open:
             return
         at, kept = promise.position, log.checkpoint
-        ours = at == self.base or at.epoch == self.epoch
+        ours = self._has_own_state(replica, at)
         may_join = promise.sound and ours and log.covers(at.index)
         from_index = max(at.index if may_join else -1, kept.index if kept else -1)
         if log.last - from_index > REPLAY_LIMIT and self.ready and not waited:
@@ -289,11 +412,14 @@ class Sequencer:
         peer.next = expected
         peer.acked = expected - 1
         # Applied there, and the answer never came: it is kept, and is asked for again.
+        self._recall(replica, peer, expected)
+        self._feed(replica, peer)
+
+    def _recall(self, replica: int, peer: _Peer, before: int) -> None:
         for index in self._unanswered:
-            if index < expected and index not in peer.open:
+            if index < before and index not in peer.open:
                 peer.open.add(index)
                 self._out.append(Order(replica, Op.RECALL, index))
-        self._feed(replica, peer)
 
     def _feed(self, replica: int, peer: _Peer) -> None:
         log = self.log
@@ -382,10 +508,15 @@ class Sequencer:
         needed = waits or (kept is None and log.start > 0)
         if not needed and not log.half_full:
             return
-        joined = [(p.won, r) for r, p in self._peers.items() if p.phase is Phase.JOINED]
-        if not joined:
-            return
-        _, replica = min(joined)  # one that seldom answers first: it pauses for the snapshot
+        joined = [
+            (p.won, r)
+            for r, p in self._peers.items()
+            if p.phase is Phase.JOINED and self._counts(r)
+        ]
+        if joined:  # one that seldom answers first: it pauses for the snapshot
+            self._ask_for_checkpoint(min(joined)[1], now)
+
+    def _ask_for_checkpoint(self, replica: int, now: float) -> None:
         self._asked_for_checkpoint = replica
         self._checkpoint_at = now + CHECKPOINT_RETRY_S
         self._serial += 1
@@ -394,6 +525,8 @@ class Sequencer:
     def _take_checkpoint(self, index: int, state: bytes) -> None:
         if self.log is not None and self.deposed_by is None:
             self.log.keep(Checkpoint(index, state))
+            if self._change_to is not None and index == self.log.last and not self._unanswered:
+                self.handover = Handover(self._change_to, Position(self.epoch, index), state)
             self._checkpoint_at = 0.0
             self._bring_those_who_waited()
 

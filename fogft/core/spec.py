@@ -23,6 +23,8 @@ from fogft.core.spec_choices import (
 from fogft.core.spec_state import StateSpec
 
 MAX_REPLICAS = 16
+# Keys of `resources` that say where a machine may be, not what it is.
+_WHEREABOUTS = frozenset({"infra", "cloud", "region", "zone", "any_of", "ordered", "job_recovery"})
 
 
 class OnTimeout(str, Enum):
@@ -145,12 +147,17 @@ class PoolSpec:
         """16 hexadecimal digits that change when running replicas must be replaced.
 
         Covers what a replica runs and serves, and the machine it needs; not how many
-        there are, how long the robot waits, or in what order regions are listed.
+        there are, how long the robot waits, or where machines may be.
         """
-        return self.hash_with(self.services)
+        return self.hash_with(self.services, self.task.get("resources"))
 
-    def hash_with(self, services: tuple[ServiceSpec, ...]) -> str:
-        """Return the `replica_hash` of a replica that carries only these services."""
+    def hash_with(self, services: tuple[ServiceSpec, ...], resources: Any) -> str:
+        """Return the `replica_hash` of a replica that carries only these services.
+
+        Args:
+            services: What it carries.
+            resources: What its machine must be: the section of the file that holds for it.
+        """
         asked: dict[str, Any] = {
             "services": sorted(_run_by_replica(s) for s in services),
             "orphan_after_s": self.health.orphan_after_s,
@@ -158,6 +165,9 @@ class PoolSpec:
         }
         if self.rendezvous or self.dial_in:
             asked["connectivity"] = [self.rendezvous, self.dial_in]
+        kinds = _kinds_of_machine(resources)
+        if kinds != ["{}"]:
+            asked["machine"] = kinds
         canonical = json.dumps(asked, sort_keys=True, default=str)
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -167,3 +177,15 @@ def _run_by_replica(service: ServiceSpec) -> tuple[str, ...]:
     policy = (str(service.concurrency), service.cancel)
     state = () if service.state is None else (str(service.state),)
     return (service.name, service.type, *(policy if policy != ("0", "") else ()), *state)
+
+
+def _kinds_of_machine(resources: Any) -> list[str]:
+    """Return what the machines of a `resources` section are, without where: each kind once."""
+    section = resources if isinstance(resources, Mapping) else {}
+    choices = section.get("any_of") or section.get("ordered") or [{}]
+    kinds = set()
+    for choice in choices if isinstance(choices, list) else [{}]:
+        merged = {**section, **(choice if isinstance(choice, Mapping) else {})}
+        kind = {key: value for key, value in merged.items() if key not in _WHEREABOUTS}
+        kinds.add(json.dumps(kind, sort_keys=True, default=str))
+    return sorted(kinds)

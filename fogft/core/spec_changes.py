@@ -10,6 +10,7 @@ from dataclasses import fields
 from enum import Enum
 from typing import Any
 
+from fogft.core.groups import groups_of, replica_hash
 from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
 
 
@@ -34,7 +35,8 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
 
 def replaces_replicas(before: PoolSpec, after: PoolSpec) -> bool:
     """Whether running replicas are replaced, because what they run or serve has changed."""
-    return before.replica_hash != after.replica_hash
+    slots = {group.first_slot for spec in (before, after) for group in groups_of(spec)}
+    return any(replica_hash(before, slot) != replica_hash(after, slot) for slot in slots)
 
 
 def _task(before: PoolSpec, after: PoolSpec) -> list[str]:

@@ -31,8 +31,8 @@ class PoolPaths:
 
     Written by `up`, `scale`, `drain`, `exclude` and `down` (under `intent_lock`):
     `identity`, `spec`, `intent`. By the manager (under `manager_lock`): `lease`,
-    `status`, `membership`, `proxy_config`, `history`, `credentials`. By the client
-    proxy (under `proxy_lock`): `proxy_status`.
+    `status`, `membership`, `proxy_config`, `history`, `credentials`, `good_spec`, `trial`. By
+    the client proxy (under `proxy_lock`): `proxy_status`.
     """
 
     folder: Path
@@ -51,6 +51,16 @@ class PoolPaths:
     def spec(self) -> Path:
         """The pool file as last applied, byte for byte."""
         return self.folder / "spec.yaml"
+
+    @property
+    def good_spec(self) -> Path:
+        """The last pool file with which the pool was wholly ready, byte for byte."""
+        return self.folder / "good.yaml"
+
+    @property
+    def trial(self) -> Path:
+        """``{file, began_at, fault}``: what became of the file applied last."""
+        return self.folder / "trial.json"
 
     @property
     def intent(self) -> Path:

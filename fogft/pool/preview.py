@@ -16,11 +16,12 @@ from fogft.core.history import History
 from fogft.core.intent import Intent
 from fogft.core.model import Observed, Offer
 from fogft.core.planner import plan
+from fogft.core.rollout import has_room
 from fogft.core.spec import PoolSpec
 from fogft.core.spec_changes import changes, replaces_replicas
 from fogft.pool import offers
 from fogft.pool.named_clouds import clouds_named, located
-from fogft.pool.store import PoolStore
+from fogft.pool.store import PoolStore, digest
 
 Far = Callable[[PoolSpec, Sequence[Offer]], Mapping[str, float]]
 # What an age is told in: the unit, its length, and from which age on.
@@ -52,6 +53,8 @@ class Preview:
         costs_money: Its machines are paid for: nothing is ordered unasked.
         accounts: Of each cloud whose credentials were tested: empty, or what is wrong.
         changes: Of a pool that exists: what the file now says otherwise, in words.
+        new_before_old: The budget has room for a replica and its successor at once.
+        rolled_back: Why this very file was given up before; empty where it was not.
         notes: What may surprise: fewer placements than replicas, no prices now.
     """
 
@@ -62,6 +65,8 @@ class Preview:
     launches: tuple[PreviewedLaunch, ...] = ()
     changes: tuple[str, ...] = ()
     replaces_replicas: bool = False
+    new_before_old: bool = True
+    rolled_back: str = ""
     notes: tuple[str, ...] = ()
     costs_money: bool = False
     accounts: Mapping[str, str] = field(default_factory=dict)
@@ -84,6 +89,11 @@ class Order:
     def spec(self) -> PoolSpec:
         """What the file asks for."""
         return self.preview.spec
+
+    @property
+    def digest(self) -> str:
+        """What names the file's text in a pool's status."""
+        return digest(self.source.encode())
 
 
 def order(
@@ -113,11 +123,7 @@ def order(
         SpecError: The cloud can never meet the file's resources.
         CloudError: A new pool, and none of the clouds that it names can be used.
     """
-    try:
-        store.identity()
-        before = store.spec()
-    except (PoolNotFound, SpecError):
-        before = None
+    before, rolled_back = _before(store, source)
     notes: list[str] = []
     accounts: Mapping[str, str] = {}
     if isinstance(cloud, Accounts):
@@ -136,19 +142,35 @@ def order(
         notes.append(f"prices cannot be had now: {error.message}")
     observed = Observed(now, (), None, sold, rtt_s=far(spec, sold))
     planned = plan("0" * 16, spec, Intent(), observed, History())
+    replaces = before is not None and not rolled_back and replaces_replicas(before, spec)
+    usd_per_hour = sum(launch.offer.usd_per_hour for launch in planned.launches)
+    cheapest = min((offer.usd_per_hour for offer in sold), default=0.0)
     preview = Preview(
         spec,
         cloud_name,
         is_new=before is None,
         wanted=planned.wanted,
         launches=tuple(_launch(launch.slot, launch.offer, now) for launch in planned.launches),
-        changes=() if before is None else tuple(changes(before, spec)),
-        replaces_replicas=before is not None and replaces_replicas(before, spec),
+        changes=() if before is None or rolled_back else tuple(changes(before, spec)),
+        replaces_replicas=replaces,
+        new_before_old=has_room(spec, usd_per_hour, cheapest),
+        rolled_back=rolled_back,
         notes=(*notes, *(planned.notes if before is None and sold else ())),
         costs_money=isinstance(cloud, Accounts),
         accounts=accounts,
     )
     return Order(preview, source, file)
+
+
+def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:
+    """Return the file in force, None for none, and why this very one was given up, if it was."""
+    try:
+        store.identity()
+        before, trial = store.spec(), store.trial()
+    except (PoolNotFound, SpecError):
+        return None, ""
+    same = trial.file == digest(source.encode()) == store.applied()
+    return before, trial.fault if same else ""
 
 
 def _tested(

@@ -87,6 +87,8 @@ def _link(raw: Mapping[str, Any], pool_uid: str) -> LinkReport:
         in_flight=int(raw.get("in_flight") or 0),
         won=int(raw.get("won") or 0),
         restarts=int(raw.get("restarts") or 0),
+        answered=int(raw.get("answered") or 0),
+        failed=int(raw.get("failed") or 0),
         detail=str(raw.get("detail") or ""),
         differs=bool(raw.get("differs")),
         offered=tuple(sorted((str(k), str(v)) for k, v in (raw.get("offered") or {}).items())),

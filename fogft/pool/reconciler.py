@@ -34,11 +34,13 @@ from fogft.core.model import (
 )
 from fogft.core.planner import Plan, PlannedLaunch, plan
 from fogft.core.refreshing import Silent
+from fogft.core.rollout import Update
 from fogft.core.spec import PoolSpec
 from fogft.pool import offers
 from fogft.pool.operations import Operations, Submit
 from fogft.pool.remembering import Remembering
 from fogft.pool.store import Identity, Store
+from fogft.pool.updating import Updating
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +59,8 @@ class Tick:
 
     Attributes:
         over: Its hours are used up: the pool ends by itself.
+        update: The update under way, or the one that was given up; None where there is none.
+        file: Digest of the pool file that was applied last.
     """
 
     identity: Identity
@@ -66,6 +70,8 @@ class Tick:
     plan: Plan
     membership: Membership | None
     over: bool = False
+    update: Update | None = None
+    file: str = ""
 
 
 def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
@@ -128,6 +134,7 @@ class Reconciler:
         self._offers: tuple[Offer, ...] = ()
         self._offers_for: tuple[str, float] | None = None
         self._remember = Remembering(store, clock)
+        self._updating = Updating(store)
         self._membership: Membership | None = store.membership()
 
     def tick(self) -> Tick:
@@ -140,6 +147,9 @@ class Reconciler:
         history = self._store.history()
         self._settle_outcomes()
         observed, trouble = self._observe(identity, spec)
+        asked, (spec, trial) = spec, self._updating.look(identity.uid, observed, history)
+        if spec is not asked:  # rolled back: what is sold to it may differ
+            observed, trouble = self._observe(identity, spec)
         if observed.machines is not None:
             self._remember.losses(observed)
             self._ask_about_silent(observed, history)
@@ -154,11 +164,19 @@ class Reconciler:
         if over:
             ends = tuple(replace(end, reason="`max_hours` is over") for end in decided.terminations)
             decided = replace(decided, terminations=ends)
+        update = None
+        if decided.health is not None and not intent.stopping:
+            update = self._updating.settle(
+                spec, trial, decided.health, history, wanted=decided.wanted, now=observed.now
+            )
+        trouble += [update.told] if update is not None else []
         if trouble:
             decided = replace(decided, notes=(*decided.notes, *trouble))
         if observed.machines is not None:
             self._apply(identity, spec, observed, decided, history)
-        return Tick(identity, spec, intent, observed, decided, self._membership, over)
+        return Tick(
+            identity, spec, intent, observed, decided, self._membership, over, update, trial.file
+        )
 
     # -- observe ----------------------------------------------------------------------------
 

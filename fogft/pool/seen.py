@@ -100,6 +100,7 @@ def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
     from fogft.core.history import History
     from fogft.core.model import Observed
     from fogft.core.planner import Plan
+    from fogft.core.rollout import describe
     from fogft.pool import proxy_report
     from fogft.pool.reconciler import Tick
 
@@ -119,7 +120,18 @@ def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
     health = None if machines is None else judge(identity.uid, spec, observed, history)
     decided = Plan(wanted=intent.wanted(spec), health=health)
     found = status.of_tick(
-        Tick(identity, spec, intent, observed, decided, store.membership()),
+        Tick(
+            identity,
+            spec,
+            intent,
+            observed,
+            decided,
+            store.membership(),
+            file=store.applied(),
+            update=None
+            if health is None
+            else describe(spec, store.good(), store.trial(), health, decided.wanted),
+        ),
         history=history,
         report=report,
         recent=events[-EVENTS_SHOWN:],

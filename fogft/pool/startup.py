@@ -84,7 +84,10 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
     paths = store.paths
     uid = secrets.token_hex(8)
     shutil.rmtree(paths.credentials, ignore_errors=True)  # of an `up` that was cut short
-    old = (paths.history, paths.membership, paths.lease, paths.records, paths.manager_records)
+    old = (
+        *(paths.history, paths.membership, paths.lease, paths.records, paths.manager_records),
+        *(paths.good_spec, paths.trial),
+    )
     for left in old:
         left.unlink(missing_ok=True)
     credentials.create_authority(paths.credentials, uid)

@@ -77,6 +77,23 @@ class ServiceStatus:
 
 
 @dataclass(frozen=True)
+class UpdateStatus:
+    """An update under way, or the last one where it was given up.
+
+    Attributes:
+        state: ``in progress``, ``stopped`` or ``rolled back``.
+        done: Replicas of the version that is wanted now which serve.
+        of: How many are wanted.
+        fault: Why it was given up; empty while it was not.
+    """
+
+    state: str
+    done: int
+    of: int
+    fault: str = ""
+
+
+@dataclass(frozen=True)
 class PoolStatus:
     """The whole pool.
 
@@ -89,6 +106,7 @@ class PoolStatus:
         ended: Why the manager has ended the pool by itself; empty while it runs.
         notes: Why the pool is not yet as wanted, in sentences.
         events: The last things that happened: ``{at, event, replica, location, detail}``.
+        applied: Digest of the pool file that was applied last.
     """
 
     pool: str
@@ -112,6 +130,8 @@ class PoolStatus:
     replicas: Sequence[ReplicaStatus] = ()
     services: Sequence[ServiceStatus] = ()
     events: Sequence[Mapping[str, Any]] = ()
+    applied: str = ""
+    update: UpdateStatus | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form."""
@@ -127,7 +147,9 @@ def from_json(raw: Any) -> PoolStatus:
     try:
         replicas = [ReplicaStatus(**replica) for replica in raw["replicas"]]
         services = [ServiceStatus(**service) for service in raw["services"]]
-        return PoolStatus(**{**raw, "replicas": replicas, "services": services})
+        update = UpdateStatus(**raw["update"]) if raw.get("update") else None
+        found = {"replicas": replicas, "services": services, "update": update}
+        return PoolStatus(**{**raw, **found})
     except (KeyError, TypeError, AttributeError) as error:
         raise StateError(f"not a status: {error}", "is the manager of another version?") from error
 
@@ -169,7 +191,16 @@ def of_tick(
         replicas=replicas,
         services=_services(tick.spec, judged, report),
         events=[_event(event) for event in recent],
+        applied=tick.file,
+        update=_update(tick),
     )
+
+
+def _update(tick: Tick) -> UpdateStatus | None:
+    update = tick.update
+    if update is None:
+        return None
+    return UpdateStatus(update.state.value, update.done, update.of, update.fault)
 
 
 def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float) -> ReplicaStatus:

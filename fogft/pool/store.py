@@ -7,6 +7,7 @@ Not here: what to remember (`fogft.core`) and how a file is replaced (`fogft.dis
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import threading
@@ -18,11 +19,12 @@ from typing import Any, Protocol
 from fogft import disk
 from fogft.core import intent as intents
 from fogft.core import membership as memberships
-from fogft.core.errors import PoolNotFound, StateError
+from fogft.core.errors import PoolNotFound, SpecError, StateError
 from fogft.core.history import Event, History, compacted
 from fogft.core.intent import Intent
 from fogft.core.model import Membership
 from fogft.core.names import POOL_UID_PATTERN
+from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
 from fogft.pool.paths import PoolPaths
 
@@ -53,7 +55,22 @@ class Store(Protocol):
         """Return what the pool is."""
 
     def spec(self) -> PoolSpec:
-        """Return the pool file as last applied."""
+        """Return the pool file in force: as applied last, or the good one after a rollback."""
+
+    def applied(self) -> str:
+        """Return the digest of the pool file that was applied last."""
+
+    def good(self) -> PoolSpec | None:
+        """Return the last file with which the pool was wholly ready; None for none yet."""
+
+    def keep_good(self, spec: PoolSpec) -> bool:
+        """Keep the file that `spec` was read from as the good one, if it was read last."""
+
+    def trial(self) -> Trial:
+        """Return what is remembered of the file applied last, or of an earlier one."""
+
+    def write_trial(self, trial: Trial) -> None:
+        """Remember it."""
 
     def intent(self) -> Intent:
         """Return what the user wants besides the file."""
@@ -93,6 +110,7 @@ class PoolStore:
         self._history: History | None = None
         self._appended = 0
         self._spec: tuple[bytes, PoolSpec] | None = None
+        self._good: tuple[bytes, PoolSpec] | None = None
 
     def identity(self) -> Identity:
         """Return what the pool is.
@@ -104,20 +122,78 @@ class PoolStore:
         return read_identity(self.paths)
 
     def spec(self) -> PoolSpec:
-        """Return the pool file as last applied.
+        """Return the pool file in force: as applied last, or the good one after a rollback.
 
         Raises:
             PoolNotFound: There is none.
             SpecError: It is wrong (`up` never stores such a file).
         """
+        raw = self._applied()
+        trial = self.trial()
+        if trial.fault and trial.file == digest(raw):
+            good = self.good()
+            if good is not None:
+                return good
+        if self._spec is None or self._spec[0] != raw:
+            self._spec = (raw, self._read(raw))
+        return self._spec[1]
+
+    def _read(self, raw: bytes) -> PoolSpec:
+        return self._parse(raw.decode(), self.identity().file)
+
+    def _applied(self) -> bytes:
         try:
-            raw = self.paths.spec.read_bytes()
+            return self.paths.spec.read_bytes()
         except FileNotFoundError:
             raise PoolNotFound(f"pool `{self.paths.folder.name}` has no spec") from None
-        if self._spec is None or self._spec[0] != raw:
-            spec = self._parse(raw.decode(), self.identity().file)
-            self._spec = (raw, spec)
-        return self._spec[1]
+
+    def applied(self) -> str:
+        """Return the digest of the pool file that was applied last.
+
+        Raises:
+            PoolNotFound: There is none.
+        """
+        return digest(self._applied())
+
+    def good(self) -> PoolSpec | None:
+        """Return the last file with which the pool was wholly ready; None for none yet."""
+        try:
+            raw = self.paths.good_spec.read_bytes()
+        except FileNotFoundError:
+            return None
+        if self._good is None or self._good[0] != raw:
+            try:
+                self._good = (raw, self._read(raw))
+            except SpecError:  # it was good for a version of fogft that knew other keys
+                return None
+        return self._good[1]
+
+    def keep_good(self, spec: PoolSpec) -> bool:
+        """Keep the file that `spec` was read from as the good one, if it was read last.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        if self._spec is None or self._spec[1] is not spec:
+            return False
+        disk.write_whole(self.paths.good_spec, self._spec[0])
+        return True
+
+    def trial(self) -> Trial:
+        """Return what is remembered of the file applied last, or of an earlier one."""
+        try:
+            raw = disk.read_json(self.paths.trial)
+            return Trial() if raw is None else Trial(**raw)
+        except (StateError, TypeError):
+            return Trial()  # damaged: the file is tried again
+
+    def write_trial(self, trial: Trial) -> None:
+        """Remember it.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        disk.write_json(self.paths.trial, asdict(trial))
 
     def intent(self) -> Intent:
         """Return what the user wants besides the file; nothing where nothing was asked."""
@@ -180,6 +256,11 @@ class PoolStore:
     def write_membership(self, membership: Membership) -> None:
         """Publish a membership."""
         disk.write_json(self.paths.membership, memberships.to_dict(membership))
+
+
+def digest(source: bytes) -> str:
+    """Return 16 hexadecimal digits that name a pool file's text."""
+    return hashlib.sha256(source).hexdigest()[:16]
 
 
 def read_identity(paths: PoolPaths) -> Identity:

@@ -308,7 +308,7 @@ class ClientProxy:
                 usable = [
                     x for x in self._links.values() if x.usable and name not in differ[x.peer.id]
                 ]
-                service.dispatcher.route(usable)
+                service.dispatcher.route(usable, self._versions(), self._leaving(usable))
                 continue
             able = [
                 link
@@ -320,6 +320,12 @@ class ClientProxy:
             if able or (fallback is not None and fallback.while_none_ready):
                 self._advertise(service)
             service.dispatcher.route(fresh or able)
+
+    def _versions(self) -> dict[ReplicaId, str]:
+        return {id: member.version for id, member in self._members.items()}
+
+    def _leaving(self, links: Iterable[Link]) -> frozenset[ReplicaId]:
+        return frozenset(link.peer.id for link in links if self._draining(link))
 
     def _advertise(self, service: _Service) -> None:
         if service.server is not None:
@@ -398,6 +404,7 @@ class ClientProxy:
         differ = self._differences(link)
         ours = next(iter(differ.values()), "") if link.usable else ""
         id = link.peer.id
+        ended = [s.dispatcher.by(id) for s in self._services.values()]
         return {
             "slot": id.slot,
             "generation": id.generation,
@@ -418,6 +425,8 @@ class ClientProxy:
             "reopened": status.reopened,
             "won": sum(s.dispatcher.won(id) for s in self._services.values()),
             "restarts": answer.restarts if answer else 0,
+            "answered": sum(well for well, _ in ended),
+            "failed": sum(ill for _, ill in ended),
             "work": dict(answer.work) if answer else {},
             "detail": status.detail or ours or (answer.detail if answer else ""),
         }

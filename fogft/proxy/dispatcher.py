@@ -166,7 +166,7 @@ class Dispatcher:
         payload = answer.payload
         replica = key_of(link)
         if payload is None:
-            self._refused(replica, answer)
+            self._refused(link.peer.id, replica, answer)
             return
         now = self._clock()
         is_ok = self._is_ok
@@ -174,13 +174,15 @@ class Dispatcher:
             try:
                 ok = is_ok(payload)
             except RosError:  # no response of this type
-                self._refused(replica, replace(answer, refusal=Refusal.MALFORMED))
+                malformed = replace(answer, refusal=Refusal.MALFORMED)
+                self._refused(link.peer.id, replica, malformed)
                 return
             if not ok:
-                self._rejected(replica, answer.request_id, payload)
+                self._rejected(link.peer.id, replica, answer.request_id, payload)
                 return
         request = answer.request_id
         with self._lock:
+            self._outcomes.served(link.peer.id)
             _, pending = self._requests.succeeded(request, now)
             if pending is None:
                 self._hedging.late(request, replica, now, answered=True)
@@ -208,10 +210,10 @@ class Dispatcher:
             if link is not None and not self._hedging.awaits(request, replica):
                 link.forget(request)
 
-    def _refused(self, replica: int, answer: Answer) -> None:
+    def _refused(self, id: ReplicaId, replica: int, answer: Answer) -> None:
         now = self._clock()
         with self._lock:
-            self._outcomes.refusal(answer.refusal)
+            self._outcomes.refusal(answer.refusal, id)
             verdict = self._requests.failed(
                 answer.request_id,
                 replica,
@@ -226,9 +228,10 @@ class Dispatcher:
         if verdict is Verdict.IDLE:
             self._idle(answer.request_id)
 
-    def _rejected(self, replica: int, request: bytes, payload: bytes) -> None:
+    def _rejected(self, id: ReplicaId, replica: int, request: bytes, payload: bytes) -> None:
         with self._lock:
             self._outcomes.count["rejected"] += 1
+            self._outcomes.failed(id)
             verdict = self._requests.rejected(request, replica, payload)
             if verdict is Verdict.LATE:
                 self._hedging.late(request, replica, self._clock(), answered=True)
@@ -426,6 +429,10 @@ class Dispatcher:
     def won(self, replica: ReplicaId) -> int:
         """Return how many requests a replica has answered first."""
         return self._outcomes.won_by(replica)
+
+    def by(self, replica: ReplicaId) -> tuple[int, int]:
+        """Return how many requests a replica has answered well, and how many failed there."""
+        return self._outcomes.by(replica)
 
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call; none where the spec wants no trace."""

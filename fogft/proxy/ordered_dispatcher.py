@@ -15,7 +15,7 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from fogft.core import ordering
@@ -23,7 +23,7 @@ from fogft.core.errors import RosError
 from fogft.core.hedging import NEVER
 from fogft.core.model import ReplicaId
 from fogft.core.ordering import Op, OrderError
-from fogft.core.sequencer import Order, Sequencer
+from fogft.core.sequencer import Handover, Order, Sequencer
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.dispatcher import key_of
 from fogft.proxy.mark import MarkFile
@@ -84,6 +84,8 @@ class OrderedDispatcher:
         self._lock = threading.Lock()
         self._sending = threading.Lock()
         self._links: dict[int, Link] = {}
+        self._versions: dict[int, str] = {}
+        self._leaving: list[int] = []
         self._numbered: dict[int, _Caller] = {}
         self._early: deque[_Caller] = deque()
         self._early_bytes = 0
@@ -91,11 +93,11 @@ class OrderedDispatcher:
         self._trouble = ""
         self._sequencer = self._begin_term()
 
-    def _begin_term(self, above: int = 0) -> Sequencer:
+    def _begin_term(self, above: int = 0, begin: Handover | None = None) -> Sequencer:
         epoch = self._mark.new_term(secrets.randbits(32), above=above)
         mark = self._mark.position
         log.info("term_began service=%s epoch=%x mark=%d", self.spec.name, epoch, mark.index)
-        return Sequencer(epoch, mark=mark)
+        return Sequencer(epoch, mark=mark, holder=self._mark.holder, begin=begin)
 
     # -- requests -------------------------------------------------------------------------
 
@@ -171,7 +173,7 @@ class OrderedDispatcher:
                 return
             now = self._clock()
             if payload is None:
-                self._outcomes.refusal(answer.refusal.split(":")[0])
+                self._outcomes.refusal(answer.refusal.split(":")[0], link.peer.id)
                 sequencer.refused(replica, op, index, answer.refusal, now)
             else:
                 try:
@@ -180,12 +182,16 @@ class OrderedDispatcher:
                     log.warning("order_unreadable service=%s reason=%r", self.spec.name, error)
                     sequencer.refused(replica, op, index, Refusal.MALFORMED, now)
                     first = False
+                if op is Op.APPLY:
+                    self._outcomes.served(link.peer.id)
                 if first:
-                    self._mark.write(sequencer.mark)  # before anybody sees the answer
+                    # Before anybody sees the answer.
+                    self._mark.write(sequencer.mark, sequencer.office.holder or "")
                     caller = self._numbered.pop(index, None)
                 if caller is not None:
                     self._outcomes.won(link.peer.id, now - caller.arrived)
-            sends = sequencer.sends or sequencer.deposed_by is not None
+            ends = sequencer.deposed_by is not None or sequencer.handover is not None
+            sends = sequencer.sends or ends or (op is Op.APPLY and sequencer.changing)
         if caller is not None and payload is not None:
             self._return(caller.handle, payload)
         elif op is Op.APPLY and payload is not None:
@@ -216,12 +222,30 @@ class OrderedDispatcher:
         with self._lock:
             self.spec = spec
 
-    def route(self, links: Sequence[Link]) -> None:
-        """Set the links that are up, whether or not their replica is ready."""
+    def route(
+        self,
+        links: Sequence[Link],
+        versions: Mapping[ReplicaId, str] | None = None,
+        leaving: Collection[ReplicaId] = (),
+    ) -> None:
+        """Set the links that are up, whether or not their replica is ready.
+
+        Args:
+            links: Them.
+            versions: What each replica runs.
+            leaving: The replicas that are to go soon.
+        """
         with self._lock:
             self._links = {key_of(link): link for link in links}
-            self._sequencer.reach(self._links, self._clock())
+            self._versions = {
+                key: (versions or {}).get(link.peer.id, "") for key, link in self._links.items()
+            }
+            self._leaving = [k for k, link in self._links.items() if link.peer.id in leaving]
+            self._reach(self._clock())
         self._send()
+
+    def _reach(self, now: float) -> None:
+        self._sequencer.reach(self._links, now, versions=self._versions, leaving=self._leaving)
 
     def tick(self) -> float:
         """Number what waited, send what is due, let callers' deadlines come. Call at 50 Hz.
@@ -234,6 +258,8 @@ class OrderedDispatcher:
             if self._sequencer.deposed_by is not None:
                 self._depose(now)
             self._sequencer.tick(now)
+            if self._sequencer.handover is not None:
+                self._hand_over(self._sequencer.handover, now)
             expired = self._expired(now)
             while self._early and self._number(self._early[0]):
                 self._early_bytes -= self._early.popleft().size
@@ -248,7 +274,13 @@ class OrderedDispatcher:
         above = self._sequencer.deposed_by or 0
         log.warning("term_ended service=%s obeyed=%x", self.spec.name, above)
         self._sequencer = self._begin_term(above)
-        self._sequencer.reach(self._links, now)
+        self._reach(now)
+
+    def _hand_over(self, begin: Handover, now: float) -> None:
+        """Another version takes over: all numbers given are answered, and none waits."""
+        log.info("office_changed service=%s version=%s", self.spec.name, begin.version)
+        self._sequencer = self._begin_term(begin=begin)
+        self._reach(now)
 
     def _expired(self, now: float) -> list[_Caller]:
         """Take out the callers whose deadline has come. Under the lock."""
@@ -290,6 +322,10 @@ class OrderedDispatcher:
         """Return how many requests a replica has answered first."""
         return self._outcomes.won_by(replica)
 
+    def by(self, replica: ReplicaId) -> tuple[int, int]:
+        """Return how many requests a replica has answered well, and how many failed there."""
+        return self._outcomes.by(replica)
+
     def report(self) -> dict[str, Any]:
         """Return counters, latency quantiles (seconds) and the state of the order."""
         with self._lock:
@@ -303,6 +339,7 @@ class OrderedDispatcher:
                     "last": log_.last if log_ else None,
                     "answered": sequencer.mark.index,
                     "joined": len(sequencer.joined),
+                    "version": sequencer.office.holder or "",
                     "log": len(log_) if log_ else 0,
                     "checkpoint": log_.checkpoint.index if log_ and log_.checkpoint else None,
                     "trouble": self._trouble,

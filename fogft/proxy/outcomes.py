@@ -13,12 +13,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from fogft.core.model import ReplicaId
+from fogft.wire.port import Refusal
 
 _LATENCIES_KEPT = 2000
 _COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
     *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
 )
+
+# Refusals that speak against the service; not those about load, links or who was faster.
+_FAILURES = frozenset({Refusal.CRASHED, Refusal.MALFORMED, Refusal.NOT_READY})
 
 
 class Outcomes:
@@ -39,6 +43,8 @@ class Outcomes:
         self.count = dict.fromkeys(_COUNTED, 0)
         self.refused: dict[str, int] = {}
         self._won: dict[ReplicaId, int] = {}
+        self._well: dict[ReplicaId, int] = {}
+        self._ill: dict[ReplicaId, int] = {}
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._late_lock = threading.Lock()
         self.trace: deque[dict[str, Any]] | None = None
@@ -85,9 +91,23 @@ class Outcomes:
         """Return how many requests a replica has answered first."""
         return self._won.get(replica, 0)
 
-    def refusal(self, reason: str) -> None:
+    def refusal(self, reason: str, replica: ReplicaId) -> None:
         """Count a refusal."""
         self.refused[reason] = self.refused.get(reason, 0) + 1
+        if reason in _FAILURES:
+            self.failed(replica)
+
+    def served(self, replica: ReplicaId) -> None:
+        """Count a request that a replica has answered well, first or not."""
+        self._well[replica] = self._well.get(replica, 0) + 1
+
+    def failed(self, replica: ReplicaId) -> None:
+        """Count a request that came to nothing at a replica, by the fault of its service."""
+        self._ill[replica] = self._ill.get(replica, 0) + 1
+
+    def by(self, replica: ReplicaId) -> tuple[int, int]:
+        """Return how many requests a replica has answered well, and how many failed there."""
+        return self._well.get(replica, 0), self._ill.get(replica, 0)
 
     def late(self) -> None:
         """Count an answer that came too late to be used. Any thread, no other lock."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,10 @@ from fogft import app, disk
 from fogft.cli import main, progress
 from fogft.cli.lifecycle import is_answering
 from fogft.core.errors import FogftError
+from fogft.core.rollout import Trial
 from fogft.pool.seen import Seen
+from fogft.pool.status import PoolStatus, UpdateStatus
+from fogft.pool.store import digest
 from tests.cli.pools import REPLICA, SPEC, STATUS, lay_down
 
 POOL = SPEC + "resources: {infra: local/us-west-2, use_spot: true}\n"
@@ -113,7 +116,7 @@ def test_it_gives_up_at_once_when_run_keeps_ending(home, file, looks, capsys):
     silent = replace(UP.services[0], ready_replicas=0)
     detail = "`run` ended (exit status 1) and is started again"
     hopeless = replace(STARTING, restarts=4, detail=detail)
-    looks(replace(UP, services=(silent,), replicas=(hopeless,)))
+    looks(updated(file, services=(silent,), replicas=(hopeless,)))
     assert main.run(["up", str(file), "--timeout", "1000"]) == 1
     said = capsys.readouterr().err
     assert "error: `/plan` of `planner` does not answer: `run` ends again and again\n" in said
@@ -208,7 +211,7 @@ def test_a_file_for_another_cloud_can_be_tried_here(file, looks, capsys):
 def test_a_changed_file_is_told_in_words(home, file, looks, capsys):
     lay_down(home)
     file.write_text(POOL.replace("replicas: 3", "replicas: 2").replace("_service", "_node"))
-    looks(UP)
+    looks(updated(file))
     assert main.run(["up", str(file)]) == 0
     assert capsys.readouterr().err.splitlines()[:5] == [
         "pool `planner` changes:",
@@ -217,6 +220,62 @@ def test_a_changed_file_is_told_in_words(home, file, looks, capsys):
         "  `replicas`: 3 -> 2",
         "  so its replicas are replaced one after the other, new before old",
     ]
+
+
+def updated(file: Path, state: str = "", fault: str = "", **others: object) -> PoolStatus:
+    """Return a status of a pool whose manager has seen a file, and what became of it."""
+    update = UpdateStatus(state, 1, 2, fault) if state else None
+    return replace(UP, applied=digest(file.read_bytes()), update=update, **others)
+
+
+def test_an_update_is_waited_for(home, file, looks, capsys):
+    """The pool answers all the time: that does not say that the update has come to its end."""
+    lay_down(home)
+    file.write_text(POOL.replace("_service", "_node"))
+    looks(UP, updated(file, "in progress"), updated(file, "in progress"), updated(file))
+    assert main.run(["up", str(file)]) == 0
+    assert capsys.readouterr().err.endswith("with 1 of 1 replicas ready\n")
+
+
+def test_an_update_that_is_rolled_back_is_an_error_with_its_reason(home, file, looks, capsys):
+    lay_down(home)
+    file.write_text(POOL.replace("_service", "_node"))
+    fault = "replica 0.2: `run` ended 4 times"
+    looks(
+        updated(file, "in progress"),
+        updated(file, "stopped", fault),
+        updated(file, "rolled back", fault),
+    )
+    assert main.run(["up", str(file)]) == 1
+    assert capsys.readouterr().err.endswith(
+        "error: `planner` was not updated: replica 0.2: `run` ended 4 times\n\n"
+        "hint: see `fogft logs`; change the file and `fogft up` it again: this one is not retried\n"
+    )
+
+
+def test_a_file_that_was_given_up_is_not_announced_as_a_change(home, file, looks, capsys):
+    paths = lay_down(home)
+    disk.write_whole(paths.good_spec, paths.spec.read_text())
+    file.write_text(POOL.replace("_service", "_node"))
+    disk.write_whole(paths.spec, file.read_text())
+    trial = Trial(digest(file.read_bytes()), 1.0, "replica 0.2: setup")
+    disk.write_json(paths.trial, asdict(trial))
+    looks(updated(file, "rolled back", trial.fault))
+    assert main.run(["up", str(file)]) == 1
+    said = capsys.readouterr().err
+    assert "changes" not in said
+    assert "error: `planner` was not updated: replica 0.2: setup\n" in said
+
+
+def test_no_room_for_both_is_said_before(home, file, looks, capsys):
+    lay_down(home)
+    cap = POOL.replace("  replicas: 3", "  replicas: 3\n  max_usd_per_hour: 0.21")
+    file.write_text(cap.replace("_service", "_node"))
+    looks(updated(file))
+    assert main.run(["up", str(file)]) == 0
+    said = capsys.readouterr().err
+    assert "  so its replicas are replaced one after the other, old before new\n" in said
+    assert "  $0.21/h (`max_usd_per_hour`) has no room for both: meanwhile one fewer" in said
 
 
 def test_the_same_file_changes_nothing(home, file, looks, capsys):

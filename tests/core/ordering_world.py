@@ -213,6 +213,7 @@ class World:
             first = self.sequencer.replied(order.replica, order.op, order.index, payload)
             if first:
                 self.mark = self.sequencer.mark
+                self.accepted(order, payload)
                 asked = self.pending.pop(order.index, None)
                 if asked is not None:
                     answer = eval(payload.decode())
@@ -230,7 +231,7 @@ class World:
         answer: bytes | None
         if begun.op is Op.APPLY:
             question = self.questions[begun.payload]
-            host.state, result = self.step(host.state, question)
+            host.state, result = self.apply(replica, host.state, question)
             host.applied.append(question)
             answer = repr(result).encode()
         elif begun.op is Op.SNAPSHOT:
@@ -240,6 +241,13 @@ class World:
             host.state, host.applied = eval(begun.payload.decode())
             answer = b""
         self.effects(replica, host.machine.done(begun.serial, answer))
+
+    def apply(self, replica: int, state: Any, question: Any) -> Any:
+        """Return the service's next state and answer."""
+        return self.step(state, question)
+
+    def accepted(self, order: Order, payload: bytes) -> None:
+        """Note an answer that a caller sees."""
 
     # -- the end --------------------------------------------------------------------------
 

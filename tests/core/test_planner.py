@@ -227,11 +227,42 @@ def test_outdated_replica_that_never_served_is_ended_at_once() -> None:
     assert (launches(world), ends(world)) == (["1.2"], ["1.1"])
 
 
-def test_no_surge_keeps_what_serves_and_says_so() -> None:
-    """With `max_surge` 0 nothing can be replaced new before old, and the note says why."""
+def test_no_surge_replaces_old_before_new_and_says_so() -> None:
+    """With `max_surge` 0 an outdated one is drained first, while all others serve."""
     world = World(spec(2, max_surge=0)).having(replica(0), replica(1, outdated=True))
     assert (launches(world), ends(world)) == ([], [])
-    assert "`max_surge`" in world.plan().notes[0]
+    assert shorts(world.plan().draining) == ["1.1"]
+    assert "slot 1: no room for both, so old before new" in world.plan().notes
+    drained = replica(1, outdated=True, drained_s=20.0)
+    world = World(spec(2, max_surge=0)).having(replica(0), drained)
+    assert ends(world) == ["1.1"]
+
+
+def test_no_room_and_nobody_else_to_answer_keeps_the_old_one() -> None:
+    """One replica alone is not ended before its successor: it serves the old file."""
+    for lone in (spec(1, max_surge=0), spec(1, max_usd_per_hour=0.15)):
+        world = World(lone).having(replica(0, outdated=True))
+        assert (launches(world), ends(world), world.plan().draining) == ([], [], ())
+        assert "slot 0 is not updated" in " ".join(world.plan().notes)
+
+
+def test_a_newcomer_has_to_serve_a_while_before_the_next_is_replaced() -> None:
+    """An update goes on only when the new version has shown for some seconds that it serves."""
+    fresh = World(spec(2)).having(replica(0, 2, age_s=3), replica(1, outdated=True))
+    assert (launches(fresh), ends(fresh), fresh.plan().draining) == ([], [], ())
+    settled = World(spec(2)).having(replica(0, 2, age_s=30), replica(1, outdated=True))
+    assert launches(settled) == ["1.2"]
+
+
+def test_an_outdated_one_that_never_served_is_ended_at_once() -> None:
+    """The failed new one of a rollback answers probes and nothing else: it is no loss."""
+    world = World(spec(2)).having(replica(0), replica(1), replica(2, state="unready"))
+    never = replace(
+        replica(2, outdated=True, state="unready"),
+        events=replica(2, state="starting").events,
+    )
+    world = World(spec(2)).having(replica(0), replica(1), never)
+    assert ends(world) == ["2.1"]
 
 
 def test_budget_holds_and_is_explained() -> None:

@@ -8,6 +8,7 @@ from fogft.core.history import Event, History
 from fogft.core.intent import Intent
 from fogft.core.membership import is_newer
 from fogft.core.model import Membership
+from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
 from fogft.pool.store import Identity
 
@@ -18,6 +19,9 @@ class MemoryStore:
     def __init__(self, identity: Identity, spec: PoolSpec) -> None:
         self._identity = identity
         self.the_spec = spec
+        self.the_good: PoolSpec | None = None
+        self.the_trial = Trial()
+        self.edits = 0  # counts files that were applied
         self.the_intent = Intent()
         self.events: list[Event] = []
         self.published: Membership | None = None
@@ -28,7 +32,28 @@ class MemoryStore:
         return self._identity
 
     def spec(self) -> PoolSpec:
-        return self.the_spec
+        rejected = self.the_trial.fault and self.the_trial.file == self.applied()
+        return self.the_good if rejected and self.the_good is not None else self.the_spec
+
+    def applied(self) -> str:
+        return f"{self.the_spec.replica_hash} {self.edits}"
+
+    def good(self) -> PoolSpec | None:
+        return self.the_good
+
+    def keep_good(self, spec: PoolSpec) -> bool:
+        self.crash_point()
+        self.the_good = spec
+        self.crash_point()
+        return True
+
+    def trial(self) -> Trial:
+        return self.the_trial
+
+    def write_trial(self, trial: Trial) -> None:
+        self.crash_point()
+        self.the_trial = trial
+        self.crash_point()
 
     def intent(self) -> Intent:
         return self.the_intent

@@ -151,6 +151,7 @@ def exclude(world: World) -> Callable[[], None]:
 def edit_the_file(world: World) -> None:
     run = world.random.choice(["one", "two", "three"])
     world.store.the_spec = replace(world.store.the_spec, task={"run": run})
+    world.store.edits += 1
 
 
 FAULTS = [

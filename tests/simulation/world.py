@@ -93,6 +93,7 @@ class World:
         self.crashing: set[ReplicaId] = set()  # their service is away
         self.told: set[ReplicaId] = set()  # of their end, by a notice that only they hear
         self.at_risk: set[ReplicaId] = set()  # their cloud recommends to move them
+        self.broken: dict[str, str] = {}  # version -> what is wrong with it, see `wrong`
         self.uplink_down = False
         self.proxy_down = False
         self.echo_draining = self.random.random() < 0.5
@@ -177,7 +178,25 @@ class World:
         """Whether a replica's service would answer if asked on its own machine."""
         ran_at = self._ran_at.get(id)
         started = ran_at is not None and self.now - ran_at >= self.start_s
+        if self.wrong(id) in ("crashes", "hangs"):
+            return False
         return started and id not in self.frozen and id not in self.crashing
+
+    def wrong(self, id: ReplicaId) -> str:
+        """Return what is wrong with a replica's version: ``crashes``, ``hangs``, ``errs`` or ''."""
+        return self.broken.get(self.versions().get(id, ""), "")
+
+    def versions(self) -> dict[ReplicaId, str]:
+        """Return which version each machine runs."""
+        return {m.id: m.spec_hash for m in self.truth() if m.id.pool_uid == UID}
+
+    def _asked(self, id: ReplicaId, *, serving: bool) -> dict[str, int]:
+        """Count restarts and requests: three a second, of which an erring version fails half."""
+        ran_s = max(0.0, self.now - self._ran_at.get(id, self.now))
+        asked = int(3 * ran_s) if serving else 0
+        failed = asked // 2 if self.wrong(id) == "errs" else asked // 200
+        restarts = int(ran_s / 2) if self.wrong(id) == "crashes" else 0
+        return {"restarts": restarts, "answered": asked - failed, "failed": failed}
 
     def links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...] | None:
         """Report as the client proxy does: of the published members, by what was heard."""
@@ -209,6 +228,7 @@ class World:
                 at_risk=up and member.id in self.at_risk,
                 silent_for_s=silent,
                 in_flight=self.random.randrange(2) if serving else 0,
+                **self._asked(member.id, serving=serving),
             )
         return tuple(self._reported.values())
 
@@ -262,7 +282,9 @@ class World:
         left = (serving & known) - gone - noticed
         for end in tick.plan.terminations:
             if end.id in serving:
-                assert len(left) >= self.wanted(), f"{end.id.short} served; left: {left}"
+                makes_room = "old before new" in end.reason
+                needed = max(1, self.wanted() - 1) if makes_room else self.wanted()
+                assert len(left) >= needed, f"{end.id.short} served; left: {left}"
         if known and len(serving & known) >= self.wanted():
             self.whole_ticks += 1
 

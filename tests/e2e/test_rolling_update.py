@@ -1,0 +1,74 @@
+"""A changed file under load: it takes over, or the good one comes back. No request is lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
+
+
+def flawless(result: dict[str, Any]) -> bool:
+    return result["failed"] == result["wrong"] == result["twice"] == 0
+
+
+def replicas(pool) -> set[tuple[int, int]]:
+    return {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
+
+
+def test_a_version_that_crashes_at_start_is_rolled_back_and_the_next_one_taken(pool):
+    """Under load: a bad file is given up, the good version serves on, a mended file is taken."""
+    pool.write(replicas=2)
+    pool.up()
+    pool.wait(lambda: (pool.folder / "home" / "pools" / "e2e" / "good.yaml").exists())
+    before, good = replicas(pool), pool.file.read_text()
+    client = pool.client(300, 20)
+
+    pool.file.write_text(good.replace("/plan_service.py", "/no_such_service.py"))
+    said = pool.fogft("up", str(pool.file), "--yes", ok=False)
+    assert "new before old" in said
+    assert "error: `e2e` was not updated: replica " in said
+    assert "`run` ended " in said
+    status = pool.wait(lambda: rolled_back(pool))
+    assert "`run` ended " in status["update"]["fault"]
+    assert before <= replicas(pool) | before
+    assert pool.ready() == 2
+    assert replicas(pool) == before, "the good ones were never touched"
+    log = (pool.folder / "home" / "pools" / "e2e" / "manager.log").read_text()
+    assert "update_stopped" in log
+    assert "was not updated" in pool.fogft("up", str(pool.file), "--yes", ok=False)
+    assert replicas(pool) == before
+
+    pool.file.write_text(good.replace("plan_service.py 0.005", "plan_service.py 0.006"))
+    pool.fogft("up", str(pool.file), "--yes", limit_s=200)
+    assert not before & replicas(pool), "`up` returns once the update is done"
+    assert pool.status()["update"] is None
+    result = client.finish()
+    assert result["requests"] > 200
+    assert flawless(result), result
+
+
+def rolled_back(pool) -> dict[str, Any] | None:
+    status = pool.status()
+    update = status["update"]
+    return status if update and update["state"] == "rolled back" else None
+
+
+def test_old_goes_before_new_where_the_budget_has_no_room_for_both(pool):
+    """The cap has room for two and no third: one always answers, and none is lost."""
+    pool.write(replicas=2)
+    pool.up()
+    paid = pool.status()["usd_per_hour"]
+    more = f"  max_usd_per_hour: {paid * 1.25:.4f}\n"
+    pool.write(replicas=2, more=more)
+    pool.up()
+    before = replicas(pool)
+    client = pool.client(300, 20)
+    pool.write(replicas=2, work_s=0.006, more=more)
+    said = pool.fogft("up", str(pool.file), "--yes", ok=False, limit_s=200)
+    assert "old before new" in said
+    assert not before & replicas(pool), said
+    assert pool.status()["usd_per_hour"] <= paid * 1.25
+    result = client.finish()
+    assert flawless(result), result
