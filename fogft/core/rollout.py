@@ -110,6 +110,8 @@ def fault(spec: PoolSpec, good: PoolSpec, health: Health, history: History, bega
         history: What happened.
         began_at: When the update began.
     """
+    if spec is good:
+        return ""
     new = [judged for judged in health.replicas if is_new(spec, good, judged.machine)]
     old = [j for j in health.replicas if j.machine.spec_hash == replica_hash(good, j.id.slot)]
     for judged in new:
@@ -234,7 +236,7 @@ def describe(
         back = all(current) and done >= wanted
         state = UpdateState.ROLLED_BACK if back else UpdateState.STOPPED
         return Update(state, done, wanted, trial.fault)
-    if not differs(spec, good, [judged.id.slot for judged in health.replicas]):
+    if spec is good or not differs(spec, good, [judged.id.slot for judged in health.replicas]):
         return None
     return Update(UpdateState.IN_PROGRESS, done, wanted)
 

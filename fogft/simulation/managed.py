@@ -13,6 +13,7 @@ from fogft.core import migration, quarantine, schedule
 from fogft.core.history import Event, History, compacted
 from fogft.core.intent import Intent
 from fogft.core.model import LinkReport, LinkState, Membership
+from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
 from fogft.pool.reconciler import Reconciler, Tick
 from fogft.pool.store import Identity
@@ -41,6 +42,25 @@ class Memory:
     def spec(self) -> PoolSpec:
         """Return the pool file."""
         return self.the_spec
+
+    def applied(self) -> str:
+        """Return a digest: the file never changes."""
+        return _TRIAL.file
+
+    def good(self) -> PoolSpec | None:
+        """Return the pool file: no other one is ever on trial."""
+        return self.the_spec
+
+    def keep_good(self, spec: PoolSpec) -> bool:
+        """Keep nothing: the good file is the pool file."""
+        return False
+
+    def trial(self) -> Trial:
+        """Return what never changes."""
+        return _TRIAL
+
+    def write_trial(self, trial: Trial) -> None:
+        """Remember nothing."""
 
     def intent(self) -> Intent:
         """Return no wishes besides the file."""
@@ -73,6 +93,7 @@ class Memory:
 
 
 _NO_WISHES = Intent()
+_TRIAL = Trial("simulated")
 
 
 class Managed:

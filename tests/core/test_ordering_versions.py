@@ -134,7 +134,7 @@ def one_service(world: Versions) -> list[str]:
 @pytest.mark.parametrize("replicas", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(12))
 def test_an_update_is_one_point_of_the_order(seed, replicas):
-    """Before it all answers are the old version's, after it the new one's, from the same state."""
+    """Before it all answers are the old version's, after it the new one's, from its state."""
     source = random.Random(seed)
     world = Versions(replicas)
     drive(world, source, ask_counter, 200, faults=0.0)
