@@ -37,7 +37,7 @@ note: waiting after 3 failed launches (capacity)
 
 def without_age(screen: str) -> str:
     """Return a screen with the one thing in it that depends on the clock made the same."""
-    return re.sub(r"seen 0\.\d s ago", "seen 0.4 s ago", screen)
+    return re.sub(r"seen [\d.]+ s ago", "seen 0.4 s ago", screen)
 
 
 def test_the_screen_at_100_columns(home, capsys):
@@ -87,7 +87,7 @@ def test_a_manager_that_hangs_is_told(home, capsys):
     paths = lay_down(home, age_s=40)
     with disk.locked(paths.manager_lock):
         main.run(["status"])
-    assert "the manager has not looked for 40 s" in capsys.readouterr().err
+    assert re.search(r"the manager has not looked for [4-9]\d s", capsys.readouterr().err)
 
 
 def test_what_sounds_alarm_stands_in_the_first_line(home, capsys):
