@@ -145,6 +145,8 @@ def up(
     rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
     if is_updating(seen, awaited):
         rest = "; the update goes on, see `fogft status`"
+    for service in () if wanted else status.services:
+        output.say(f"offers {service.name} ({service.type})")
     output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
 
 
@@ -178,6 +180,8 @@ def managed(pool: str) -> Seen:
 def is_answering(seen: Seen, services: set[str], since: float) -> bool:
     """Whether every service has a ready replica and a client proxy, as seen after `since`.
 
+    Without services to look for, every one that was discovered.
+
     A pool whose schedule wants no replica now is as it should be.
     """
     status = seen.status
@@ -187,7 +191,8 @@ def is_answering(seen: Seen, services: set[str], since: float) -> bool:
     return (
         status.observed_at >= since
         and status.proxy_alive
-        and {service.name for service in status.services} == services == ready
+        and bool(ready)
+        and {service.name for service in status.services} == (services or ready) == ready
     )
 
 
@@ -224,7 +229,9 @@ def not_answering(seen: Seen, what: str) -> FogftError:
 
     status = seen.status
     silent = [service.name for service in status.services if not service.ready_replicas]
-    listed = ", ".join(f"`{name}`" for name in silent) or "the client proxy"
+    listed = ", ".join(f"`{name}`" for name in silent) or (
+        "the client proxy" if status.services else "`run`"
+    )
     lines = [f"{listed} of `{status.pool}` {what}"]
     lines += [f"  {note}" for note in status.notes]
     lines += [f"  replica {r.slot}.{r.generation}: {r.detail}" for r in status.replicas if r.detail]

@@ -138,7 +138,8 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
         return False
     if machine.spec_hash != replica_hash(spec, machine.id.slot):
         return bool(link.ready)
-    return link.ready.issuperset(service.name for service in services_at(spec, machine.id.slot))
+    wanted = services_at(spec, machine.id.slot) or spec.discovered
+    return bool(wanted) and link.ready.issuperset(service.name for service in wanted)
 
 
 @dataclass(frozen=True)

@@ -136,11 +136,17 @@ class PoolSpec:
     rendezvous: tuple[str, ...] = ()
     dial_in: str = ""
     task: Mapping[str, Any] = field(default_factory=dict)
+    discovered: tuple[ServiceSpec, ...] = ()
 
     @cached_property
     def derived(self) -> dict[Any, Any]:
         """Where `groups` keeps what it worked out of this spec, which never changes."""
         return {}
+
+    @property
+    def proxied(self) -> tuple[ServiceSpec, ...]:
+        """The services that robots are offered: the file's, or what was discovered."""
+        return self.services or self.discovered
 
     @property
     def replica_hash(self) -> str:

@@ -107,7 +107,8 @@ def pool_spec(
     workdir = spec.task.get("workdir")
     if isinstance(workdir, str) and check_workdir is not None:
         _judge(top, "workdir", check_workdir(workdir))
-    for section, service in zip(ours.sections("services", ""), services, strict=True):
+    sections = ours.sections("services", "") if services else ()
+    for section, service in zip(sections, services, strict=True):
         if check_types is not None:
             _judge(section, "type", check_types(service.type))
         if service.ok_field and check_fields is not None:

@@ -21,11 +21,13 @@ _SERVICES_HINT = "write a list, such as `services: [{name: /detect, type: my_msg
 
 
 def read_services(ours: Section) -> tuple[ServiceSpec, ...]:
-    """Return what `services` asks for.
+    """Return what `services` asks for; nothing where it is left out: then `run` tells.
 
     Raises:
         SpecError: The first mistake.
     """
+    if "services" not in ours.children:
+        return ()
     found: dict[str, ServiceSpec] = {}
     lines: dict[str, int] = {}
     for section in ours.sections("services", _SERVICES_HINT):

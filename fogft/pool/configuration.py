@@ -92,7 +92,7 @@ def proxy_config(
             "ca": f"{paths.credentials.name}/ca.crt",
             "certificate": f"{paths.credentials.name}/{stem}.crt",
             "key": f"{paths.credentials.name}/{stem}.key",
-            "services": [to_plain(service) for service in spec.services],
+            "services": [to_plain(service) for service in spec.proxied],
             "suspect_after_s": spec.health.suspect_after_s,
             "rendezvous": list(spec.rendezvous),
             "records": paths.records.name,

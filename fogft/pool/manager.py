@@ -27,6 +27,7 @@ from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
 from fogft.pool import configuration, farewell, proxy_report, shutdown, status
 from fogft.pool.announcing import ManagerRecords
+from fogft.pool.discovered import Discovery
 from fogft.pool.latency import Distances, Latencies
 from fogft.pool.lease import Lease
 from fogft.pool.ledger import Ledger
@@ -76,6 +77,7 @@ class Manager:
         self._certified_at: float | None = None
         self._revoked: frozenset[str] = frozenset()
         self._records = ManagerRecords(self._paths, self._identity.uid, self._lease.epoch)
+        self._discovery = Discovery(self._paths.discovered)
         self._seen: dict[Path, tuple[int, int, int] | None] = {}
         self._digest: object = None
         self._trouble: list[str] = []
@@ -127,6 +129,7 @@ class Manager:
         tick = self._attempt_tick()
         if tick is None:
             return False
+        self._attempt(lambda: self._discover(tick))
         self._attempt(lambda: self._records.look(tick.spec.rendezvous, tick.membership))
         if tick.over and tick.observed.machines == ():
             self._attempt(self._leave)
@@ -136,6 +139,11 @@ class Manager:
                 return not self._trouble
         self._attempt(lambda: self._write_status(tick))
         return False
+
+    def _discover(self, tick: Tick) -> None:
+        if self._discovery.look(tick.spec, tick.observed):
+            log.info("services_discovered pool=%s", self._identity.name)
+            self._wake.set()  # the client proxy is to know
 
     def _leave(self) -> None:
         """See to it that nothing of a pool that ends by itself is left but its folder."""
@@ -188,7 +196,11 @@ class Manager:
     def _write_status(self, tick: Tick, ended: str = "") -> None:
         report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
         fresh = report is not None and report.fresh(time.time())
-        notes = [*self._trouble, *filter(None, (self._proxy.trouble, self._records.trouble))]
+        notes = [
+            *self._trouble,
+            *self._discovery.notes,
+            *filter(None, (self._proxy.trouble, self._records.trouble)),
+        ]
         if (report is None or not fresh) and not tick.over:
             when = "lately" if report else "yet"
             notes.append(f"the client proxy has not reported {when}")

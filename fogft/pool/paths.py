@@ -31,8 +31,8 @@ class PoolPaths:
 
     Written by `up`, `scale`, `drain`, `exclude` and `down` (under `intent_lock`):
     `identity`, `spec`, `intent`. By the manager (under `manager_lock`): `lease`,
-    `status`, `membership`, `proxy_config`, `history`, `credentials`, `good_spec`, `trial`. By
-    the client proxy (under `proxy_lock`): `proxy_status`.
+    `status`, `membership`, `proxy_config`, `history`, `credentials`, `good_spec`, `trial`,
+    `discovered`. By the client proxy (under `proxy_lock`): `proxy_status`.
     """
 
     folder: Path
@@ -91,6 +91,11 @@ class PoolPaths:
     def membership(self) -> Path:
         """The membership that the client proxy follows, and its cache."""
         return self.folder / "membership.json"
+
+    @property
+    def discovered(self) -> Path:
+        """Services that replicas told of, where the pool file lists none."""
+        return self.folder / "discovered.json"
 
     @property
     def records(self) -> Path:

@@ -86,7 +86,7 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
     shutil.rmtree(paths.credentials, ignore_errors=True)  # of an `up` that was cut short
     old = (
         *(paths.history, paths.membership, paths.lease, paths.records, paths.manager_records),
-        *(paths.good_spec, paths.trial),
+        *(paths.good_spec, paths.trial, paths.discovered),
     )
     for left in old:
         left.unlink(missing_ok=True)

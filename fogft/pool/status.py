@@ -253,7 +253,7 @@ def _services(
             ),
             counters=counters.get(service.name, {}),
         )
-        for service in spec.services
+        for service in spec.proxied
     ]
 
 

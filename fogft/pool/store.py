@@ -12,7 +12,7 @@ import json
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,6 +26,7 @@ from fogft.core.model import Membership
 from fogft.core.names import POOL_UID_PATTERN
 from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
+from fogft.pool import discovered
 from fogft.pool.paths import PoolPaths
 
 COMPACT_AFTER = 20_000
@@ -124,6 +125,8 @@ class PoolStore:
     def spec(self) -> PoolSpec:
         """Return the pool file in force: as applied last, or the good one after a rollback.
 
+        Where it lists no services, what was discovered is with it.
+
         Raises:
             PoolNotFound: There is none.
             SpecError: It is wrong (`up` never stores such a file).
@@ -136,7 +139,17 @@ class PoolStore:
                 return good
         if self._spec is None or self._spec[0] != raw:
             self._spec = (raw, self._read(raw))
+        self._spec = self._completed(self._spec)
         return self._spec[1]
+
+    def _completed(self, read: tuple[bytes, PoolSpec]) -> tuple[bytes, PoolSpec]:
+        """Add what was discovered to a spec that lists no services; the same object if known."""
+        raw, spec = read
+        if not spec.services:
+            found = discovered.read(self.paths.discovered).specs()
+            if found != spec.discovered:
+                return raw, replace(spec, discovered=found)
+        return read
 
     def _read(self, raw: bytes) -> PoolSpec:
         return self._parse(raw.decode(), self.identity().file)
@@ -166,6 +179,7 @@ class PoolStore:
                 self._good = (raw, self._read(raw))
             except SpecError:  # it was good for a version of fogft that knew other keys
                 return None
+        self._good = self._completed(self._good)
         return self._good[1]
 
     def keep_good(self, spec: PoolSpec) -> bool:

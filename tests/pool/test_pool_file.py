@@ -6,6 +6,7 @@ import datetime
 import os
 import re
 import textwrap
+from dataclasses import replace
 
 import pytest
 import yaml
@@ -177,11 +178,6 @@ MISTAKES = {
         "run: x\nfogft:\n",
         "pool.yaml:2: fogft: must be a map of keys, not nothing",
         "write `fogft:` with `services:` below it",
-    ),
-    "no services": (
-        "run: x\nfogft: {replicas: 2}\n",
-        "pool.yaml:2: fogft.services: is missing",
-        "write a list, such as `services: [{name: /detect, type: my_msgs/srv/Detect}]`",
     ),
     "empty services": (
         pool(services="[]"),
@@ -703,3 +699,11 @@ def test_no_bytes_make_anything_but_a_spec_error(source, tmp_path_factory):
     path.write_bytes(source)
     with pytest.raises(SpecError, match=rf"^{re.escape(str(path))}:"):
         pool_file.read(path)
+
+
+def test_a_file_without_services_leaves_it_to_what_run_offers():
+    spec = pool_file.parse("run: x\nfogft: {replicas: 2}\n", file="pool.yaml")
+    assert spec.services == spec.proxied == ()
+    found = replace(spec, discovered=(ServiceSpec("/a", "a/srv/A"),))
+    assert found.proxied == found.discovered
+    assert found.replica_hash == spec.replica_hash

@@ -1,0 +1,71 @@
+"""A pool whose file lists no services offers what `run` advertises, as a robot sees it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from tests.e2e.pool import NODES, Pool
+
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
+
+OFFERED = {
+    "/arm/turn": ["std_srvs/srv/SetBool"],  # `flip`, remapped, in the namespace
+    "/arm/worker/reset": ["std_srvs/srv/Trigger"],  # `~/reset` of the renamed node
+    "/plan": ["nav_msgs/srv/GetPlan"],  # absolute: no namespace touches it
+}
+
+
+def robot(pool: Pool, name: str, kind: str, seconds: float = 20) -> dict:
+    done = subprocess.run(
+        [sys.executable, str(NODES / "robot.py"), name, kind, str(seconds)],
+        env=pool.environ, capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def own(services: dict[str, list[str]]) -> dict[str, list[str]]:
+    """Leave out what every node of rclpy has, the asking one too."""
+    return {n: t for n, t in services.items() if not n.startswith("/robot/")}
+
+
+def test_the_robot_is_offered_what_run_advertises(pool: Pool):
+    """Names, namespaces and remappings as in ROS; nothing of ROS's own; kept across restarts."""
+    names = "-r __ns:=/arm -r __node:=worker -r flip:=turn"
+    pool.file.write_text(
+        "name: e2e\n"
+        "resources: {any_of: [{infra: local/us-west-1}, {infra: local/us-west-2}]}\n"
+        f"run: exec {sys.executable} {NODES}/several_services.py --ros-args {names}\n"
+        "fogft: {replicas: 2}\n"
+    )
+    pool.up()
+    seen = robot(pool, "/arm/worker/reset", "std_srvs/srv/Trigger")
+    assert own(seen["services"]) == OFFERED
+    assert "message='/arm/worker'" in seen["answer"]
+    assert "success=True" in robot(pool, "/arm/turn", "std_srvs/srv/SetBool")["answer"]
+    status = pool.status()
+    assert {s["name"]: s["ready_replicas"] for s in status["services"]} == dict.fromkeys(OFFERED, 2)
+
+    # The manager, the client proxy and every replica die; the offer does not.
+    os.kill(status["manager_pid"], signal.SIGKILL)
+    os.kill(status["proxy_pid"], signal.SIGKILL)
+    pool.up()
+    assert own(robot(pool, "/plan", "nav_msgs/srv/GetPlan")["services"]) == OFFERED
+    assert {r["generation"] for r in pool.status()["replicas"]} == {1}, "nothing was replaced"
+
+
+def test_a_replica_that_offers_other_names_is_explained(pool: Pool):
+    pool.write(replicas=1)
+    text = pool.file.read_text().replace("name: /plan", "name: /arm/plan")
+    pool.file.write_text(text)
+    said = pool.fogft("up", str(pool.file), "--yes", "--timeout", "15", ok=False)
+    assert "`run` does not offer /arm/plan yet; it offers /plan (nav_msgs/srv/GetPlan)" in re.sub(
+        r"\s+", " ", said
+    )
