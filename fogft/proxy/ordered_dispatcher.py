@@ -173,7 +173,8 @@ class OrderedDispatcher:
                 return
             now = self._clock()
             if payload is None:
-                self._outcomes.refusal(answer.refusal.split(":")[0], link.peer.id)
+                asked = link.peer.id if op is Op.APPLY else None
+                self._outcomes.refusal(answer.refusal.split(":")[0], asked)
                 sequencer.refused(replica, op, index, answer.refusal, now)
             else:
                 try:

@@ -21,8 +21,9 @@ _COUNTED = (
     *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
 )
 
-# Refusals that speak against the service; not those about load, links or who was faster.
-_FAILURES = frozenset({Refusal.CRASHED, Refusal.MALFORMED, Refusal.NOT_READY})
+# Refusals that speak against the service; not those about load, links, who was faster, or a
+# start that takes its time.
+_FAILURES = frozenset({Refusal.CRASHED, Refusal.MALFORMED})
 
 
 class Outcomes:
@@ -91,10 +92,10 @@ class Outcomes:
         """Return how many requests a replica has answered first."""
         return self._won.get(replica, 0)
 
-    def refusal(self, reason: str, replica: ReplicaId) -> None:
-        """Count a refusal."""
+    def refusal(self, reason: str, replica: ReplicaId | None = None) -> None:
+        """Count a refusal, and hold it against the replica if it was of a request."""
         self.refused[reason] = self.refused.get(reason, 0) + 1
-        if reason in _FAILURES:
+        if replica is not None and reason in _FAILURES:
             self.failed(replica)
 
     def served(self, replica: ReplicaId) -> None:

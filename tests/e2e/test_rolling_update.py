@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import signal
+import subprocess
+import sys
 from typing import Any
 
 import pytest
+
+from tests.e2e.pool import NODES
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
 
@@ -72,3 +78,46 @@ def test_old_goes_before_new_where_the_budget_has_no_room_for_both(pool):
     assert pool.status()["usd_per_hour"] <= paid * 1.25
     result = client.finish()
     assert flawless(result), result
+
+
+def test_versions_of_a_stateful_service_never_mix(pool):
+    """The new version adds ten where the old one adds one: each answer shows who computed it."""
+    write_counter(pool, "old", 1)
+    pool.up()
+    client = subprocess.Popen(
+        [sys.executable, f"{NODES}/count_client.py"],
+        env=pool.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert client.stderr is not None
+    assert any(line.startswith("asking") for line in client.stderr)
+    write_counter(pool, "new", 10)
+    pool.fogft("up", str(pool.file), "--yes", limit_s=200)
+    assert pool.status()["update"] is None
+    client.send_signal(signal.SIGINT)
+    out, err = client.communicate(timeout=60)
+    assert client.returncode == 0, err
+    answers = json.loads(out)
+    assert None not in answers, "a request was lost"
+    said = [(word, int(total)) for word, total in map(str.split, answers)]
+    versions = [version for version, _ in said]
+    assert versions == sorted(versions, reverse=True), "old and new took turns"
+    assert {"old", "new"} == set(versions)
+    before = 0
+    for version, total in said:
+        before += 1 if version == "old" else 10
+        assert total == before, (version, total)
+
+
+def write_counter(pool, version: str, factor: int) -> None:
+    pool.file.write_text(
+        "name: e2e\n"
+        "resources: {infra: local}\n"
+        f"run: exec {sys.executable} {NODES}/count_service.py {version} {factor}\n"
+        "fogft:\n"
+        "  replicas: 2\n"
+        "  services:\n"
+        "    - name: /count\n"
+        "      type: std_srvs/srv/SetBool\n"
+        "      timeout_s: 10.0\n"
+        "      state: {snapshot: /count/get_state, restore: /count/set_state}\n"
+    )
