@@ -64,6 +64,7 @@ class _Peer:
     wait_s: float = RETRY_FIRST_S / 2
     retry_at: float = 0.0
     checked_at: float = 0.0
+    waits_since: float | None = None
 
 
 @dataclass(frozen=True)
@@ -233,6 +234,7 @@ class Sequencer:
                 self._out.append(Order(replica, Op.CLAIM, self._serial))
             elif peer.phase is Phase.CLAIMED:
                 self._bring(replica, peer)
+                self._ask_again(replica, peer, now)
             elif peer.phase is Phase.JOINED:
                 self._feed(replica, peer)
                 self._check(replica, peer, now)
@@ -308,6 +310,17 @@ class Sequencer:
             return False  # of the version that took over: it begins from what was handed over
         return at == self.base
 
+    def _ask_again(self, replica: int, peer: _Peer, now: float) -> None:
+        """Claim anew one that waits for long: it may have applied more since it was asked."""
+        if peer.phase is not Phase.CLAIMED:
+            return
+        if peer.waits_since is None:
+            peer.waits_since = now
+        elif now - peer.waits_since > CHECK_EVERY_S and self._asked_for_checkpoint is None:
+            peer.phase = Phase.ASKED
+            self._serial += 1
+            self._out.append(Order(replica, Op.CLAIM, self._serial))
+
     def _check(self, replica: int, peer: _Peer, now: float) -> None:
         """Ask an idle replica where it stands: no request would tell that its service died."""
         if peer.phase is Phase.JOINED and not peer.open and now - peer.checked_at > CHECK_EVERY_S:
@@ -362,7 +375,7 @@ class Sequencer:
         if peer.phase is not Phase.ASKED:
             return
         peer.phase = Phase.CLAIMED
-        peer.promise = promise
+        peer.promise, peer.waits_since = promise, None
         self.held_by = ""
         if self.base is not None:
             self._bring(replica, peer)

@@ -90,7 +90,7 @@ class OrderedDispatcher:
         self._early: deque[_Caller] = deque()
         self._early_bytes = 0
         self._outcomes = Outcomes()
-        self._trouble = ""
+        self._trouble = self._told = ""
         self._sequencer = self._begin_term()
 
     def _begin_term(self, above: int = 0, begin: Handover | None = None) -> Sequencer:
@@ -313,7 +313,8 @@ class OrderedDispatcher:
             trouble = f"robot `{sequencer.held_by}` orders this service"
         elif sequencer.stranded:
             trouble = "no replica that can be reached holds the state; see docs/design/state.md"
-        if trouble and trouble != self._trouble:
+        if trouble and trouble != self._told:
+            self._told = trouble
             log.error("state_unavailable service=%s reason=%r", self.spec.name, trouble)
         self._trouble = trouble
 

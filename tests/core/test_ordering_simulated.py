@@ -85,7 +85,7 @@ def test_histories_are_linearizable_under_faults(seed, questions, step, start):
     check(world, step, start)
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", [*range(25), 10622])
 def test_without_losing_every_copy_all_recover_and_agree(seed):
     """While one replica and its service stay, all others come to its state and all is answered."""
     source = random.Random(seed)
