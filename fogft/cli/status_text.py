@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from fogft.cli.table import GAP, Cell, columns, with_remark
+from fogft.cli.tree_text import tree
 
 if TYPE_CHECKING:
     from fogft.pool.seen import Seen
@@ -34,6 +35,8 @@ def rendered(seen: Seen, *, width: int, colour: bool) -> list[str]:
         lines += ["", *replicas(status.replicas, REPLICA_COLUMNS, width=width, colour=colour)]
     if status.services:
         lines += ["", *services(status.services, colour=colour)]
+    drawn = tree(status.topology, colour=colour)
+    lines += ["", *drawn] if drawn else []
     remarks = notes(status, colour=colour)
     return [*lines, "", *remarks] if remarks else lines
 

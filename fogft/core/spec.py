@@ -21,6 +21,7 @@ from fogft.core.spec_choices import (
     TrafficSpec,
 )
 from fogft.core.spec_state import StateSpec
+from fogft.core.topology import Topology
 
 MAX_REPLICAS = 16
 # Keys of `resources` that say where a machine may be, not what it is.
@@ -117,6 +118,7 @@ class PoolSpec:
         migration: When a replica moves to a better location; None for never.
         rendezvous: ``host:port`` of each rendezvous.
         dial_in: ``host:port`` where replicas dial the robot; empty where the robot dials them.
+        topology: Who talks through whom.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -135,6 +137,7 @@ class PoolSpec:
     migration: MigrationSpec | None = field(default_factory=MigrationSpec)
     rendezvous: tuple[str, ...] = ()
     dial_in: str = ""
+    topology: Topology = field(default_factory=Topology)
     task: Mapping[str, Any] = field(default_factory=dict)
     discovered: tuple[ServiceSpec, ...] = ()
 

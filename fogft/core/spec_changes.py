@@ -23,7 +23,15 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
         for key in ("replicas", "max_surge", "max_usd_per_hour", "max_hours")
         if getattr(before, key) != getattr(after, key)
     ]
-    for key in ("availability", "placement", "on_demand", "groups", "schedule", "migration"):
+    for key in (
+        "availability",
+        "placement",
+        "on_demand",
+        "groups",
+        "schedule",
+        "migration",
+        "topology",
+    ):
         found += _section(key, getattr(before, key), getattr(after, key))
     found += [
         _one(f"health.{f.name}", getattr(before.health, f.name), getattr(after.health, f.name))

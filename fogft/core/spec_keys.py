@@ -24,6 +24,7 @@ FOGFT_KEYS = (
     "migration",
     "rendezvous",
     "dial_in",
+    "topology",
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
@@ -31,6 +32,9 @@ SERVICE_KEYS = (
     *("fallback", "trace"),
     *("replicas", "traffic", "quorum", "tolerance", "state"),
 )
+TOPOLOGY_KEYS = ("gateways", "robots", "through")
+GATEWAY_KEYS = ("name", "endpoint", "through")
+ROBOT_KEYS = ("name", "through")
 FALLBACK_KEYS = ("service", "after_s", "while_none_ready", "limit_s")
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
 AVAILABILITY_KEYS = (
@@ -73,7 +77,7 @@ REFUSED_TASK_KEYS = {
 }
 # Designed, not built. Ignoring one would promise what nobody does.
 LATER_KEYS = {
-    "topology": "remove it; every replica is linked to the robot directly",
+    "autoscale": "remove it; `fogft scale` or `schedule` say how many replicas there are",
 }
 
 

@@ -29,6 +29,7 @@ from fogft.core.spec_plan import (
 from fogft.core.spec_services import read_services
 from fogft.core.spec_state import StateSpec
 from fogft.core.spec_task import check_task
+from fogft.core.spec_topology import read_topology
 from fogft.core.spec_tree import Node, Section, plain, shown
 
 # What only this machine can tell. Each returns what is wrong, None if nothing is; what to
@@ -102,6 +103,7 @@ def pool_spec(
         migration=read_migration(ours),
         rendezvous=read_rendezvous(ours),
         dial_in=read_dial_in(ours),
+        topology=read_topology(ours, services),
         task=task,
     )
     workdir = spec.task.get("workdir")

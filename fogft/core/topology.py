@@ -11,7 +11,7 @@ Not here: the pool file's section (`spec_topology`), links (`fogft.proxy`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fogft.core.errors import StateError
@@ -64,13 +64,25 @@ class Topology:
         return self.robots.get(name, self.through)
 
     def neighbours(self, holder: Holder) -> tuple[Gateway, ...]:
-        """Return the gateways that somebody talks to; none for the replicas."""
+        """Return the gateways that somebody talks to; none for the replicas.
+
+        One without a certificate cannot be talked to.
+        """
         if holder.role is Role.GATEWAY:
             own = self.of(holder.name)
             listed = own.through if own is not None else ()
         else:
             listed = self.of_robot(holder.name)
-        return tuple(g for g in self.gateways if g.name in listed)
+        return tuple(g for g in self.gateways if g.name in listed and g.generations)
+
+
+def certified(topology: Topology, generations: Mapping[str, Iterable[int]]) -> Topology:
+    """Return a topology with the generations of each gateway's certificates that are good."""
+    gateways = tuple(
+        replace(g, generations=tuple(sorted(generations.get(g.name, ()))))
+        for g in topology.gateways
+    )
+    return replace(topology, gateways=gateways)
 
 
 def trouble(topology: Topology) -> str:

@@ -98,6 +98,15 @@ class Ledger:
             if h.role is Role.REPLICA and int(h.name) >= FIRST_SLOT_BY_HAND
         )
 
+    def gateways(self) -> dict[str, tuple[int, ...]]:
+        """Return the good generations of each gateway's certificates, by name."""
+        found: dict[str, tuple[int, ...]] = {}
+        for entry in self.entries():
+            holder = entry.holder
+            if holder.role is Role.GATEWAY and entry.state(self._clock()) == "good":
+                found[holder.name] = (*found.get(holder.name, ()), holder.generation)
+        return found
+
     def issue(self, holder: Holder, *, days: float) -> Credential:
         """Certify a holder, and remember it.
 

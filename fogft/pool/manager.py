@@ -92,6 +92,7 @@ class Manager:
             epoch=self._lease.epoch,
             revoked=self._ledger.revoked,
             by_hand=self._ledger.by_hand,
+            gateways=self._ledger.gateways,
             on_done=self._wake.set,
             distances=Distances(Latencies(latency_file()), on_thread),
         )

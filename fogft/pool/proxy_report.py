@@ -25,6 +25,7 @@ class ProxyReport:
     Attributes:
         written_at: Seconds since the epoch, by the same machine's clock.
         services: Service name -> its counters, as the proxy wrote them.
+        gateways: Name, state, round trip and detail of the links to gateways.
     """
 
     pid: int
@@ -34,6 +35,7 @@ class ProxyReport:
     links: tuple[LinkReport, ...] = ()
     services: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     uplink_suspected: bool = False
+    gateways: tuple[Mapping[str, Any], ...] = ()
 
     def fresh(self, now: float) -> bool:
         """Whether it still says something about now. A clock that jumped makes it say nothing."""
@@ -67,9 +69,21 @@ def parse(raw: Any, pool_uid: str) -> ProxyReport | None:
             links=tuple(_link(link, pool_uid) for link in raw["links"]),
             services={str(k): dict(v) for k, v in dict(raw.get("services") or {}).items()},
             uplink_suspected=bool(raw.get("uplink_suspected")),
+            gateways=tuple(_gateway(one) for one in raw.get("gateways") or ()),
         )
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError):
         return None
+
+
+def _gateway(raw: Mapping[str, Any]) -> dict[str, Any]:
+    rtt = raw.get("rtt_s")
+    return {
+        "name": str(raw["name"]),
+        "generation": int(raw["generation"]),
+        "state": LinkState(raw["state"]).value,
+        "rtt_s": None if rtt is None else float(rtt),
+        "detail": str(raw.get("detail") or ""),
+    }
 
 
 def _link(raw: Mapping[str, Any], pool_uid: str) -> LinkReport:

@@ -36,6 +36,7 @@ from fogft.core.planner import Plan, PlannedLaunch, plan
 from fogft.core.refreshing import Silent
 from fogft.core.rollout import Update
 from fogft.core.spec import PoolSpec
+from fogft.core.topology import certified
 from fogft.pool import offers
 from fogft.pool.operations import Operations, Submit
 from fogft.pool.remembering import Remembering
@@ -99,6 +100,7 @@ class Reconciler:
         epoch: Of the lease; goes into every membership.
         revoked: Common names of certificates that were taken back.
         by_hand: Replicas that people start themselves, and that are still let in.
+        gateways: Name -> generations of its certificates that are good.
         on_done: Called when a long cloud call has ended.
         distances: Says how far regions are from the robot, of what is sold and what runs.
     """
@@ -115,6 +117,7 @@ class Reconciler:
         epoch: int = 1,
         revoked: Callable[[], frozenset[str]] = frozenset,
         by_hand: Callable[[], frozenset[ReplicaId]] = frozenset,
+        gateways: Callable[[], Mapping[str, tuple[int, ...]]] = dict,
         on_done: Callable[[], None] = lambda: None,
         distances: Distances = lambda spec, *_: spec.placement.rtt_s,
     ) -> None:
@@ -127,6 +130,7 @@ class Reconciler:
         self._epoch = epoch
         self._revoked = revoked
         self._by_hand = by_hand
+        self._gateways = gateways
         # A planned launch is what a launch is about; None stands for a termination.
         self._operations: Operations[Machine | None] = Operations(submit, on_done)
         self._refreshes: Operations[None] = Operations(submit, on_done)
@@ -286,6 +290,7 @@ class Reconciler:
             epoch=self._epoch,
             members=members,
             revoked=revoked,
+            topology=certified(spec.topology, self._gateways()) if spec.topology else None,
         )
         if membership is not None:
             self._store.write_membership(membership)

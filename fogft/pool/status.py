@@ -105,6 +105,8 @@ class PoolStatus:
         ready: Replicas whose services answer and that are to stay.
         ended: Why the manager has ended the pool by itself; empty while it runs.
         notes: Why the pool is not yet as wanted, in sentences.
+        topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
+            how this machine's robot finds its gateways; empty where there are none.
         events: The last things that happened: ``{at, event, replica, location, detail}``.
         applied: Digest of the pool file that was applied last.
     """
@@ -132,6 +134,7 @@ class PoolStatus:
     events: Sequence[Mapping[str, Any]] = ()
     applied: str = ""
     update: UpdateStatus | None = None
+    topology: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form."""
@@ -187,10 +190,11 @@ def of_tick(
         proxy_pid=report.pid if report is not None and proxy_alive else None,
         proxy_alive=proxy_alive,
         excluded=sorted(tick.intent.excluded),
-        notes=[*plan.notes, *notes],
+        notes=[*plan.notes, *_without_certificate(tick), *notes],
         replicas=replicas,
         services=_services(tick.spec, judged, report),
         events=[_event(event) for event in recent],
+        topology=_topology(tick, report if proxy_alive else None),
         applied=tick.file,
         update=_update(tick),
     )
@@ -201,6 +205,28 @@ def _update(tick: Tick) -> UpdateStatus | None:
     if update is None:
         return None
     return UpdateStatus(update.state.value, update.done, update.of, update.fault)
+
+
+def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
+    from fogft.core import topology
+
+    here = tick.membership.topology if tick.membership is not None else tick.spec.topology
+    if not here:
+        return {}
+    links = [dict(one) for one in report.gateways] if report is not None else []
+    robot = report.robot if report is not None else ""
+    return {"robot": robot, **topology.to_plain(here), "links": links}
+
+
+def _without_certificate(tick: Tick) -> list[str]:
+    if tick.membership is None:
+        return []
+    return [
+        f"gateway `{gateway.name}` has no certificate: `fogft credentials issue gateway "
+        f"{gateway.name}`"
+        for gateway in tick.membership.topology.gateways
+        if not gateway.generations
+    ]
 
 
 def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float) -> ReplicaStatus:

@@ -56,6 +56,9 @@ MORE_TABLES = {
     "`schedule`": spec_keys.SCHEDULE_KEYS,
     "Each of `windows`": spec_keys.WINDOW_KEYS,
     "`migration`": spec_keys.MIGRATION_KEYS,
+    "`topology`": spec_keys.TOPOLOGY_KEYS,
+    "Each of `gateways`": spec_keys.GATEWAY_KEYS,
+    "Each of `robots`": spec_keys.ROBOT_KEYS,
 }
 
 

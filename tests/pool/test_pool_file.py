@@ -124,14 +124,14 @@ MISTAKES = {
         "`run` belongs at the top level of the file",
     ),
     "key that comes later": (
-        pool("topology: tree"),
-        "pool.yaml:4: fogft.topology: is not supported yet",
-        LATER_KEYS["topology"],
+        pool("autoscale: true"),
+        "pool.yaml:4: fogft.autoscale: is not supported yet",
+        LATER_KEYS["autoscale"],
     ),
     "key that comes later, in a service": (
-        pool(services="[{name: a, topology: 2}]"),
-        "pool.yaml:3: fogft.services[0].topology: is not supported yet",
-        "remove it; every replica is linked to the robot directly",
+        pool(services="[{name: a, autoscale: 2}]"),
+        "pool.yaml:3: fogft.services[0].autoscale: is not supported yet",
+        "remove it; `fogft scale` or `schedule` say how many replicas there are",
     ),
     "SkyServe's section": (
         pool(top="service: {replicas: 2}"),
