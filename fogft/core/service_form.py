@@ -15,7 +15,7 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from fogft.core import spec_state
-from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
+from fogft.core.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
 from fogft.core.spec_choices import FallbackSpec
 
 LONGEST_S = 1e7  # what a request's header can carry
@@ -65,6 +65,7 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         state=spec_state.from_plain(raw.get("state")),
         fallback=_fallback(raw.get("fallback")),
         trace=bool(raw.get("trace")),
+        advertise=Advertise(raw["advertise"]) if raw.get("advertise") else None,
     )
 
 

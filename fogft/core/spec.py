@@ -44,6 +44,14 @@ class HedgingMode(str, Enum):
     FAILOVER = "failover"  # one; another when that fails
 
 
+class Advertise(str, Enum):
+    """When the service is there on the robot: what `wait_for_service` tells."""
+
+    WHILE_READY = "while_ready"  # while some replica can answer
+    ONCE_READY = "once_ready"  # from the first replica that can answer, to the pool's end
+    ALWAYS = "always"  # from the start
+
+
 @dataclass(frozen=True)
 class ServiceSpec:
     """One proxied service.
@@ -57,6 +65,7 @@ class ServiceSpec:
         traffic: What is asked of it, for costs.
         concurrency: Requests that a replica gives the service at once; 0 to learn it.
         fallback: Who answers at the deadline, or before; only with `on_timeout: fallback`.
+        advertise: When the service is offered on the robot; None for what `advertised` says.
         trace: Whether each request leaves a line in the client proxy's `trace.jsonl`.
         cancel: Name of the service's cancel service (`std_srvs/srv/Trigger`); empty for none.
         quorum: The answer is the one that so many replicas agree on; 1 for the first.
@@ -80,6 +89,18 @@ class ServiceSpec:
     state: StateSpec | None = None
     fallback: FallbackSpec | None = None
     trace: bool = False
+    advertise: Advertise | None = None
+
+    @property
+    def advertised(self) -> Advertise:
+        """When it is offered: as told; else while it can be answered.
+
+        One that is answered with no replica at all, or whose requests are kept in order, stays.
+        """
+        if self.advertise is not None:
+            return self.advertise
+        stays = self.on_timeout is not OnTimeout.SILENT or self.state is not None
+        return Advertise.ONCE_READY if stays else Advertise.WHILE_READY
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ FOGFT_KEYS = (
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
     *("hedging", "hedging_budget", "concurrency", "cancel"),
-    *("fallback", "trace"),
+    *("fallback", "trace", "advertise"),
     *("replicas", "traffic", "quorum", "tolerance", "state"),
 )
 TOPOLOGY_KEYS = ("gateways", "robots", "through")

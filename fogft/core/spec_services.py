@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fogft.core import ros_names
-from fogft.core.spec import MAX_REPLICAS, HedgingMode, OnTimeout, ServiceSpec
+from fogft.core.spec import MAX_REPLICAS, Advertise, HedgingMode, OnTimeout, ServiceSpec
 from fogft.core.spec_choices import FallbackSpec
 from fogft.core.spec_keys import (
     CONCURRENCY_LIMIT,
@@ -73,7 +73,18 @@ def _service(section: Section) -> ServiceSpec:
         state=read_state(section),
         fallback=_fallback(section, name),
         trace=_trace(section),
+        advertise=_advertise(section),
     )
+
+
+def _advertise(section: Section) -> Advertise | None:
+    if not section.has("advertise"):
+        return None
+    wanted = section.choice("advertise", Advertise.WHILE_READY)
+    if wanted is Advertise.WHILE_READY and section.has("state"):
+        what = "cannot be `while_ready` for a service with `state`: its requests are kept in order"
+        raise section.error("advertise", what, "remove it")
+    return wanted
 
 
 def _fallback(section: Section, name: str) -> FallbackSpec | None:

@@ -25,10 +25,11 @@ from fogft.core.records import SignedRecord
 from fogft.core.spec import HedgingMode, ServiceSpec
 from fogft.proxy.dispatcher import Dispatcher, key_of
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
+from fogft.proxy.proxied import ProxiedService
 from fogft.proxy.sameness import Define, Sameness
 from fogft.proxy.seen_through import best_of, seen_through
 from fogft.proxy.voting import VotingDispatcher
-from fogft.ros.port import RosClient, RosNode, RosServer
+from fogft.ros.port import RosNode
 from fogft.wire.port import Answer, Behind, Dialer, Link, Peer
 
 log = logging.getLogger(__name__)
@@ -46,26 +47,6 @@ class MakeDispatcher(Protocol):
         wake: Callable[[], None],
     ) -> Dispatcher | OrderedDispatcher:
         """Make it, given how to respond and how to have `tick` called soon."""
-
-
-class _Service:
-    """A service, its dispatcher, and its ROS server once advertised."""
-
-    def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher | OrderedDispatcher) -> None:
-        self.spec = spec
-        self.dispatcher = dispatcher
-        self.server: RosServer | None = None
-        self.fallback: RosClient | None = None
-        self.fallback_name = ""
-        self.trouble = ""  # why it cannot be advertised; empty when it can
-
-    def close(self) -> None:
-        """Withdraw it from ROS, and let go of what its dispatcher holds."""
-        for end in (self.server, self.fallback):
-            if end is not None:
-                end.close()
-        if isinstance(self.dispatcher, OrderedDispatcher):
-            self.dispatcher.close()
 
 
 class ClientProxy:
@@ -97,7 +78,7 @@ class ClientProxy:
         self._make_dispatcher = make_dispatcher
         self._clock = clock
         self._lock = threading.RLock()
-        self._services: dict[str, _Service] = {}
+        self._services: dict[str, ProxiedService] = {}
         self._links: dict[ReplicaId, Link] = {}
         self._members: dict[ReplicaId, Member] = {}
         self._version = (0, 0)
@@ -135,20 +116,20 @@ class ClientProxy:
                     self._redial(id)
         self._change()
 
-    def _new_service(self, spec: ServiceSpec) -> _Service:
-        service: _Service
+    def _new_service(self, spec: ServiceSpec) -> ProxiedService:
+        service: ProxiedService
 
         def respond(handle: Any, payload: bytes) -> None:
             if service.server is not None:
                 service.server.respond(handle, payload)
 
         make = self._make_dispatcher
-        service = _Service(spec, make(self._here(spec), respond, self._wake.set))
+        service = ProxiedService(spec, make(self._here(spec), respond, self._wake.set))
         if spec.fallback is not None:
             self._adopt(service)
         return service
 
-    def _adopt(self, service: _Service) -> None:
+    def _adopt(self, service: ProxiedService) -> None:
         """Have the dispatcher follow its service's spec, with a client of the fallback."""
         spec, dispatcher = self._here(service.spec), service.dispatcher
         if isinstance(dispatcher, OrderedDispatcher):
@@ -289,10 +270,9 @@ class ClientProxy:
             for link in self._links.values():
                 link.flush()
             looks = [service.dispatcher.tick() for service in self._services.values()]
+            now = self._clock()
             for service in self._services.values():
-                dispatcher = service.dispatcher
-                if isinstance(dispatcher, OrderedDispatcher) and dispatcher.able:
-                    self._advertise(service)
+                service.advertise(self._node, now)
         self._next_look = min(looks, default=NEVER)
         return changed
 
@@ -316,9 +296,7 @@ class ClientProxy:
                 if name in link.ready and name not in differ[id]
             ]
             fresh = [link for link in able if not self._draining(link)]
-            fallback = service.spec.fallback
-            if able or (fallback is not None and fallback.while_none_ready):
-                self._advertise(service)
+            service.able = bool(able)
             service.dispatcher.route(fresh or able)
 
     def _versions(self) -> dict[ReplicaId, str]:
@@ -326,20 +304,6 @@ class ClientProxy:
 
     def _leaving(self, links: Iterable[Link]) -> frozenset[ReplicaId]:
         return frozenset(link.peer.id for link in links if self._draining(link))
-
-    def _advertise(self, service: _Service) -> None:
-        if service.server is not None:
-            return
-        spec = service.spec
-        try:
-            service.server = self._node.serve(spec.name, spec.type, service.dispatcher.submit)
-        except RosError as error:  # it shall not take the other services with it
-            if service.trouble != error.message:
-                service.trouble = error.message
-                log.error("service_not_advertised service=%s reason=%r", spec.name, error.message)
-        else:
-            service.trouble = ""
-            log.info("service_advertised service=%s type=%s", spec.name, spec.type)
 
     def _draining(self, link: Link) -> bool:
         member = self._members.get(link.peer.id)

@@ -97,6 +97,11 @@ class Dispatcher:
 
     # -- requests -------------------------------------------------------------------------
 
+    @property
+    def waiting(self) -> int:
+        """How many requests have no answer yet."""
+        return len(self._requests)
+
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to whom the policy chooses."""
         self.forward(os.urandom(REQUEST_ID_BYTES), payload, handle, self.spec.timeout_s)

@@ -69,3 +69,18 @@ def test_a_replica_that_offers_other_names_is_explained(pool: Pool):
     assert "`run` does not offer /arm/plan yet; it offers /plan (nav_msgs/srv/GetPlan)" in re.sub(
         r"\s+", " ", said
     )
+
+
+def test_wait_for_service_is_true_only_while_a_replica_can_answer(pool: Pool):
+    """The only replica dies: the service goes. The next one serves: it is there again."""
+    pool.write(replicas=1)
+    pool.up()
+    assert robot(pool, "/plan", "nav_msgs/srv/GetPlan")["answer"]
+    pool.fogft("chaos", "freeze", "0")
+
+    def gone() -> bool:
+        return robot(pool, "/plan", "nav_msgs/srv/GetPlan", 0.5)["answer"] is None
+
+    pool.wait(gone)
+    pool.fogft("chaos", "thaw", "0", ok=False)
+    assert robot(pool, "/plan", "nav_msgs/srv/GetPlan", 60)["answer"]

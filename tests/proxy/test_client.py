@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from fogft.core.advertising import HOLD_S
 from fogft.core.definitions import Definition
 from fogft.core.errors import RosError
 from fogft.core.model import Member, Membership, ReplicaId
@@ -271,3 +272,39 @@ def test_where_every_type_differs_nothing_is_advertised():
     scene.dialer.links[0].told = told(0, "int64")
     scene.ready(*scene.dialer.links)
     assert scene.node.servers == {}
+
+
+def test_a_service_is_withdrawn_when_nobody_can_answer_and_offered_again():
+    scene = Scene()
+    scene.follow(member(0))
+    [link] = scene.dialer.links
+    scene.ready(link)
+    first = scene.node.servers["/s"]
+    link.ready = frozenset()
+    scene.proxy.changed(link)
+    scene.proxy.run_once(0)
+    assert not first.closed
+    scene.clock.now += HOLD_S
+    scene.proxy.run_once(0)
+    assert first.closed
+    scene.ready(link)
+    assert scene.node.servers["/s"] is not first
+    scene.ask()
+    scene.proxy.answered(link, link.reply(b"r"))
+    assert scene.node.servers["/s"].responses == [("caller", b"r")]
+
+
+def test_a_service_is_not_withdrawn_under_a_request_that_waits():
+    scene = Scene()
+    scene.follow(member(0))
+    [link] = scene.dialer.links
+    scene.ready(link)
+    scene.ask()
+    link.ready = frozenset()
+    scene.proxy.changed(link)
+    scene.proxy.run_once(0)
+    scene.clock.now += HOLD_S
+    scene.proxy.run_once(0)
+    assert not scene.node.servers["/s"].closed
+    scene.proxy.answered(link, link.reply(b"r"))
+    assert scene.node.servers["/s"].responses == [("caller", b"r")]
