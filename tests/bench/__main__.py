@@ -23,7 +23,7 @@ Rows = list[dict[str, Any]]
 
 def measurements() -> dict[str, Callable[..., Rows]]:
     """Return what can be measured, by name, in the order of running."""
-    from tests.bench import commands, faults, ordering, planning, simulation, speed, tail
+    from tests.bench import commands, faults, ordering, planning, simulation, speed, tail, uplink
 
     found: dict[str, Callable[..., Rows]] = {
         "commands": commands.commands,
@@ -39,6 +39,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["cancellation"] = tail.cancellation
     found["simulation"] = simulation.simulation
     found["ordering"] = ordering.ordering
+    found["uplink"] = uplink.uplink
     return found
 
 

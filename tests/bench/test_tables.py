@@ -49,4 +49,5 @@ def test_there_is_a_measurement_for_each_promise():
         "cancellation",
         "simulation",
         "ordering",
+        "uplink",
     ]

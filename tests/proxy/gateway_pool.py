@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,18 @@ class GatewayPool:
             )
         self.replicas[slot] = made
         self._members[slot] = Member(ReplicaId(POOL_UID, slot, 1), endpoint)
+
+    def endpoint(self, slot: int) -> str:
+        return self._members[slot].endpoint
+
+    def reach(self, slot: int, endpoint: str) -> None:
+        """Have everybody reach a replica at another address, from the next membership on."""
+        self._members[slot] = replace(self._members[slot], endpoint=endpoint)
+
+    def forget(self, slot: int) -> None:
+        """Let a replica in no more; it was killed."""
+        self.replicas.pop(slot).kill()
+        del self._members[slot]
 
     def gateway(
         self, name: str, *, listen: str = "", where: str = "", generation: int = 1
@@ -189,6 +202,10 @@ class Robot(Process):
         """Wait until each request has its own answer, once."""
         wait_for(lambda: (told := self.tell())["right"] == told["asked"] or told["wrong"])
         assert not self.tell()["wrong"]
+
+    def settle(self) -> None:
+        """Wait until nothing is pending: what was to be cancelled has been."""
+        wait_for(lambda: self.tell()["report"]["services"][SERVICE]["pending"] == 0)
 
     def sent(self) -> int:
         """Return how many copies of requests it has sent."""

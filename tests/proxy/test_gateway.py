@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.bench import uplink
 from tests.proxy.gateway_pool import GatewayPool, Process
 from tests.wire.wire_pool import wait_for
 
@@ -91,8 +92,7 @@ def test_a_gateway_cut_off_from_its_replicas_hands_back_what_it_holds(pool):
     wait_for(robot.ready)
     robot.ask(10)
     wait_for(lambda: pool.ran() == 10)
-    pool.replicas.pop(0).kill()
-    pool._members.clear()
+    pool.forget(0)
     pool.replica(1)
     pool.lay_out(
         {"one": (one.endpoint(), ()), "two": (two.endpoint(), ())}, {"ada": ["one", "two"]}
@@ -136,8 +136,17 @@ def test_a_gateway_goes_on_under_a_new_certificate(pool):
 def test_only_a_gateways_certificate_will_do(pool):
     """A replica's certificate at a gateway's address is sent nothing."""
     pool.replica(0)
-    pool.lay_out({"edge": (pool._members[0].endpoint, ())}, {"ada": ["edge"]})
+    pool.lay_out({"edge": (pool.endpoint(0), ())}, {"ada": ["edge"]})
     robot = pool.robot("ada")
     wait_for(lambda: "certificate" in str(robot.tell()["report"]["gateways"]))
     assert pool.ran() == 0
     assert not robot.ready()
+
+
+@pytest.mark.parametrize("replicas", [1, 2, 4])
+def test_the_uplink_carries_each_request_once(tmp_path, replicas):
+    """At most 1.05 times the payload, whatever the number of replicas; probes are counted."""
+    found = uplink.of_pool(tmp_path / "pool", replicas, 50)
+    assert found["through_a_gateway"] <= 1.05
+    if replicas > 1:  # a loser may be stopped before all of it has left
+        assert found["directly"] > 1.5

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import os
 import subprocess
 from collections.abc import Iterator
 
 _CLONE_NEWNET = 0x40000000
+_ETHERNET_HEADER_BYTES = 14
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -43,8 +45,8 @@ class Namespaces:
         _run("ip", "-n", name, "link", "set", "lo", "up")
         return name
 
-    def join(self, one: str, address: str, other: str, far_address: str) -> None:
-        """Lay a cable; both addresses lie in one /24."""
+    def join(self, one: str, address: str, other: str, far_address: str) -> tuple[str, str]:
+        """Lay a cable; both addresses lie in one /24. Return the names of its two ends."""
         self._cables += 1
         near, far = f"ft{self._cables}a", f"ft{self._cables}b"
         _run("ip", "-n", one, "link", "add", near, "type", "veth", "peer", "name", far,
@@ -52,6 +54,7 @@ class Namespaces:
         for name, cable, where in ((one, near, address), (other, far, far_address)):
             _run("ip", "-n", name, "addr", "add", f"{where}/24", "dev", cable)
             _run("ip", "-n", name, "link", "set", cable, "up")
+        return near, far
 
     def blackhole(self, where: str, address: str) -> None:
         """Let nothing that `where` sends reach an address; nobody is told."""
@@ -63,6 +66,23 @@ class Namespaces:
     def readdress(self, where: str, cable: str, old: str, new: str) -> None:
         _run("ip", "-n", where, "addr", "del", f"{old}/24", "dev", cable)
         _run("ip", "-n", where, "addr", "add", f"{new}/24", "dev", cable)
+
+    def cut(self, where: str, cable: str) -> None:
+        """Take an interface down."""
+        _run("ip", "-n", where, "link", "set", cable, "down")
+
+    def by_packets(self, where: str, cable: str) -> None:
+        """Have packets leave one by one, as on a real cable, so that their headers are counted."""
+        _run("ip", "-n", where, "link", "set", "dev", cable, "gso_max_segs", "1")
+
+    def sent_bytes(self, where: str, cable: str) -> int:
+        """Return how many bytes of IP have left on a cable, the headers of IP and TCP included."""
+        shown = subprocess.run(
+            ["ip", "-n", where, "-s", "-j", "link", "show", cable],
+            check=True, capture_output=True, text=True,
+        )  # fmt: skip
+        sent = json.loads(shown.stdout)[0]["stats64"]["tx"]
+        return int(sent["bytes"]) - _ETHERNET_HEADER_BYTES * int(sent["packets"])
 
     def close(self) -> None:
         for name in self._names:
