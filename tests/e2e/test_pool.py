@@ -90,20 +90,6 @@ def test_traffic_outlives_the_manager_and_the_next_one_adopts_the_pool(pool):
     assert {(r["slot"], r["generation"]) for r in status["replicas"]} == before
 
 
-def test_a_changed_file_is_applied_without_losing_a_request(pool):
-    """A new `run` replaces every replica, new before old, under load."""
-    pool.write(replicas=2)
-    pool.up()
-    before = {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
-    client = pool.client(90, 20)
-    pool.write(replicas=2, work_s=0.006)
-    pool.up()
-    pool.wait(
-        lambda: not before & {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
-    )
-    assert flawless(client.finish())
-
-
 def test_scale_up_and_down_under_load(pool):
     pool.write(replicas=1)
     pool.up()
