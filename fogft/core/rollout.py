@@ -160,7 +160,7 @@ def _counts(replicas: list[Judged]) -> tuple[int, int]:
 
 def at_least(hits: int, of: int) -> float:
     """Return the lower end of Wilson's interval, at three standard deviations, for a share."""
-    if not of:
+    if not hits:  # nothing, whatever rounding would make of it
         return 0.0
     share, square = hits / of, _SURE * _SURE
     spread = _SURE * math.sqrt(share * (1 - share) / of + square / (4 * of * of))

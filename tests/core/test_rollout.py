@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fogft.core.health import judge
@@ -117,7 +117,8 @@ def test_as_many_errors_as_the_old_version_has_are_none() -> None:
     assert found(pool(old, counted(new, answered=48, failed=52))) == ""
 
 
-@given(st.integers(0, 400), st.integers(0, 400))
+@example(hits=0, others=15)
+@given(hits=st.integers(0, 400), others=st.integers(0, 400))
 def test_the_lower_end_of_a_share_is_below_it(hits: int, others: int) -> None:
     """It claims no more than was seen, and lies in the range of a share."""
     of = hits + others
