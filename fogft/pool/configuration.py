@@ -24,7 +24,7 @@ from fogft.core.model import ReplicaId
 from fogft.core.planner import PlannedLaunch
 from fogft.core.service_form import REPLICA_KEYS, to_plain
 from fogft.core.spec import PoolSpec
-from fogft.pool import credentials, templates
+from fogft.pool import credentials, templates, workspace
 from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import Identity
@@ -155,7 +155,7 @@ def build_order(
         placement=planned.offer.placement,
         usd_per_hour=planned.offer.usd_per_hour,
         spec_hash=replica_hash(spec, id.slot),
-        task=absolute(task_at(spec, id.slot), Path(identity.file).parent),
+        task=workspace.with_build(absolute(task_at(spec, id.slot), Path(identity.file).parent)),
         files={
             "replica.yaml": replica_config(identity, spec, id).encode(),
             "ca.crt": issued.authority_pem,

@@ -10,7 +10,7 @@ import pytest
 from fogft import app, disk
 from fogft.cli import main, progress
 from fogft.cli.lifecycle import is_answering
-from fogft.core.errors import FogftError
+from fogft.core.errors import FogftError, SpecError
 from fogft.core.rollout import Trial
 from fogft.pool.seen import Seen
 from fogft.pool.status import PoolStatus, UpdateStatus
@@ -313,12 +313,19 @@ def test_init_writes_an_example_and_says_how_to_go_on(tmp_path, capsys):
     assert main.run(["init", "planner", "--into", str(into), "--force"]) == 0
 
 
-@pytest.mark.parametrize("name", app.examples())
+@pytest.mark.parametrize("name", [name for name in app.examples() if name != "words"])
 def test_every_example_is_a_good_pool_file(tmp_path, name):
     files = app.init(name, tmp_path / name)
     preview = app.order(files[0]).preview
     assert len(preview.launches) == preview.spec.replicas
     assert preview.notes == ()
+
+
+def test_an_example_with_a_type_of_its_own_asks_for_its_workspace(tmp_path):
+    files = app.init("words", tmp_path / "words")
+    with pytest.raises(SpecError, match="no package `word_interfaces`") as caught:
+        app.order(files[0])
+    assert "workspace sourced?" in caught.value.hint
 
 
 def test_an_unknown_example_is_an_error(capsys):

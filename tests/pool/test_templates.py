@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from fogft.core.errors import FogftError
 from fogft.pool import init, pool_file, templates
 
-EXAMPLES = ["echo", "planner"]
+EXAMPLES = ["echo", "planner", "words"]
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
 values = st.recursive(
@@ -166,7 +166,9 @@ class TestRefusals:
             "there is no example `planer`",
             "did you mean `planner`?",
         )
-        assert self.refuse(tmp_path, "xyz", tmp_path / "a")[1] == ("known here: `echo`, `planner`")
+        assert self.refuse(tmp_path, "xyz", tmp_path / "a")[1] == (
+            "known here: `echo`, `planner`, `words`"
+        )
 
     def test_a_file_is_in_the_way(self, tmp_path):
         (tmp_path / "echo_client.py").write_text("mine")

@@ -199,7 +199,7 @@ class Machine:
             *("--notice-file", str(folder / folders.NOTICE)),
         ]
         environ = {**os.environ, "ROS_DOMAIN_ID": str(domain.number)}
-        return self._spawn(command, folder, environ)
+        return self._spawn(task_commands.sourced(command, workdir), folder, environ)
 
     def _spawn(self, command: list[str], workdir: Path, environ: Mapping[str, str]) -> int:
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,26 @@ from fogft.ros.environment import child_environment
 
 
 def environment(task: Mapping[str, Any]) -> dict[str, str]:
-    """Return the environment of `setup`: the user's own, with the task's variables."""
+    """Return the environment of `setup`: the user's own, with the task's variables.
+
+    In a virtual environment its own programs come first, as they do for `run`.
+    """
     environ = child_environment(os.environ)
+    if sys.prefix != sys.base_prefix:
+        environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
     for key in ("envs", "secrets"):
         values = task.get(key)
         if isinstance(values, Mapping):
             environ |= {str(k): "" if v is None else str(v) for k, v in values.items()}
     return environ
+
+
+def sourced(command: list[str], workdir: Path) -> list[str]:
+    """Return a command that runs with the folder's colcon workspace sourced, if it has one."""
+    setup = workdir / "install" / "setup.bash"
+    if not setup.is_file():
+        return command
+    return ["bash", "-c", '. "$0"; exec "$@"', str(setup), *command]
 
 
 def robot_domain(environ: Mapping[str, str] = os.environ) -> int:

