@@ -42,7 +42,7 @@ in_image su - ubuntu -c "
 # by the template's own commands, but has no index to ask.
 "$venv/bin/python" "$here/dependencies.py" "$checkout/pyproject.toml" >"$image/requirements.txt"
 /usr/bin/python3 -m venv "$image/pip"
-"$image/pip/bin/pip" wheel -q -w "$image/root/opt/wheelhouse" -r "$image/requirements.txt"
+"$image/pip/bin/pip" wheel -q --use-pep517 -w "$image/root/opt/wheelhouse" -r "$image/requirements.txt"
 rm -rf "$image/pip"
 printf 'offline = true\n[pip]\nno-index = true\nfind-links = ["/opt/wheelhouse"]\n' \
   >"$image/root/etc/uv/uv.toml"
