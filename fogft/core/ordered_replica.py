@@ -239,9 +239,15 @@ class OrderedReplica(Generic[T]):
         if self._restore is not None:
             index, payload, to = self._restore
             self._restore = None
-            self.sound = False
-            self._forget_answers()
-            return [*out, self._begin(Op.RESTORE, index, [to], payload)]
+            if self.joined and index < self._expected:
+                out.append(Reply(to, ordering.encode_index(self._expected)))
+            else:
+                # It may have joined by another restore since; what it was sent then is not for
+                # the state that comes now.
+                out += self._give_up(NOT_JOINED)
+                self.joined = self.sound = False
+                self._forget_answers()
+                return [*out, self._begin(Op.RESTORE, index, [to], payload)]
         if self._snapshots and self.joined:
             waiting, self._snapshots = self._snapshots, []
             return [*out, self._begin(Op.SNAPSHOT, self.position.index, waiting)]
