@@ -183,7 +183,12 @@ def test_pool_settles_and_stays_settled(world: World) -> None:
     """Without further faults, room to surge and offers, plans lead to a whole and quiet pool."""
     world = replace(
         world,
-        spec=replace(world.spec, max_surge=max(1, world.spec.max_surge), max_usd_per_hour=None),
+        spec=replace(
+            world.spec,
+            max_surge=max(1, world.spec.max_surge),
+            max_usd_per_hour=None,
+            migration=None,  # it begins anew when what was avoided is forgiven
+        ),
         offers=OFFERS,
         intent=replace(world.intent, excluded=frozenset()),
         links=tuple(
