@@ -214,7 +214,7 @@ class _Reasons:
             return f"its price, {offer.usd_per_hour:g}, cannot be"
         if self._intent.is_excluded(location):
             return "excluded by `fogft exclude`"
-        rest = self._resting.get(location) or self._resting.get(EVERYWHERE)
+        rest = self._resting.get(offer.placement.supply) or self._resting.get(EVERYWHERE)
         if rest is not None:
             return f"rests {rest.until - self._now:.0f} s more after {rest.failures} x {rest.cause}"
         picks = self._picks.get(offer.group, [])

@@ -18,6 +18,7 @@ from enum import Enum
 from typing import Any
 
 from fogft.core.errors import StateError
+from fogft.core.model import supply
 
 
 class EventKind(str, Enum):
@@ -45,6 +46,7 @@ class Event:
     Attributes:
         at: Seconds since the epoch.
         location: Where (``cloud/region/zone``); empty in events after the launch.
+        on_demand: Of a launch: not bought on the spot market.
         detail: Why, in words. For REFUSED and FAILED the first word is the cause:
             ``capacity``, ``quota``, ``setup``, ``timeout`` or ``error``.
     """
@@ -55,6 +57,7 @@ class Event:
     generation: int
     location: str = ""
     detail: str = ""
+    on_demand: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the event as a JSON object."""
@@ -68,6 +71,8 @@ class Event:
             out["location"] = self.location
         if self.detail:
             out["detail"] = self.detail
+        if self.on_demand:
+            out["on_demand"] = True
         return out
 
     @classmethod
@@ -85,6 +90,7 @@ class Event:
                 generation=int(value["generation"]),
                 location=str(value.get("location", "")),
                 detail=str(value.get("detail", "")),
+                on_demand=bool(value.get("on_demand", False)),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise StateError(f"not an event: `{value!r:.120}`") from error
@@ -105,6 +111,12 @@ class Record:
     ending: bool = False
     closed: EventKind | None = None
     closed_at: float = 0.0
+    on_demand: bool = False
+
+    @property
+    def supply(self) -> str:
+        """What it was bought from; see `Placement.supply`."""
+        return supply(self.location, on_demand=self.on_demand)
 
 
 @dataclass(frozen=True)
@@ -136,6 +148,7 @@ class History:
         record = self._records.get(key)
         if record is None:
             record = Record(event.slot, event.generation, event.at, event.location)
+            record.on_demand = event.on_demand
             self._records[key] = record
         if event.kind is EventKind.LAUNCH:  # a second one: it was thought gone, and is listed
             record.closed, record.ending = None, False
@@ -151,7 +164,7 @@ class History:
             if record.first_ready_at is None:
                 record.first_ready_at = event.at
             record.unready_since = None
-            self._proven_at[record.location] = event.at
+            self._proven_at[record.supply] = event.at
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
         elif kind is EventKind.DRAINING:
@@ -173,7 +186,7 @@ class History:
 
     def _fail(self, record: Record, event: Event) -> None:
         cause = event.detail.split(":")[0].split(" ")[0] or "error"
-        failures = self._failures.setdefault(record.location, [])
+        failures = self._failures.setdefault(record.supply, [])
         insort(failures, Failure(event.at, cause), key=lambda failure: failure.at)
 
     def record(self, slot: int, generation: int) -> Record | None:
@@ -200,12 +213,12 @@ class History:
 
     @property
     def failures(self) -> Mapping[str, list[Failure]]:
-        """Location -> its failures, oldest first."""
+        """Supply -> its failures, oldest first."""
         return self._failures
 
-    def proven_at(self, location: str) -> float:
-        """Return when a replica last became ready there; minus infinity for never."""
-        return self._proven_at.get(location, float("-inf"))
+    def proven_at(self, supply: str) -> float:
+        """Return when a replica from there last became ready; minus infinity for never."""
+        return self._proven_at.get(supply, float("-inf"))
 
     @property
     def losses(self) -> Mapping[str, list[float]]:

@@ -53,9 +53,19 @@ class Placement:
         """``cloud/region/zone``: what can be excluded, full or quarantined."""
         return f"{self.cloud}/{self.region}/{self.zone}"
 
+    @property
+    def supply(self) -> str:
+        """What can run short by itself: a location's spot machines, or those on demand."""
+        return supply(self.location, on_demand=not self.spot)
+
     def within(self, location: str) -> bool:
         """Whether this lies in a location given as ``cloud``, ``cloud/region`` or all three."""
         return (self.location + "/").startswith(location.rstrip("/") + "/")
+
+
+def supply(location: str, *, on_demand: bool) -> str:
+    """Return `Placement.supply` of a location: the location itself for spot machines."""
+    return f"{location} on demand" if on_demand else location
 
 
 @dataclass(frozen=True)

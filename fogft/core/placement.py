@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import NamedTuple
 
-from fogft.core.model import Offer, Placement
+from fogft.core.model import Offer, Placement, supply
 from fogft.core.quarantine import EVERYWHERE, Backoff
 from fogft.core.score import Scale
 
@@ -78,7 +78,7 @@ class Market:
     Args:
         offers: What can be bought, in any order. Impossible prices are left out.
         excluded: Locations (``cloud``, ``cloud/region`` or all three) that the user ruled out.
-        resting: Locations in backoff.
+        resting: Supplies in backoff, see `Placement.supply`.
         avoid: Locations to use only when no other is left: one was lost there lately.
         scale: How price and distance are weighed.
     """
@@ -100,7 +100,7 @@ class Market:
         if excluded:
             allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
         rows = sorted(_rows(allowed, self.scale), key=_WITHOUT_OFFER)
-        self.rows = [row for row in rows if row.location not in self._resting]
+        self.rows = [row for row in rows if _supply(row) not in self._resting]
         self._clouds = {row.cloud for row in self.rows}
         self._nothing = ""
         if EVERYWHERE in self._resting:
@@ -113,7 +113,7 @@ class Market:
         elif not allowed:
             self._nothing = "every offered location is excluded"
         elif not self.rows:
-            places = sorted({row.location for row in rows})
+            places = sorted({_supply(row) for row in rows})
             causes = ", ".join(f"`{place}`: {self._resting[place].cause}" for place in places)
             self._nothing = f"every location rests after failures ({causes})"
 
@@ -160,6 +160,10 @@ class Market:
                 f"leaves ${max(budget_usd_per_hour or 0.0, 0.0):.3f}/h",
             )
         return Choice(best.offer, rank=best_rank)
+
+
+def _supply(row: Row) -> str:
+    return row.location if row.spot else supply(row.location, on_demand=True)
 
 
 def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:

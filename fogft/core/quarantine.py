@@ -1,7 +1,8 @@
 """How long a location is left alone after it disappointed. Pure.
 
-Failures are refused launches (no capacity, no quota), launches that failed, and replicas
-that died young. After n failures in a row a location rests for
+A location sells spot machines and on-demand ones. Either supply may run short while the other
+does not, so each rests by itself. Failures are refused launches (no capacity, no quota),
+launches that failed, and replicas that died young. After n failures in a row a location rests for
 
     min(BASE_S * 2 ** (n - 1), LIMIT_S)
 
@@ -52,7 +53,7 @@ class Backoff:
 
 
 def resting(history: History, now: float) -> Mapping[str, Backoff]:
-    """Return the locations that must not be tried now, with the reason.
+    """Return the supplies (`Placement.supply`) that must not be tried now, with the reason.
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """

@@ -299,7 +299,13 @@ class Reconciler:
     def _launch(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> None:
         order = self._build_order(identity, spec, planned)
         location = order.placement.location
-        self._remember.add(EventKind.LAUNCH, order.id, location=location, detail=planned.reason)
+        self._remember.add(
+            EventKind.LAUNCH,
+            order.id,
+            location=location,
+            detail=planned.reason,
+            on_demand=not order.placement.spot,
+        )
         log.info("launch_ordered replica=%s zone=%s %s", order.id.short, location, planned.reason)
         expected = Machine(
             id=order.id,

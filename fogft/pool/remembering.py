@@ -36,6 +36,7 @@ class Remembering:
         *,
         location: str = "",
         detail: str = "",
+        on_demand: bool = False,
         at: float | None = None,
     ) -> None:
         """Add one event, of now unless told.
@@ -44,7 +45,7 @@ class Remembering:
             StateError: It cannot be written; it did not happen.
         """
         when = self._clock() if at is None else at
-        self._store.append(Event(when, kind, id.slot, id.generation, location, detail))
+        self._store.append(Event(when, kind, id.slot, id.generation, location, detail, on_demand))
 
     def losses(self, observed: Observed) -> None:
         """Note who is no longer listed. The cloud's list must be known.
@@ -67,7 +68,14 @@ class Remembering:
             id, machine = judged.id, judged.machine
             record = history.record(id.slot, id.generation)
             if record is None or record.closed is not None:  # the cloud's list is the record
-                self.add(EventKind.LAUNCH, id, location=machine.placement.location, at=now)
+                place = machine.placement
+                self.add(
+                    EventKind.LAUNCH,
+                    id,
+                    location=place.location,
+                    on_demand=not place.spot,
+                    at=now,
+                )
                 record = history.record(id.slot, id.generation)
             if record is None:
                 continue

@@ -18,6 +18,7 @@ events = st.lists(
         st.integers(1, 4),
         st.sampled_from(["", "c/r/a", "c/r/b"]),
         st.sampled_from(["", "capacity: full"]),
+        st.booleans(),
     ),
     max_size=40,
 ).map(lambda found: sorted(found, key=lambda e: e.at))

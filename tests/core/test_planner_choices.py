@@ -253,6 +253,22 @@ def test_fallback_keeps_to_the_cap():
     assert len(ours(world)) == 1
 
 
+@pytest.mark.parametrize("cause", ["capacity", "quota"])
+def test_where_spot_is_refused_on_demand_of_the_same_place_stands_in(cause):
+    """A location at rest for spot machines is not at rest for on-demand ones, nor the reverse."""
+    spot, demand = offer("a/r/1", 0.1), offer("a/r/1", 0.3, spot=False)
+    mixed = spec(1, on_demand=OnDemandSpec(0, fallback=True))
+
+    def refused(*, on_demand: bool) -> tuple[Event, ...]:
+        launch = Event(NOW - 2, EventKind.LAUNCH, 0, 1, "a/r/1", on_demand=on_demand)
+        return launch, Event(NOW - 1, EventKind.REFUSED, 0, 1, detail=f"{cause}: none")
+
+    for was_on_demand in (False, True):
+        world = World(mixed, offers=(spot, demand), events=refused(on_demand=was_on_demand))
+        [launch] = world.plan().launches
+        assert launch.offer.placement.spot is was_on_demand
+
+
 def test_without_fallback_nothing_stands_in():
     asked = spec(2, on_demand=OnDemandSpec(1, False))
     world, _ = lived(World(asked, offers=ON_DEMAND), 3)

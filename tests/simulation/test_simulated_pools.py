@@ -214,6 +214,19 @@ def test_skyserve_falls_back_to_on_demand_where_spot_is_gone():
     assert rows["fogft"].available == 0.0
 
 
+def test_on_demand_stands_in_where_spot_is_gone_and_leaves_when_it_is_back():
+    """No spot anywhere from hour 6 to 12: answered all the time but while both boot."""
+    pool = spec(2, on_demand=OnDemandSpec(fallback=True))
+    wanted = scenario(pool, days=1.0, timing=Timing(notice_s=0.0))
+    short = of_changes([(0, UNLIMITED), (6 * HOUR_S, 0), (12 * HOUR_S, UNLIMITED)], wanted.length_s)
+    recorded = dict.fromkeys(wanted.market(0).timelines, short)
+    policy, meter = run(replace(wanted, recorded=recorded))
+    outcome = meter.outcome()
+    assert outcome.outages == 1
+    assert outcome.longest_outage_s < 900
+    assert all(vm.order.placement.spot and vm.ready for vm in policy.world.vms.values())
+
+
 def test_an_on_demand_machine_may_fail():
     wanted = scenario(spec(1), days=30.0, timing=Timing(on_demand_mttf_s=5 * 86_400.0))
     outcome = run(wanted, "one on-demand")[1].outcome()
