@@ -122,6 +122,7 @@ class Reconciler:
         distances: Distances = lambda spec, *_: spec.placement.rtt_s,
     ) -> None:
         self._cloud = cloud
+        self._refreshing = cloud if isinstance(cloud, Refreshing) else None
         self._distances = distances
         self._store = store
         self._clock = clock
@@ -224,8 +225,8 @@ class Reconciler:
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:
         """Have the cloud asked about replicas that fell silent, where its list is from memory."""
-        cloud = self._cloud
-        if not isinstance(cloud, Refreshing):
+        cloud = self._refreshing
+        if cloud is None:
             return
         for outcome in self._refreshes.collect():
             if outcome.error is not None:
