@@ -82,8 +82,15 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"{MAX_POOL_DAYS} pool-days",
             "ask for fewer `--seeds` or `--days`",
         )
+    notes = []
+    limit_s = scenario.spec.health.start_limit_s
+    if 1.25 * scenario.timing.boot_s > limit_s:
+        notes.append(
+            f"some boots take longer than `health.start_limit_s` ({limit_s:g} s): such launches "
+            "count as failed"
+        )
     if not scenario.recorded:
-        return scenario, []
+        return scenario, notes
     lengths = {place: line.length_s for place, line in scenario.recorded.items()}
     shortest = min(lengths, key=lambda place: lengths[place])
     most = (lengths[shortest] - (scenario.length_s - scenario.days * DAY_S)) / DAY_S
@@ -94,8 +101,8 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
         )
     if scenario.days > most:
         scenario = replace(scenario, days=most)
-        return scenario, [f"the traces cover {most:.1f} days after the first hour: all are used"]
-    return scenario, []
+        notes.append(f"the traces cover {most:.1f} days after the first hour: all are used")
+    return scenario, notes
 
 
 def _expected(scenario: Scenario, wanted: int) -> dict[str, float] | None:

@@ -243,6 +243,11 @@ def test_recorded_traces_shorter_than_asked_are_used_whole():
     assert report.expected is None  # nothing ever changes: nothing can be fitted
 
 
+def test_boots_that_the_pool_file_does_not_wait_for_are_told():
+    wanted = scenario(spec(1), days=0.1, timing=Timing(boot_s=900.0))
+    assert "some boots take longer than `health.start_limit_s` (900 s)" in simulate(wanted).notes[0]
+
+
 def test_recorded_numbers_are_room_for_so_many_machines():
     """Two replicas and room for one in the only zone with a trace: one serves."""
     wanted = scenario(spec(2), days=1.0)
