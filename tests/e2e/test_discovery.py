@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -84,3 +85,38 @@ def test_wait_for_service_is_true_only_while_a_replica_can_answer(pool: Pool):
     pool.wait(gone)
     pool.fogft("chaos", "thaw", "0", ok=False)
     assert robot(pool, "/plan", "nav_msgs/srv/GetPlan", 60)["answer"]
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("ros2service") is None,
+    reason="ros2service is not installed here (PyPI has none)",
+)
+def test_ros2_service_list_type_and_call_go_through_the_proxy(pool: Pool):
+    """With the real `ros2` command."""
+    pool.file.write_text(
+        "name: e2e\n"
+        f"run: exec {sys.executable} {NODES}/several_services.py\n"
+        "resources: {infra: local/us-west-1}\n"
+        "fogft: {replicas: 1}\n"
+    )
+    pool.up()
+
+    def ros2(*words: str, ok: bool = True) -> str:
+        code = "import sys; from ros2cli.cli import main; sys.exit(main())"
+        done = subprocess.run(
+            [sys.executable, "-c", code, "service", *words],
+            env=pool.environ, capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0 or not ok, done.stderr
+        return done.stdout
+
+    found = ros2("list", "--no-daemon", "--spin-time", "3", "-t").splitlines()
+    assert {line for line in found if not line.startswith("/_ros2cli")} == {
+        "/flip [std_srvs/srv/SetBool]",
+        "/plan [nav_msgs/srv/GetPlan]",
+        "/several/reset [std_srvs/srv/Trigger]",
+    }
+    # `type` starts ros2cli's daemon and looks for half a second; the daemon ends with the pool.
+    pool.wait(lambda: ros2("type", "/flip", ok=False) == "std_srvs/srv/SetBool\n", 60)
+    said = ros2("call", "/flip", "std_srvs/srv/SetBool", "{data: false}")
+    assert "success=True" in said
