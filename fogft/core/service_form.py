@@ -17,6 +17,7 @@ from typing import Any
 from fogft.core import spec_state
 from fogft.core.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
 from fogft.core.spec_choices import FallbackSpec
+from fogft.core.uplinks import UplinkPolicy
 
 LONGEST_S = 1e7  # what a request's header can carry
 # What a replica must know; the rest is the robot's.
@@ -65,6 +66,7 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         state=spec_state.from_plain(raw.get("state")),
         fallback=_fallback(raw.get("fallback")),
         trace=bool(raw.get("trace")),
+        uplinks=UplinkPolicy(raw.get("uplinks") or ServiceSpec.uplinks),
         advertise=Advertise(raw["advertise"]) if raw.get("advertise") else None,
     )
 

@@ -22,6 +22,7 @@ from fogft.core.spec_choices import (
 )
 from fogft.core.spec_state import StateSpec
 from fogft.core.topology import Topology
+from fogft.core.uplinks import UplinkPolicy
 
 MAX_REPLICAS = 16
 # Keys of `resources` that say where a machine may be, not what it is.
@@ -71,6 +72,7 @@ class ServiceSpec:
         quorum: The answer is the one that so many replicas agree on; 1 for the first.
         tolerance: Path of a float field of the response -> how far apart still agrees.
         state: How its state is taken and given; None for a service that keeps none.
+        uplinks: Which of the robot's uplinks its requests take.
     """
 
     name: str
@@ -89,6 +91,7 @@ class ServiceSpec:
     state: StateSpec | None = None
     fallback: FallbackSpec | None = None
     trace: bool = False
+    uplinks: UplinkPolicy = UplinkPolicy.PREFER
     advertise: Advertise | None = None
 
     @property
@@ -140,6 +143,8 @@ class PoolSpec:
         rendezvous: ``host:port`` of each rendezvous.
         dial_in: ``host:port`` where replicas dial the robot; empty where the robot dials them.
         topology: Who talks through whom.
+        uplinks: Network interfaces of this machine's robot, the preferred one first; none for
+            whatever its routes say.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -159,6 +164,7 @@ class PoolSpec:
     rendezvous: tuple[str, ...] = ()
     dial_in: str = ""
     topology: Topology = field(default_factory=Topology)
+    uplinks: tuple[str, ...] = ()
     task: Mapping[str, Any] = field(default_factory=dict)
     discovered: tuple[ServiceSpec, ...] = ()
 

@@ -1,11 +1,14 @@
-"""Judge `rendezvous` and `dial_in` of a pool file: where the parts of a pool find each other."""
+"""Judge `rendezvous`, `dial_in`, `uplinks` of a pool file: how its parts reach each other."""
 
 from __future__ import annotations
 
 from fogft.core.membership import is_endpoint
 from fogft.core.spec_tree import Section, shown
+from fogft.core.uplinks import is_interface
 
 MAX_RENDEZVOUS = 4
+MAX_UPLINKS = 4
+_UPLINKS_HINT = "write what `ip link` lists, such as `uplinks: [wlan0, wwan0]`"
 _RENDEZVOUS_HINT = "write a list, such as `rendezvous: [meet.example.org:7450]`"
 _DIAL_IN_HINT = (
     "write the robot's own address and a port, such as `dial_in: robot.example.org:7460`"
@@ -42,6 +45,30 @@ def read_dial_in(ours: Section) -> str:
     if "dial_in" not in ours.children:
         return ""
     return _endpoint(ours, "dial_in", ours.children["dial_in"].value, _DIAL_IN_HINT)
+
+
+def read_uplinks(ours: Section) -> tuple[str, ...]:
+    """Return the robot's network interfaces, the preferred one first.
+
+    Raises:
+        SpecError: They are none.
+    """
+    if "uplinks" not in ours.children:
+        return ()
+    listed = ours.children["uplinks"].value
+    if not isinstance(listed, tuple) or not listed:
+        raise ours.error("uplinks", "must be a list of network interfaces", _UPLINKS_HINT)
+    found = []
+    for node in listed:
+        if not isinstance(node.value, str) or not is_interface(node.value):
+            what = f"{shown(node.value)} is not a network interface's name"
+            raise ours.error("uplinks", what, _UPLINKS_HINT)
+        if node.value in found:
+            raise ours.error("uplinks", f"has `{node.value}` twice", "list each of them once")
+        found.append(node.value)
+    if len(found) > MAX_UPLINKS:
+        raise ours.error("uplinks", f"has {len(found)}", f"list {MAX_UPLINKS} at most")
+    return tuple(found)
 
 
 def _endpoint(ours: Section, key: str, value: object, hint: str) -> str:

@@ -25,11 +25,13 @@ FOGFT_KEYS = (
     "rendezvous",
     "dial_in",
     "topology",
+    "uplinks",
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
     *("hedging", "hedging_budget", "concurrency", "cancel"),
     *("fallback", "trace", "advertise"),
+    "uplinks",
     *("replicas", "traffic", "quorum", "tolerance", "state"),
 )
 TOPOLOGY_KEYS = ("gateways", "robots", "through")

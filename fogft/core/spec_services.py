@@ -73,6 +73,7 @@ def _service(section: Section) -> ServiceSpec:
         state=read_state(section),
         fallback=_fallback(section, name),
         trace=_trace(section),
+        uplinks=section.choice("uplinks", ServiceSpec.uplinks),
         advertise=_advertise(section),
     )
 

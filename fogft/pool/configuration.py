@@ -99,6 +99,7 @@ def proxy_config(
             # A gateway's replicas hear of revocations from a rendezvous.
             **({"revocations": paths.revocations.name} if file == "proxy.yaml" else {}),
             "dial_in": "" if robot else spec.dial_in,  # that is where this machine is
+            "uplinks": [] if robot else list(spec.uplinks),  # and these are its own
         },
     )
 

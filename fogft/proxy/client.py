@@ -31,6 +31,7 @@ from fogft.proxy.seen_through import best_of, seen_through
 from fogft.proxy.voting import VotingDispatcher
 from fogft.ros.port import RosNode
 from fogft.wire.port import Answer, Behind, Dialer, Link, Peer
+from fogft.wire.uplinks import UplinksLink
 
 log = logging.getLogger(__name__)
 
@@ -201,6 +202,13 @@ class ClientProxy:
             return False
         log.error("robot_revoked certificate=%s", own)
         return True
+
+    def redial(self) -> None:
+        """Dial everybody anew, by other uplinks; what is in flight is sent again."""
+        with self._lock:
+            for id in list(self._links):
+                self._redial(id)
+        self._change()
 
     def _redial(self, id: ReplicaId) -> None:
         member = self._members[id]
@@ -392,6 +400,7 @@ class ClientProxy:
             "answered": sum(well for well, _ in ended),
             "failed": sum(ill for _, ill in ended),
             "work": dict(answer.work) if answer else {},
+            **({"uplinks": link.uplinks()} if isinstance(link, UplinksLink) else {}),
             "detail": status.detail or ours or (answer.detail if answer else ""),
         }
 

@@ -29,6 +29,7 @@ from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.process import Watched, start_log, stop_on_signal
 from fogft.proxy.voting import VotingDispatcher
 from fogft.ros import environment, memory_tuning
+from fogft.wire.uplinks import UplinkDialer
 
 log = logging.getLogger(__name__)
 
@@ -93,12 +94,13 @@ def run(config_path: Path) -> None:
     make = functools.partial(
         make_dispatcher, marks=config.status.with_suffix(".marks"), pool_uid=config.pool_uid
     )
-    proxy = ClientProxy(config.pool_uid, node, _dialer(config, sign), make, define=definition)
+    dialer = make_dialer(config, sign.age_s)
+    proxy = ClientProxy(config.pool_uid, node, dialer, make, define=definition)
     proxy.serve(config.services)
     following = Following(config)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
     try:
-        _loop(config_path, config, _Parts(proxy, following, sign), stop)
+        _loop(config_path, config, _Parts(proxy, following, sign, dialer), stop)
     finally:
         following.close()
         proxy.close()
@@ -107,17 +109,26 @@ def run(config_path: Path) -> None:
         log.info("proxy_stopped pool=%s", config.pool)
 
 
-def _dialer(config: ClientProxyConfig, sign: ManagerSign) -> Any:
+def make_dialer(config: ClientProxyConfig, manager_age: Callable[[], float | None]) -> UplinkDialer:
+    """Make the dialer of a proxy, or of a gateway.
+
+    With several uplinks one is suspected in half the time: a false alarm costs a copy, no more.
+    """
     from fogft.wire.zenoh_link import ZenohDialer
 
-    return ZenohDialer(
-        config.credentials,
-        robot=config.robot,
-        pool_uid=config.pool_uid,
-        suspect_after_s=config.suspect_after_s,
-        manager_age=sign.age_s,
-        tell_losers=config.tell_losers,
+    several = len(config.uplinks) > 1
+    dialer = UplinkDialer(
+        ZenohDialer(
+            config.credentials,
+            robot=config.robot,
+            pool_uid=config.pool_uid,
+            suspect_after_s=config.suspect_after_s / 2 if several else config.suspect_after_s,
+            manager_age=manager_age,
+            tell_losers=config.tell_losers,
+        )
     )
+    dialer.use(config.uplinks, {service.name: service.uplinks for service in config.services})
+    return dialer
 
 
 def make_dispatcher(
@@ -167,6 +178,7 @@ class _Parts(NamedTuple):
     proxy: ClientProxy
     following: Following
     sign: ManagerSign
+    dialer: UplinkDialer
 
 
 def _loop(
@@ -175,7 +187,7 @@ def _loop(
     parts: _Parts,
     stop: threading.Event,
 ) -> None:
-    proxy, following, sign = parts
+    proxy, following, sign, _ = parts
     memory = memory_tuning.Trimmer()
     watched_config = Watched(config_path)
     watched_config.changed()
@@ -226,6 +238,9 @@ def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
     new = read_client(path)
     if (new.pool_uid, new.domain_id) != (old.pool_uid, old.domain_id):
         raise StateError(f"`{path}`: pool_uid and domain_id cannot change while the proxy runs")
+    policies = {service.name: service.uplinks for service in new.services}
+    if parts.dialer.use(new.uplinks, policies):
+        parts.proxy.redial()
     parts.proxy.serve(new.services)
     parts.following.apply(new)
     log.info("config_applied services=%d", len(new.services))

@@ -17,6 +17,7 @@ from fogft.core.errors import StateError
 from fogft.core.model import ReplicaId
 from fogft.core.service_form import from_plain, seconds
 from fogft.core.spec import ServiceSpec
+from fogft.core.uplinks import is_interface
 from fogft.wire.frame import ROBOT_BYTES_LIMIT
 
 DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
@@ -41,6 +42,7 @@ class ClientProxyConfig:
         revocations: The manager's signed revocations, to be passed on to replicas.
         dial_in: ``host:port`` that replicas which cannot be reached are told; empty for none.
         dial_in_listen: Where to listen for them; empty for that port on all addresses.
+        uplinks: Network interfaces, the preferred one first; none for what the routes say.
     """
 
     pool: str
@@ -60,6 +62,7 @@ class ClientProxyConfig:
     revocations: Path | None = None
     dial_in: str = ""
     dial_in_listen: str = ""
+    uplinks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -136,6 +139,7 @@ def _client(raw: Mapping[str, Any], base: Path) -> ClientProxyConfig:
         revocations=base / raw["revocations"] if raw.get("revocations") else None,
         dial_in=_endpoint(raw.get("dial_in") or ""),
         dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
+        uplinks=_interfaces(raw.get("uplinks")),
     )
 
 
@@ -216,6 +220,14 @@ def _endpoints(raw: Any) -> tuple[str, ...]:
     if raw is not None and not isinstance(raw, list):
         raise ValueError(f"{raw!r:.40} is not a list of endpoints")
     return tuple(_endpoint(one) for one in raw or ())
+
+
+def _interfaces(raw: Any) -> tuple[str, ...]:
+    if raw is None:
+        return ()
+    if not isinstance(raw, list) or not all(isinstance(o, str) and is_interface(o) for o in raw):
+        raise ValueError(f"{raw!r:.40} is not a list of network interfaces")
+    return tuple(dict.fromkeys(raw))
 
 
 def _endpoint(raw: Any) -> str:

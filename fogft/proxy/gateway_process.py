@@ -24,6 +24,7 @@ from fogft.core.holders import Holder, Role, holder_of
 from fogft.core.model import ReplicaId
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.client import ClientProxy
+from fogft.proxy.client_process import make_dialer
 from fogft.proxy.config import GatewayConfig, read_gateway
 from fogft.proxy.dispatcher import Dispatcher
 from fogft.proxy.following import Following
@@ -68,23 +69,14 @@ class _Gateway:
     """The parts of a gateway, and its loop."""
 
     def __init__(self, config: GatewayConfig) -> None:
-        from fogft.wire.zenoh_link import ZenohDialer
-
         self._config = config
         client = config.client
         self._incarnation = secrets.token_hex(8)
         self._manager_seen = -NEVER
         self._draining = False
         self._forwarder = Forwarder()
-        self._dialer = ZenohDialer(
-            client.credentials,
-            robot=client.robot,
-            pool_uid=client.pool_uid,
-            suspect_after_s=client.suspect_after_s,
-            manager_age=self._manager_age_s,
-            tell_losers=client.tell_losers,
-        )
-        self._proxy = ClientProxy(client.pool_uid, NoRos(), self._dialer, self._make_dispatcher)
+        dialer = make_dialer(client, self._manager_age_s)
+        self._proxy = ClientProxy(client.pool_uid, NoRos(), dialer, self._make_dispatcher)
         self._services = tuple(_passed_on(service) for service in client.services)
         self._proxy.serve(self._services)
         self._following = Following(client)

@@ -68,7 +68,9 @@ def robot_settings(
     return {
         **_common(settings),
         "mode": "client",
-        "connect/endpoints": [f"tls/{peer.endpoint}"],
+        "connect/endpoints": [
+            f"tls/{peer.endpoint}" + (f"#iface={peer.interface}" if peer.interface else "")
+        ],
         # One try: the keeper tries again, and knows when and why.
         "connect/timeout_ms": 0,
         "connect/exit_on_failure": True,

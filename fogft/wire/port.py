@@ -162,11 +162,16 @@ class LinkEvents(Protocol):
 
 @dataclass(frozen=True)
 class Peer:
-    """A replica to dial: its endpoint (``host:port``) and the name its certificate must have."""
+    """A replica to dial: its endpoint (``host:port``) and the name its certificate must have.
+
+    Attributes:
+        interface: Through which of our network interfaces; empty for whatever the routes say.
+    """
 
     id: ReplicaId
     endpoint: str
     certificate_name: str
+    interface: str = ""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ replica's silence means for the pool (`fogft.core`).
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -260,6 +261,9 @@ class ZenohLink:
 
     def _explain(self, took_s: float) -> str:
         """Find words for a failed opening; empty when that was done lately."""
+        interface = self._peer.interface
+        if interface and interface not in {name for _, name in socket.if_nameindex()}:
+            return f"there is no network interface `{interface}` here"
         if took_s >= self._dialer.settings.open_timeout_s * 0.9:
             return f"`{self._peer.endpoint}` does not answer: frozen, blackholed or overloaded"
         now = time.monotonic()

@@ -17,10 +17,10 @@ from typing import Any
 
 from fogft.core.errors import RosError
 from fogft.proxy.client import ClientProxy
+from fogft.proxy.client_process import make_dialer
 from fogft.proxy.config import read_client
 from fogft.proxy.dispatcher import Dispatcher
 from fogft.proxy.following import Following
-from fogft.wire.zenoh_link import ZenohDialer
 
 
 class Callers:
@@ -79,12 +79,7 @@ class Callers:
 def main() -> None:
     config = read_client(Path(sys.argv[1]))
     callers = Callers()
-    dialer = ZenohDialer(
-        config.credentials,
-        robot=config.robot,
-        pool_uid=config.pool_uid,
-        suspect_after_s=config.suspect_after_s,
-    )
+    dialer = make_dialer(config, lambda: None)
     proxy = ClientProxy(
         config.pool_uid,
         callers,

@@ -150,3 +150,16 @@ def test_the_uplink_carries_each_request_once(tmp_path, replicas):
     assert found["through_a_gateway"] <= 1.05
     if replicas > 1:  # a loser may be stopped before all of it has left
         assert found["directly"] > 1.5
+
+
+def test_an_uplink_that_is_not_there_costs_nothing(pool):
+    """Over loopback: one interface exists and one does not, which is said."""
+    pool.replica(0)
+    pool.reach(0, f"localhost:{pool.endpoint(0).rpartition(':')[2]}")
+    robot = pool.robot("ada", extra="uplinks: [nosuch0, lo]\n")
+    wait_for(robot.ready)
+    robot.ask(50)
+    robot.all_right()
+    (link,) = robot.tell()["report"]["links"]
+    assert [u["state"] for u in link["uplinks"]] == ["connecting", "up"]
+    assert "nosuch0" in link["uplinks"][0]["detail"]

@@ -67,9 +67,17 @@ class Namespaces:
         _run("ip", "-n", where, "addr", "del", f"{old}/24", "dev", cable)
         _run("ip", "-n", where, "addr", "add", f"{new}/24", "dev", cable)
 
-    def cut(self, where: str, cable: str) -> None:
-        """Take an interface down."""
-        _run("ip", "-n", where, "link", "set", cable, "down")
+    def remove(self, where: str, cable: str) -> None:
+        """Take an interface away, as when a modem is pulled out."""
+        _run("ip", "-n", where, "link", "del", cable)
+
+    def address(self, where: str, address: str) -> None:
+        """Give a machine an address of its own, whatever cable is used."""
+        _run("ip", "-n", where, "addr", "add", f"{address}/32", "dev", "lo")
+
+    def route(self, where: str, to: str, via: str, cable: str, *, metric: int) -> None:
+        _run("ip", "-n", where, "route", "add", f"{to}/32", "via", via, "dev", cable,
+             "metric", str(metric))  # fmt: skip
 
     def by_packets(self, where: str, cable: str) -> None:
         """Have packets leave one by one, as on a real cable, so that their headers are counted."""
