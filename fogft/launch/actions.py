@@ -214,8 +214,7 @@ def _written(tree: Mapping[str, Any]) -> Path:
     make_folder(home())
     make_folder(folder)
     path = folder / f"{tree['name']}.yaml"
-    yaml.SafeDumper.add_representer(str, _as_block)
-    write_whole(path, yaml.safe_dump(dict(tree), sort_keys=False))
+    write_whole(path, yaml.dump(dict(tree), Dumper=_Blocks, sort_keys=False))
     return path
 
 
@@ -223,6 +222,13 @@ def _as_block(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
     """Write texts of several lines as a person would."""
     style = "|" if "\n" in text else None
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+class _Blocks(yaml.SafeDumper):
+    """A dumper of our own: other actions of the launch share PyYAML's."""
+
+
+_Blocks.add_representer(str, _as_block)
 
 
 def _held(
