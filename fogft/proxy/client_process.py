@@ -114,7 +114,7 @@ def make_dialer(config: ClientProxyConfig, manager_age: Callable[[], float | Non
 
     With several uplinks one is suspected in half the time: a false alarm costs a copy, no more.
     """
-    from fogft.wire.zenoh_link import ZenohDialer
+    from fogft.wire.zenoh_dialer import ZenohDialer
 
     several = len(config.uplinks) > 1
     dialer = UplinkDialer(

@@ -34,6 +34,7 @@ from fogft.wire.port import Answer, Peer, Refusal
 from fogft.wire.recalls import WORTH_S, Recalls
 from fogft.wire.timer_budget import TimerBudget
 from fogft.wire.turns import LARGE_BYTES, Turns
+from fogft.wire.zenoh_attempt import OpenAttempt, ran_in_vain, read_reply
 
 log = logging.getLogger(__name__)
 
@@ -59,33 +60,6 @@ _REFUSED = {
 
 
 _TELL_RECORDS_TIMEOUT_S = 5.0
-
-
-class OpenAttempt:
-    """A request on its way through one connection."""
-
-    __slots__ = (
-        *("deadline", "key", "mark", "offered", "payload", "request_id", "service", "size"),
-    )
-
-    def __init__(
-        self,
-        service: str,
-        key: zenoh.KeyExpr,
-        request_id: bytes,
-        payload: bytes,
-        *,
-        offered: float,
-        remaining_s: float,
-    ) -> None:
-        self.service = service
-        self.key = key
-        self.request_id = request_id
-        self.payload: bytes | None = payload  # None once it was sent, or is not wanted
-        self.size = len(payload)
-        self.offered = offered
-        self.deadline = offered + remaining_s
-        self.mark = 0  # what the connection had sent once this was sent (`credit`)
 
 
 # In the queue, in place of an attempt: tell the replica of what was forgotten.
@@ -296,11 +270,11 @@ class Connection:
         if not self.window.holds(attempt):
             if self._recalls is not None:  # it was forgotten, or has ended
                 self._recalls.answered(attempt.request_id)
-            if reply.ok is not None or _ran_in_vain(reply):
+            if reply.ok is not None or ran_in_vain(reply):
                 self._late(attempt.service, attempt.request_id)
             return
         try:
-            payload, refusal = _read_reply(reply, attempt.request_id)
+            payload, refusal = read_reply(reply, attempt.request_id)
         except frame.FrameError as error:
             log.warning("answer_malformed request=%s reason=%r", attempt.request_id.hex(), error)
             payload, refusal = None, Refusal.MALFORMED
@@ -401,40 +375,6 @@ class Connection:
     def join(self, timeout_s: float) -> None:
         """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
         self._thread.join(timeout_s)
-
-
-def _ran_in_vain(reply: zenoh.Reply) -> bool:
-    """Whether the replica says that it ran a request whose answer was not wanted any more."""
-    if reply.err is None:
-        return False
-    try:
-        return frame.decode_refusal(reply.err.payload.to_bytes())[1] == Refusal.LATE
-    except frame.FrameError:
-        return False
-
-
-def _read_reply(reply: zenoh.Reply, request_id: bytes) -> tuple[bytes | None, str]:
-    """Return payload and refusal of a reply: one of both.
-
-    Raises:
-        FrameError: It is an answer to another request, or none at all.
-    """
-    payload, refusal = None, ""
-    if reply.ok is not None:
-        if reply.ok.attachment is None:
-            raise frame.FrameError("an answer without a header")
-        answered_id = frame.decode_answer(reply.ok.attachment.to_bytes())
-        payload = reply.ok.payload.to_bytes()
-    elif reply.err is not None:
-        content = reply.err.payload.to_bytes()
-        if content == b"Timeout":  # Zenoh's own, in place of an answer
-            return None, Refusal.LOST
-        answered_id, refusal = frame.decode_refusal(content)
-    else:
-        raise frame.FrameError("neither an answer nor a refusal")
-    if answered_id != request_id:
-        raise frame.FrameError("an answer to another request")
-    return payload, refusal
 
 
 def _close(session: Any) -> None:

@@ -15,7 +15,7 @@ from fogft.core.model import LinkState, ReplicaId
 from fogft.wire.link_window import ATTEMPTS_LIMIT
 from fogft.wire.memory import MemoryWire
 from fogft.wire.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer, Refusal
-from fogft.wire.zenoh_link import ZenohDialer
+from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_listener import ZenohListener
 from tests.wire.wire_pool import (
     LIMIT_S,

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from fogft.wire.zenoh_link import ZenohDialer, ZenohLink
+from fogft.wire.zenoh_dialer import ZenohDialer
+from fogft.wire.zenoh_link import ZenohLink
 from tests.wire.wire_pool import POOL_UID, Authority, Owner, ReplicaProcess, keys, peer
 
 

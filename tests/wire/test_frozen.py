@@ -81,7 +81,7 @@ ROBOT = """
 import json, sys, time
 from pathlib import Path
 from fogft.wire.config import LinkSettings
-from fogft.wire.zenoh_link import ZenohDialer
+from fogft.wire.zenoh_dialer import ZenohDialer
 from tests.wire.wire_pool import POOL_UID, SERVICE, Files, Owner, keys, peer, request_id, wait_for
 
 files = Files(*(Path(path) for path in sys.argv[1:4]))

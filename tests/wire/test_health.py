@@ -139,7 +139,7 @@ def test_every_accepted_offer_is_answered_exactly_once(
 LEAVING = """
 import sys
 from pathlib import Path
-from fogft.wire.zenoh_link import ZenohDialer
+from fogft.wire.zenoh_dialer import ZenohDialer
 from tests.wire.wire_pool import POOL_UID, SERVICE, Files, Owner, keys, peer, request_id, wait_for
 
 files = Files(*(Path(path) for path in sys.argv[1:4]))

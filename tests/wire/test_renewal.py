@@ -13,7 +13,8 @@ from fogft.core.model import LinkState
 from fogft.core.records import Record, RecordKind, SignedRecord, sign_record
 from fogft.pool.credentials import Role
 from fogft.wire.signing import Signer
-from fogft.wire.zenoh_link import ZenohDialer, ZenohLink
+from fogft.wire.zenoh_dialer import ZenohDialer
+from fogft.wire.zenoh_link import ZenohLink
 from tests.wire.wire_pool import (
     POOL_UID,
     SERVICE,
