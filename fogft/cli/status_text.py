@@ -21,7 +21,7 @@ LINKS = {"up": "good", "connecting": "soon", "suspect": "bad"}
 REPLICA_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "LINK", "RTT", "WON", "AGE")
 STARTING_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "AGE")
 SERVICE_COLUMNS = (
-    *("SERVICE", "READY", "REQUESTS", "ANSWERED", "UNANSWERED", "LATE"),
+    *("SERVICE", "READY", "REQUESTS", "ANSWERED", "FALLBACK", "UNANSWERED", "LATE"),
     *("WAITING", "P50", "P99"),
 )
 NUMBERS = ("$/H", "RTT", "WON", "AGE", *SERVICE_COLUMNS[1:])
@@ -120,6 +120,7 @@ def services(rows: Sequence[ServiceStatus], *, colour: bool) -> list[str]:
                 Cell(number(row.ready_replicas), "" if row.ready_replicas else "bad"),
                 Cell(number(count.get("received", 0))),
                 Cell(number(count.get("answered", 0))),
+                Cell(number(count.get("fallback", 0))),
                 Cell(number(unanswered), "bad" if unanswered else ""),
                 Cell(number(count.get("late", 0))),
                 Cell(number(count.get("pending", 0))),

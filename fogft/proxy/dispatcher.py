@@ -119,15 +119,19 @@ class Dispatcher:
             if self._pending_bytes + len(payload) > self._max_pending_bytes:
                 count["turned_away"] += 1
                 turned_away = count["turned_away"]
+                self._outcomes.note(request, "turned_away", took_s=0.0)
             else:
                 turned_away = 0
                 links, able = self._links, self._able
                 chosen = self._hedging.first(request, able, now)
                 self._pending_bytes += len(payload)
+                item = Request(payload, handle, now, traced=self._outcomes.trace is not None)
+                if item.story is not None:
+                    item.story.asked.update(dict.fromkeys(chosen, now))
                 self._requests.register(
                     request,
                     deadline=now + timeout_s,
-                    item=Request(payload, handle, now),
+                    item=item,
                     replicas=chosen,
                     now=now,
                     complete=len(chosen) == len(able),
@@ -163,6 +167,11 @@ class Dispatcher:
     def _declined(self, request: bytes, replica: int) -> None:
         with self._lock:
             self._outcomes.count["sent"] -= 1
+            pending = self._requests.get(request)
+            story = pending.item.story if pending is not None else None
+            if pending is not None and story is not None:
+                if story.asked.get(replica) == pending.open.get(replica):  # and not earlier
+                    story.asked.pop(replica, None)
             self._requests.declined(request, replica)
             self._hedging.declined(replica, full=True)
 
@@ -219,6 +228,9 @@ class Dispatcher:
         now = self._clock()
         with self._lock:
             self._outcomes.refusal(answer.refusal, id)
+            pending = self._requests.get(answer.request_id)
+            if pending is not None and pending.item.story is not None:
+                pending.item.story.refused[replica] = answer.refusal
             verdict = self._requests.failed(
                 answer.request_id,
                 replica,
@@ -397,6 +409,8 @@ class Dispatcher:
                 self._hedging.declined(replica, full=not wanted)
                 return
             self._outcomes.count["sent"] += 1
+            if pending.item.story is not None:
+                pending.item.story.asked.setdefault(replica, now)
         remaining_s = pending.deadline - now
         if not link.offer(self.spec.name, request, pending.item.payload, remaining_s):
             full.add(replica)

@@ -7,15 +7,19 @@ Owns: the numbers. Not here: what they are counted for (`dispatcher`), showing t
 
 from __future__ import annotations
 
+import bisect
 import threading
 from collections import deque
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from fogft.core.model import ReplicaId
 from fogft.wire.port import Refusal
 
 _LATENCIES_KEPT = 2000
+# Upper bounds of the histogram's buckets, seconds: from a local call to a planner that thinks.
+BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 _COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
     *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
@@ -47,6 +51,8 @@ class Outcomes:
         self._well: dict[ReplicaId, int] = {}
         self._ill: dict[ReplicaId, int] = {}
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._buckets = [0] * (len(BUCKETS_S) + 1)
+        self._took_s = 0.0
         self._late_lock = threading.Lock()
         self.trace: deque[dict[str, Any]] | None = None
 
@@ -55,6 +61,8 @@ class Outcomes:
         self.count["answered"] += 1
         self._won[replica] = self._won.get(replica, 0) + 1
         self._latencies.append(took_s)
+        self._buckets[bisect.bisect_left(BUCKETS_S, took_s)] += 1
+        self._took_s += took_s
 
     def note(
         self,
@@ -62,7 +70,8 @@ class Outcomes:
         outcome: str,
         *,
         took_s: float,
-        asked: Mapping[int, float],
+        asked: Mapping[int, float] = MappingProxyType({}),
+        refused: Mapping[int, str] = MappingProxyType({}),
         replica: str = "",
     ) -> None:
         """Trace how a request ended.
@@ -71,7 +80,8 @@ class Outcomes:
             request: Its id.
             outcome: One of `count`'s.
             took_s: Since it arrived, in seconds.
-            asked: Who worked on it at its end, and since when after its arrival.
+            asked: Who was asked for it, and when after its arrival.
+            refused: Who refused it, and why the last time.
             replica: Who answered it.
         """
         if self.trace is not None:
@@ -81,10 +91,8 @@ class Outcomes:
                     "outcome": outcome,
                     "replica": replica,
                     "took_s": round(took_s, 6),
-                    "asked": {
-                        f"{key >> 32}.{key & 0xFFFFFFFF}": round(after_s, 6)
-                        for key, after_s in asked.items()
-                    },
+                    "asked": {_short(key): round(after_s, 6) for key, after_s in asked.items()},
+                    "refused": {_short(key): reason for key, reason in refused.items()},
                 }
             )
 
@@ -116,7 +124,11 @@ class Outcomes:
             self.count["late"] += 1
 
     def report(self) -> dict[str, Any]:
-        """Return counters and latency quantiles (seconds; None before the first answer)."""
+        """Return counters and latencies (seconds; quantiles None before the first answer).
+
+        ``buckets`` counts answers by latency, between the bounds of `BUCKETS_S`; ``took_s`` is
+        the sum of those latencies.
+        """
         ordered = sorted(self._latencies)
         return {
             **self.count,
@@ -124,4 +136,11 @@ class Outcomes:
             "won": {replica.short: count for replica, count in self._won.items()},
             "p50_s": ordered[len(ordered) // 2] if ordered else None,
             "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,
+            "buckets": list(self._buckets),
+            "took_s": self._took_s,
         }
+
+
+def _short(key: int) -> str:
+    """Return a replica's ``slot.generation`` from the dispatcher's number for it."""
+    return f"{key >> 32}.{key & 0xFFFFFFFF}"

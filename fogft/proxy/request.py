@@ -5,12 +5,32 @@ from __future__ import annotations
 from typing import Any
 
 
+class Story:
+    """Who was asked for a traced request. Moments are on the dispatcher's clock, seconds.
+
+    Attributes:
+        asked: Each replica that took it, with the moment when it was asked first.
+        refused: Each replica that refused it, with its last reason.
+    """
+
+    __slots__ = ("asked", "refused")
+
+    def __init__(self) -> None:
+        self.asked: dict[int, float] = {}
+        self.refused: dict[int, str] = {}
+
+
 class Request:
-    """A caller's request. `arrived` is on the dispatcher's clock, seconds."""
+    """A caller's request. `arrived` is on the dispatcher's clock, seconds.
 
-    __slots__ = ("arrived", "handle", "payload")
+    Attributes:
+        story: For the trace; None where it is not traced.
+    """
 
-    def __init__(self, payload: bytes, handle: Any, arrived: float) -> None:
+    __slots__ = ("arrived", "handle", "payload", "story")
+
+    def __init__(self, payload: bytes, handle: Any, arrived: float, *, traced: bool) -> None:
         self.payload = payload
         self.handle = handle
         self.arrived = arrived
+        self.story = Story() if traced else None

@@ -19,7 +19,7 @@ from fogft.core.fallback import Rescues
 from fogft.core.first_response import FirstResponse, Pending
 from fogft.core.spec_choices import FallbackSpec
 from fogft.proxy.outcomes import Outcomes
-from fogft.proxy.request import Request
+from fogft.proxy.request import Request, Story
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -178,6 +178,7 @@ def note_end(
     """Trace the end of a request, where that is wanted. Under the lock."""
     if outcomes.trace is None:
         return
-    arrived = pending.item.arrived
-    asked = {key: begun - arrived for key, begun in pending.open.items()}
-    outcomes.note(request, outcome, took_s=now - arrived, asked=asked, replica=replica)
+    arrived, story = pending.item.arrived, pending.item.story or Story()
+    asked = {key: begun - arrived for key, begun in story.asked.items()}
+    took_s, refused = now - arrived, story.refused
+    outcomes.note(request, outcome, took_s=took_s, asked=asked, refused=refused, replica=replica)

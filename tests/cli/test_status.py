@@ -28,8 +28,8 @@ REPLICA  PHASE     LOCATION                $/H  LINK            RTT    WON    AG
 2.3      draining  local/us-west-2/a     0.021  suspect      1.25 s      7   26 h
          silent for 17 s, and so it is replaced by another one elsewhere
 
-SERVICE  READY  REQUESTS  ANSWERED  UNANSWERED   LATE  WAITING      P50     P99
-/plan        1     1 424     1 419           5  2 801        2  21.3 ms  148 ms
+SERVICE  READY  REQUESTS  ANSWERED  FALLBACK  UNANSWERED   LATE  WAITING      P50     P99
+/plan        1     1 424     1 416         3           5  2 801        2  21.3 ms  148 ms
 
 note: waiting after 3 failed launches (capacity)
 """

@@ -183,6 +183,39 @@ def test_a_trace_says_who_won_and_who_was_asked():
     assert scene.dispatcher.trace() == []
 
 
+def test_a_trace_of_what_expired_says_who_was_asked_and_who_refused():
+    """Also where nobody works on it any more: its replicas drop it at the deadline themselves."""
+    scene = Scene(2, trace=True)
+    scene.ask()
+    for link, reason in zip(scene.links, ("expired", "lost"), strict=True):
+        scene.clock.now += 1
+        scene.dispatcher.answered(link, link.refusal(reason))
+    scene.links[1].room = 0  # so that it is never asked again
+    scene.pass_time(3.0)
+    scene.local.calls[0][1](b"r")
+    [line] = scene.dispatcher.trace()
+    assert line["outcome"] == "fallback"
+    assert line["asked"] == {"0.1": 0.0, "1.1": 0.0}
+    assert line["refused"] == {"0.1": "expired", "1.1": "lost"}
+
+
+def test_a_trace_leaves_out_who_had_no_room():
+    scene = Scene(2, trace=True)
+    scene.links[1].room = 0
+    scene.ask()
+    scene.answer(0, b"r")
+    [line] = scene.dispatcher.trace()
+    assert line["asked"] == {"0.1": 0.0}
+
+
+def test_what_is_turned_away_is_in_the_trace():
+    scene = Scene(trace=True)
+    scene.dispatcher._max_pending_bytes = 0
+    scene.ask()
+    [line] = scene.dispatcher.trace()
+    assert (line["outcome"], line["asked"], line["refused"]) == ("turned_away", {}, {})
+
+
 def test_without_a_trace_nothing_is_kept():
     scene = Scene()
     scene.ask()
