@@ -168,10 +168,8 @@ class Dispatcher:
         with self._lock:
             self._outcomes.count["sent"] -= 1
             pending = self._requests.get(request)
-            story = pending.item.story if pending is not None else None
-            if pending is not None and story is not None:
-                if story.asked.get(replica) == pending.open.get(replica):  # and not earlier
-                    story.asked.pop(replica, None)
+            if pending is not None and pending.item.story is not None:
+                pending.item.story.declined(replica, pending.open.get(replica))
             self._requests.declined(request, replica)
             self._hedging.declined(replica, full=True)
 

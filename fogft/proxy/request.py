@@ -19,6 +19,11 @@ class Story:
         self.asked: dict[int, float] = {}
         self.refused: dict[int, str] = {}
 
+    def declined(self, replica: int, asked: float | None) -> None:
+        """Take back that a replica was asked at this moment; it may have been before."""
+        if self.asked.get(replica) == asked:
+            self.asked.pop(replica, None)
+
 
 class Request:
     """A caller's request. `arrived` is on the dispatcher's clock, seconds.

@@ -80,8 +80,8 @@ STATUS = PoolStatus(
             ready_replicas=1,
             counters={
                 "received": 1424, "answered": 1416, "fallback": 3, "late": 2801, "rejected": 0,
-                "silent": 4, "empty": 0, "turned_away": 1, "refused": {}, "pending": 2, "pending_bytes": 300,
-                "p50_s": 0.0213, "p99_s": 0.148,
+                "silent": 4, "empty": 0, "turned_away": 1, "refused": {}, "pending": 2,
+                "pending_bytes": 300, "p50_s": 0.0213, "p99_s": 0.148,
             },
         ),
     ),
