@@ -1,0 +1,16 @@
+"""The experiments that run, in the order of the paper. A line each; loaded when needed."""
+
+from __future__ import annotations
+
+import importlib
+
+from tests.evaluation.experiment import Experiment
+
+# Name -> module with an object `EXPERIMENT`.
+MODULES: dict[str, str] = {}
+
+
+def load(name: str) -> Experiment:
+    """Return an experiment by name."""
+    found: Experiment = importlib.import_module(MODULES[name]).EXPERIMENT
+    return found
