@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 MESSAGE_BYTES_LIMIT = 256 << 20
 _SESSIONS_LIMIT = 128  # robots, and gateways, at one replica
 _HANDSHAKES_LIMIT = 32
+_SIGN_OF_LIFE_EVERY_S = 2.0
 
 
 class CredentialPaths(Protocol):
@@ -43,17 +44,25 @@ class CredentialPaths(Protocol):
 class LinkSettings:
     """Times of a link, in seconds.
 
+    Zenoh's own two are long, because it cannot tell a thin uplink from a dead one; both ends see
+    to the connection themselves (`flow_watch`, `doorkeeper`).
+
     Attributes:
         lease_s: Zenoh ends a session whose peer sent nothing for so long. Must be longer
             than `wait_before_close_s`, or healthy links stall for seconds.
-        wait_before_close_s: How long a send may block before Zenoh gives the session up.
-            An uplink slower than 2 Mbit/s needs more: a batch is 64 KiB.
+        wait_before_close_s: How long the sending of one message may take before Zenoh gives
+            the session up.
         open_timeout_s: The most that opening a session takes.
+        stall_after_s: A robot gives up a connection in which a queue stands still for so long,
+            or for four round trips where that is longer.
+        stuck_after_s: A replica gives up a connection that delivers nothing for so long.
     """
 
-    lease_s: float = 2.0
-    wait_before_close_s: float = 0.3
+    lease_s: float = 600.0
+    wait_before_close_s: float = 500.0
     open_timeout_s: float = 1.5
+    stall_after_s: float = 1.0
+    stuck_after_s: float = 15.0
 
     def __post_init__(self) -> None:
         if not 0 < self.wait_before_close_s < self.lease_s:
@@ -150,6 +159,8 @@ def _common(settings: LinkSettings) -> dict[str, Any]:
         "transport/shared_memory/enabled": False,
         "transport/link/protocols": ["tls"],
         "transport/link/tx/lease": round(settings.lease_s * 1e3),
+        # So many in a lease: a peer that is out of reach leaves something unacknowledged.
+        "transport/link/tx/keep_alive": max(4, round(settings.lease_s / _SIGN_OF_LIFE_EVERY_S)),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
             settings.wait_before_close_s * 1e6
         ),

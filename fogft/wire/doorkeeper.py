@@ -3,8 +3,8 @@
 Zenoh owns the port. It lets a connection that never says who it is stand for as long as it
 likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look ourselves,
 four times a second, at this process's own sockets: what is connected to the port and is no
-authenticated link is ended when it is too old or when there are too many, and a link of a
-revoked holder is ended at once. Both are counted.
+authenticated link is ended when it is too old or when there are too many, a link of a revoked
+holder at once, and one that delivers nothing of what it holds after a while. All are counted.
 
 Owns: ending connections. Not here: whose requests are refused (`guests`).
 """
@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Collection, Mapping
 
+from fogft.wire import sockets
+from fogft.wire.drain import Drain
 from fogft.wire.reply_queue import Counters
+from fogft.wire.sockets import Address
 
 log = logging.getLogger(__name__)
 
@@ -30,9 +31,8 @@ PATIENCE_S = 3.0
 STRANGERS_LIMIT = 16
 # In a flood even the young have to go, but not one that may be in the middle of its handshake.
 LEAST_AGE_S = 0.5
-
-Address = tuple[str, int]
-_DESCRIPTORS = Path("/proc/self/fd")
+# A robot that is out of reach has long opened another link by then.
+STUCK_AFTER_S = 15.0
 
 
 class Doorkeeper:
@@ -42,8 +42,9 @@ class Doorkeeper:
         port: The port that this process listens at.
         links: Returns the peers' addresses of authenticated links, with their common names.
         revoked: Returns the names whose links are to be ended.
-        counters: Counts ``unauthenticated`` and ``revoked_links`` ended.
+        counters: Counts ``unauthenticated``, ``revoked_links`` and ``stuck_links`` ended.
         also: Called with each look.
+        stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.
     """
 
     def __init__(
@@ -54,13 +55,16 @@ class Doorkeeper:
         counters: Counters,
         *,
         also: Callable[[], None] = lambda: None,
+        stuck_after_s: float = STUCK_AFTER_S,
     ) -> None:
         self._port = port
         self._links = links
         self._revoked = revoked
         self._counters = counters
         self._also = also
+        self._stuck_after_s = stuck_after_s
         self._first_seen: dict[Address, float] = {}
+        self._drains: dict[Address, Drain] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fogft-doorkeeper", daemon=True)
         self._thread.start()
@@ -83,22 +87,36 @@ class Doorkeeper:
         with contextlib.ExitStack() as stack:
             found = {
                 peer: stack.enter_context(connection)
-                for peer, connection in _connections(self._port)
+                for peer, connection in sockets.connections(self._port)
             }
             links = self._links()  # after the sockets: who is in by now is no stranger
             revoked = self._revoked()
             for peer, name in links.items():
                 if name in revoked and peer in found:
                     self._end(found[peer], peer, "revoked_links", name)
+            self._end_the_stuck(links, found, now)
             seen = {peer: self._first_seen.get(peer, now) for peer in found if peer not in links}
             for peer in condemned(seen, now):
                 self._end(found[peer], peer, "unauthenticated", "")
                 del seen[peer]
             self._first_seen = seen
 
+    def _end_the_stuck(
+        self, links: Mapping[Address, str], found: Mapping[Address, socket.socket], now: float
+    ) -> None:
+        """End links whose peers have acknowledged nothing for long: frozen, or out of reach."""
+        drains = {peer: self._drains.get(peer) or Drain() for peer in links if peer in found}
+        for peer, drain in drains.items():
+            flow = sockets.flow(found[peer])
+            if flow is None:
+                continue
+            drain.look(flow, now)
+            if drain.stuck_s(now) > self._stuck_after_s:
+                self._end(found[peer], peer, "stuck_links", links[peer])
+        self._drains = drains
+
     def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:
-        with contextlib.suppress(OSError):  # it ended by itself
-            connection.shutdown(socket.SHUT_RDWR)
+        sockets.end(connection)
         count = self._counters.add(event)
         if count & (count - 1) == 0:
             log.warning(
@@ -120,45 +138,3 @@ def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
         for peer in by_age
         if now - strangers[peer] >= (LEAST_AGE_S if peer in surplus else PATIENCE_S)
     ]
-
-
-def address(endpoint: str) -> Address:
-    """Return host and port of a Zenoh endpoint such as ``tls/[::1]:7447``.
-
-    Raises:
-        ValueError: It is none.
-    """
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
-    return _plain(host.strip("[]")), int(port.partition("?")[0].partition("#")[0])
-
-
-def _plain(host: str) -> str:
-    return host.removeprefix("::ffff:") if "." in host else host
-
-
-def _connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
-    """Yield this process's TCP connections at a port, each as a socket of our own to it."""
-    try:
-        numbers = [int(entry.name) for entry in _DESCRIPTORS.iterdir()]
-    except OSError:
-        return  # no Linux: nothing can be seen to
-    for number in numbers:
-        try:
-            if not os.readlink(_DESCRIPTORS / str(number)).startswith("socket:"):
-                continue
-            connection = socket.socket(fileno=os.dup(number))
-        except OSError:
-            continue  # closed in between
-        try:
-            at_port = (
-                connection.family in (socket.AF_INET, socket.AF_INET6)
-                and connection.type == socket.SOCK_STREAM
-                and connection.getsockname()[1] == port
-            )
-            peer = connection.getpeername() if at_port else None
-        except OSError:
-            peer = None  # it listens, or is no longer connected
-        if peer is None:
-            connection.close()
-        else:
-            yield (_plain(peer[0]), peer[1]), connection

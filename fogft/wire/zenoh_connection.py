@@ -28,10 +28,12 @@ from fogft.core.records import Sign
 from fogft.wire import frame
 from fogft.wire.credit import Credit
 from fogft.wire.diagnosis import wrong_name
+from fogft.wire.flow_watch import FlowWatch
 from fogft.wire.leaving import see_off
 from fogft.wire.link_window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.wire.port import Answer, Peer, Refusal
 from fogft.wire.recalls import WORTH_S, Recalls
+from fogft.wire.sockets import address
 from fogft.wire.timer_budget import TimerBudget
 from fogft.wire.turns import LARGE_BYTES, Turns
 from fogft.wire.zenoh_attempt import OpenAttempt, ran_in_vain, read_reply
@@ -47,6 +49,8 @@ _AT_ONCE = zenoh.ConsolidationMode.NONE
 _QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
 # A `get` that took this long was stuck behind a full queue: see whether the session survived.
 _STUCK_S = 0.1
+# How long the keeper looks often after the last large request began to leave.
+_WATCH_S = 5.0
 # How long Zenoh keeps a cancellation; nobody answers it.
 _TELL_TIMEOUT_S = 1.0
 _NOBODY = handlers.Callback(lambda _: None, indirect=False)
@@ -81,6 +85,7 @@ class Connection:
         late: Called with service and id when a forgotten request was answered. Must not block.
         lost: Called, from any thread and perhaps more than once, when it is no longer of use.
         room: Called when a window that was full has room again.
+        large: Called when something large is sent and `watched` is not set. Must not block.
 
     Raises:
         zenoh.ZError: Nothing was reached.
@@ -102,8 +107,12 @@ class Connection:
         late: Callable[[str, bytes], None],
         lost: Callable[[], None],
         room: Callable[[], None],
+        large: Callable[[], None] = lambda: None,
     ) -> None:
         self._turns = turns
+        self._on_large = large
+        self._large_since = float("-inf")
+        self.watched = False
         self._answered = answered
         self._late = late
         self._on_lost = lost
@@ -128,7 +137,7 @@ class Connection:
             self._listener = self._session.info.declare_link_events_listener(
                 handlers.Callback(self._link_event, indirect=False)
             )
-            self._check_peer(peer)
+            self.flow = self._check_peer(peer)
         except BaseException:
             _close_aside(self._session, peer)
             raise
@@ -137,12 +146,14 @@ class Connection:
         )
         self._thread.start()
 
-    def _check_peer(self, peer: Peer) -> None:
-        found = {link.auth_identifier for link in self._session.info.links()}
+    def _check_peer(self, peer: Peer) -> FlowWatch:
+        links = self._session.info.links()
+        found = {link.auth_identifier for link in links}
         if not found:
             raise WireError(f"`{peer.endpoint}` was lost as soon as it was reached")
         for name in found - {peer.certificate_name}:
             raise WireError(wrong_name(name, peer), "another machine has this address now")
+        return FlowWatch(address(links[0].src), address(links[0].dst))
 
     # -- requests (any thread) ------------------------------------------------------------
 
@@ -239,14 +250,24 @@ class Connection:
             self._end(attempt, None, Refusal.LOST)
             return
         attempt.payload = None
-        turn = self._turns.take() if attempt.size >= LARGE_BYTES else None
+        large = attempt.size >= LARGE_BYTES
+        turn = self._turns.take() if large else None
         began = time.monotonic()
+        if large:
+            self._large_since = began
+            self._sends_large()
         try:
             self._get(attempt, payload, remaining_s)
         finally:
             self._turns.give(turn)
         if time.monotonic() - began > _STUCK_S and not self.alive():
             self._lose("it took nothing more, and Zenoh gave the session up")
+
+    def _sends_large(self) -> None:
+        """Have the keeper look whether it flows, from now on and for a while."""
+        if not self.watched:
+            self.watched = True
+            self._on_large()
 
     def _get(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
         self._session.get(
@@ -289,6 +310,12 @@ class Connection:
         self._on_lost()
 
     # -- the keeper -----------------------------------------------------------------------
+
+    def look(self, now: float) -> float:
+        """Look what flows; return for how many of the last seconds something large moved."""
+        if self.watched and now - self._large_since > _WATCH_S and not self._queue.qsize():
+            self.watched = False
+        return self.flow.look(now)
 
     def alive(self) -> bool:
         """Whether Zenoh still has a link beneath this session."""
@@ -366,6 +393,7 @@ class Connection:
     def close(self) -> None:
         """End it: what is open is lost. Returns at once; the sender thread closes the session."""
         ended = self.window.close()
+        self.flow.end_if_stuck()
         see_off(self._thread)
         self._queue.put(None)
         for attempt in ended:

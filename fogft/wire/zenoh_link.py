@@ -39,10 +39,12 @@ log = logging.getLogger(__name__)
 _PROBE_EVERY_S = 1.0
 _FIRST_PROBES_EVERY_S = 0.1
 _UNREADY_PROBES_EVERY_S = 0.25  # a replica that is there gets requests soon after it is ready
+_PROBE_TIMEOUT_S = 60.0  # on a thin uplink it waits behind what is large
 _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
 _EXPLAIN_EVERY_S = 5.0
 _EXPLAIN_TIMEOUT_S = 0.5
 _RENEW_AGAIN_S = 5.0
+_LOOK_EVERY_S = 0.1  # while something large is sent
 
 
 @dataclass(frozen=True)
@@ -248,6 +250,7 @@ class ZenohLink:
                 late=self._late,
                 lost=self._wake.set,
                 room=self._changed,
+                large=self._wake.set,
             )
         except (WireError, CredentialError) as error:
             self._say(error.message)
@@ -285,6 +288,8 @@ class ZenohLink:
             if self._renewal_due(now) and connection is self._live:
                 break
             self._let_go()
+            if not self._flows(connection, now):
+                break
             if now >= next_probe:
                 connection.sweep()
                 self._probe(connection, now)
@@ -295,12 +300,23 @@ class ZenohLink:
             if left_s <= 0:
                 connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
                 break
-            self._pause(min(next_probe - now, left_s))
+            often = _LOOK_EVERY_S if connection.watched else left_s
+            self._pause(min(next_probe - now, left_s, often))
             try:
                 up = self._listen(connection) or up
             except WireError as error:
                 connection.lost_because = error.message
         return up
+
+    def _flows(self, connection: Connection, now: float) -> bool:
+        """See whether what is large moves: then nobody is silent. False where it stands still."""
+        moved_s = connection.look(now)
+        for silence in (self._silence, self._asked):
+            silence.excuse(moved_s, now)
+        longest_s, shortest_s = self._suspect_after_s, self._dialer.settings.stall_after_s
+        if connection.flow.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
+            connection.lost_because = "it takes nothing more of what is sent"
+        return not connection.lost_because
 
     def _next_probe_in_s(self, *, up: bool) -> float:
         if not up:
@@ -339,9 +355,7 @@ class ZenohLink:
             self._wake.set()
 
         try:
-            connection.probe(
-                self._probe_key, frame.encode_probe(probe), self._suspect_after_s * 2, heard
-            )
+            connection.probe(self._probe_key, frame.encode_probe(probe), _PROBE_TIMEOUT_S, heard)
         except zenoh.ZError as error:
             connection.lost_because = f"sending failed: {error}"
             return

@@ -27,13 +27,14 @@ from fogft.core.record_set import RecordSet, Verdict
 from fogft.core.records import RecordError, SignedRecord
 from fogft.wire import config, frame, record_frames
 from fogft.wire.config import CredentialPaths, LinkSettings
-from fogft.wire.doorkeeper import Address, Doorkeeper, address
+from fogft.wire.doorkeeper import Doorkeeper
 from fogft.wire.guests import Guests, NotAdmittedError
 from fogft.wire.handshakes import HandshakeLog
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
 from fogft.wire.reply_queue import Counters, Reply, ReplyQueues
 from fogft.wire.signing import LazyVerifier
+from fogft.wire.sockets import Address, address
 
 log = logging.getLogger(__name__)
 
@@ -147,9 +148,8 @@ class ZenohListener:
         self._handshakes = handshakes
         self._doorkeeper: Doorkeeper | None = None
         self._id = id
-        self._config = config.replica_settings(
-            self._endpoint, id, credentials, settings or LinkSettings()
-        )
+        self._settings = settings or LinkSettings()
+        self._config = config.replica_settings(self._endpoint, id, credentials, self._settings)
         self._guests = Guests(
             id.pool_uid,
             certificate_name or names.replica_certificate_name(id),
@@ -194,6 +194,7 @@ class ZenohListener:
             lambda: self._guests.revoked,
             self._counters,
             also=self._count_handshakes,
+            stuck_after_s=self._settings.stuck_after_s,
         )
         self._on_request = on_request
         self.add(services)
@@ -360,7 +361,8 @@ class ZenohListener:
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
         ``malformed``, ``records``, ``records_refused``, ``not_admitted``, ``handshakes_refused``,
-        ``unauthenticated``, ``revoked_links``, ``reply_dropped``, ``failed``, ``cancellations``.
+        ``unauthenticated``, ``revoked_links``, ``stuck_links``, ``reply_dropped``, ``failed``,
+        ``cancellations``.
         """
         return self._counters.snapshot()
 

@@ -79,6 +79,13 @@ class Namespaces:
         _run("ip", "-n", where, "route", "add", f"{to}/32", "via", via, "dev", cable,
              "metric", str(metric))  # fmt: skip
 
+    def limit(self, where: str, cable: str, mbit_per_s: float, *, latency_ms: int = 400) -> None:
+        """Have a cable carry no more; what would wait longer than `latency_ms` is lost."""
+        _run(
+            *("ip", "netns", "exec", where, "tc", "qdisc", "replace", "dev", cable, "root"),
+            *("tbf", "rate", f"{mbit_per_s}mbit", "burst", "16kb", "latency", f"{latency_ms}ms"),
+        )
+
     def by_packets(self, where: str, cable: str) -> None:
         """Have packets leave one by one, as on a real cable, so that their headers are counted."""
         _run("ip", "-n", where, "link", "set", "dev", cable, "gso_max_segs", "1")

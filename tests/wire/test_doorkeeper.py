@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.wire.doorkeeper import LEAST_AGE_S, PATIENCE_S, STRANGERS_LIMIT, address, condemned
+from fogft.wire.doorkeeper import LEAST_AGE_S, PATIENCE_S, STRANGERS_LIMIT, condemned
+from fogft.wire.sockets import address
 
 ages = st.lists(st.floats(0, 10), max_size=60)
 

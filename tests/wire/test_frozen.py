@@ -31,7 +31,9 @@ from tests.wire.wire_pool import (
 MEGABYTE = os.urandom(1 << 20)
 # Here a send to a frozen peer blocks for longer than any test waits. So whatever shares a
 # thread, a lock or a queue with such a send fails its test, and no test needs a clock.
-STUCK = LinkSettings(lease_s=300.0, wait_before_close_s=200.0)
+STUCK = LinkSettings(
+    lease_s=300.0, wait_before_close_s=200.0, stall_after_s=3600.0, stuck_after_s=3600.0
+)
 
 
 def test_a_frozen_replica_does_not_delay_a_healthy_one(

@@ -12,7 +12,9 @@ from fogft.wire.zenoh_link import ZenohLink
 from tests.wire.wire_pool import SERVICE, ReplicaProcess, request_id, wait_for
 
 # A send to the frozen replica blocks for longer than any test waits.
-STUCK = LinkSettings(lease_s=300.0, wait_before_close_s=200.0)
+STUCK = LinkSettings(
+    lease_s=300.0, wait_before_close_s=200.0, stall_after_s=3600.0, stuck_after_s=3600.0
+)
 IN_THE_SENDERS_HANDS = 8  # passed to Zenoh before its queue and the socket were full
 
 

@@ -1,0 +1,63 @@
+"""Watch what flows through one link's connection, and end it beneath Zenoh where nothing does.
+
+Owns: a connection's socket and its `Drain`. Not here: the judgement (`drain`), when to look
+(`zenoh_link`).
+"""
+
+from __future__ import annotations
+
+from fogft.wire import sockets
+from fogft.wire.drain import BULK_BYTES, Drain
+from fogft.wire.sockets import Address, OwnSocket
+
+# Below, what is large is kept short in the kernel: 16 KiB take longer than 10 ms.
+THIN_BYTES_PER_S = 2_000_000.0
+
+
+class FlowWatch:
+    """Of one connection; used by one thread, but for `end`.
+
+    Args:
+        own: The address of its own end.
+        peer: The address of the other end.
+    """
+
+    def __init__(self, own: Address, peer: Address) -> None:
+        self._socket = OwnSocket(own, peer)
+        self._drain = Drain()
+        self._kept_short = False
+
+    @property
+    def bytes_per_s(self) -> float | None:
+        """How fast it drains, once that was seen."""
+        return self._drain.bytes_per_s
+
+    def look(self, now: float) -> float:
+        """Look once; return for how many of the last seconds large things moved."""
+        connection = self._socket.borrow()
+        if connection is None:
+            return 0.0
+        with connection:
+            flow = sockets.flow(connection)
+            if flow is None:
+                return 0.0
+            moved_s = self._drain.look(flow, now)
+            rate = self._drain.bytes_per_s
+            if not self._kept_short and rate is not None and rate < THIN_BYTES_PER_S:
+                sockets.keep_short(connection)
+                self._kept_short = True
+        return moved_s
+
+    def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
+        """Whether a queue stands still, as of the last look; see `Drain.stalled`."""
+        return self._drain.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
+
+    def end_if_stuck(self) -> None:
+        """End the connection if a queue is left in it: Zenoh would wait ten seconds for that."""
+        connection = self._socket.borrow()
+        if connection is None:
+            return
+        with connection:
+            flow = sockets.flow(connection)
+            if flow is not None and flow.outstanding >= BULK_BYTES:
+                sockets.end(connection)

@@ -1,0 +1,152 @@
+"""This process's own TCP connections, seen beside Zenoh: whose they are, what flows, their end.
+
+Zenoh opens the sockets and tells nothing of them. The kernel does: it lists the descriptors of
+this process and counts each connection's bytes. Where it does not (no Linux), nothing is found.
+
+Owns: finding and reading sockets. Not here: what follows from it (`doorkeeper`, `drain`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import socket
+import struct
+import termios
+from collections.abc import Iterator
+from pathlib import Path
+
+from fogft.wire.drain import Flow
+
+Address = tuple[str, int]
+
+_DESCRIPTORS = Path("/proc/self/fd")
+# struct tcp_info of linux/tcp.h: eight bytes of state, then 32 and 64 bit counts.
+_INFO_BYTES = 136
+_RTT, _RTT_VARIATION = (struct.Struct("@I"), 68), (struct.Struct("@I"), 72)
+_ACKNOWLEDGED, _RECEIVED = (struct.Struct("@Q"), 120), (struct.Struct("@Q"), 128)
+_COUNT = struct.Struct("@i")
+_TCP_NOTSENT_LOWAT = 25
+_UNSENT_BYTES = 16 << 10
+
+
+def address(endpoint: str) -> Address:
+    """Return host and port of a Zenoh endpoint such as ``tls/[::1]:7447``.
+
+    Raises:
+        ValueError: It is none.
+    """
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    return _plain(host.strip("[]")), int(port.partition("?")[0].partition("#")[0])
+
+
+def _plain(host: str) -> str:
+    return host.removeprefix("::ffff:") if "." in host else host
+
+
+def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
+    """Yield the connections whose own end is at a port: the peer, and a socket of ours to it."""
+    for number in _numbers():
+        connection = _duplicate(number)
+        if connection is None:
+            continue
+        ends = _ends(connection)
+        if ends is None or ends[0][1] != port:
+            connection.close()
+        else:
+            yield ends[1], connection
+
+
+class OwnSocket:
+    """One connection of this process. It is looked up anew each time and held by nobody here.
+
+    Args:
+        own: The address of its own end.
+        peer: The address of the other end.
+    """
+
+    def __init__(self, own: Address, peer: Address) -> None:
+        self._own = own
+        self._peer = peer
+        self._number = -1
+
+    def borrow(self) -> socket.socket | None:
+        """Return a socket to it, to be closed at once by the caller; None where there is none.
+
+        Kept open, it would keep the connection from ending.
+        """
+        for number in (self._number, *_numbers()):
+            connection = _duplicate(number)
+            if connection is None:
+                continue
+            if _ends(connection) == (self._own, self._peer):
+                self._number = number
+                return connection
+            connection.close()
+        return None
+
+
+def _numbers() -> list[int]:
+    try:
+        return [int(entry.name) for entry in _DESCRIPTORS.iterdir()]
+    except OSError:
+        return []  # no Linux: nothing can be seen to
+
+
+def _duplicate(number: int) -> socket.socket | None:
+    """Return a socket of ours to a TCP connection, None where a descriptor is no such."""
+    try:
+        if number < 0 or not os.readlink(_DESCRIPTORS / str(number)).startswith("socket:"):
+            return None
+        connection = socket.socket(fileno=os.dup(number))
+    except OSError:
+        return None  # closed in between
+    if (
+        connection.family in (socket.AF_INET, socket.AF_INET6)
+        and connection.type == socket.SOCK_STREAM
+    ):
+        return connection
+    connection.close()
+    return None
+
+
+def _ends(connection: socket.socket) -> tuple[Address, Address] | None:
+    try:
+        own, peer = connection.getsockname(), connection.getpeername()
+    except OSError:
+        return None  # it listens, or is no longer connected
+    return (_plain(own[0]), own[1]), (_plain(peer[0]), peer[1])
+
+
+def flow(connection: socket.socket) -> Flow | None:
+    """Return what the kernel counted on a connection; None where it does not tell."""
+    try:
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+        waiting = fcntl.ioctl(connection, termios.TIOCOUTQ, bytes(_COUNT.size))
+    except OSError:
+        return None
+    if len(info) < _INFO_BYTES:
+        return None  # a kernel before 4.1
+    rtt_us, variation_us, acknowledged, received = (
+        form.unpack_from(info, at)[0]
+        for form, at in (_RTT, _RTT_VARIATION, _ACKNOWLEDGED, _RECEIVED)
+    )
+    return Flow(
+        acknowledged=acknowledged,
+        received=received,
+        outstanding=max(0, _COUNT.unpack(waiting)[0]),
+        round_trip_s=(rtt_us + 4 * variation_us) / 1e6,
+    )
+
+
+def keep_short(connection: socket.socket) -> None:
+    """Let little wait in the kernel, so that probes overtake what is large."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
+
+
+def end(connection: socket.socket) -> None:
+    """End a connection at both of its ends, whatever Zenoh is doing with it."""
+    with contextlib.suppress(OSError):  # it ended by itself
+        connection.shutdown(socket.SHUT_RDWR)

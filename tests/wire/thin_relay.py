@@ -1,0 +1,76 @@
+"""A TCP relay on loopback that passes so many bytes a second each way, and may stop doing so."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+
+_CHUNK_BYTES = 4096
+_BUFFER_BYTES = 16 << 10
+
+
+class ThinRelay:
+    """Passes bytes on to a target, slowly.
+
+    Args:
+        target: ``host:port``.
+        bytes_per_s: Each way, for all connections together.
+
+    Attributes:
+        endpoint: ``host:port`` where it listens.
+        open: Clear it, and nothing passes until it is set again.
+    """
+
+    def __init__(self, target: str, bytes_per_s: float) -> None:
+        host, _, port = target.rpartition(":")
+        self._target = (host, int(port))
+        self._bytes_per_s = bytes_per_s
+        self._server = socket.socket()
+        # Small buffers, set before listening: what waits shall wait at the sender.
+        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._server.bind(("127.0.0.1", 0))
+        self._server.listen()
+        self._ends: list[socket.socket] = [self._server]
+        self.endpoint = f"127.0.0.1:{self._server.getsockname()[1]}"
+        self.open = threading.Event()
+        self.open.set()
+        self._next = {"up": 0.0, "down": 0.0}
+        self._lock = threading.Lock()
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._server.accept()
+                far = socket.socket()
+                far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+                far.connect(self._target)
+                for end in (near, far):
+                    end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+                self._ends += [near, far]
+                for source, sink, way in ((near, far, "up"), (far, near, "down")):
+                    threading.Thread(
+                        target=self._pass, args=(source, sink, way), daemon=True
+                    ).start()
+
+    def _pass(self, source: socket.socket, sink: socket.socket, way: str) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(_CHUNK_BYTES):
+                with self._lock:  # a turn on the line
+                    begin = max(self._next[way], time.monotonic())
+                    self._next[way] = begin + len(data) / self._bytes_per_s
+                time.sleep(max(0.0, self._next[way] - time.monotonic()))
+                self.open.wait()
+                sink.sendall(data)
+        for end in (source, sink):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self.open.set()
+        for end in self._ends:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
