@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from fogft import disk
@@ -53,23 +54,62 @@ def lock_holder(lock: Path) -> int | None:
 def end_holder(lock: Path, *, suspected_pid: int | None, patience_s: float = 10.0) -> int | None:
     """End the process that holds a lock: SIGTERM, then SIGKILL. Return its pid; None for nobody.
 
+    Returns when it is gone, not only its lock: a process lets go of what it holds, and may
+    hang only then.
+
     Args:
         lock: The file.
         suspected_pid: Who is said to hold it, where the kernel's list does not tell.
-        patience_s: How long to wait after SIGTERM.
+        patience_s: How long to wait after each signal.
     """
     if not disk.is_locked(lock):
         return None
     pid = lock_holder(lock) or suspected_pid
     if pid is None or pid == os.getpid():
         return None
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.kill(pid, number)
-            os.kill(pid, signal.SIGCONT)  # one that is stopped would never hear of it
-        end = time.monotonic() + patience_s
-        while disk.is_locked(lock) and time.monotonic() < end:
-            time.sleep(POLL_S)
-        if not disk.is_locked(lock):
-            break
+    with _opened(pid) as process:
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                process.send(number)
+                process.send(signal.SIGCONT)  # one that is stopped would never hear of it
+            end = time.monotonic() + patience_s
+            while disk.is_locked(lock) or process.alive:
+                if time.monotonic() > end:
+                    break
+                time.sleep(POLL_S)
+            else:
+                break
     return pid
+
+
+class _Process:
+    """A process that stays this one, even if its number is given to another."""
+
+    def __init__(self, pid: int, descriptor: int | None) -> None:
+        self._pid = pid
+        self._descriptor = descriptor
+
+    @property
+    def alive(self) -> bool:
+        """Whether it has not ended; a zombie has. False where the kernel cannot tell."""
+        return self._descriptor is not None and not select.select([self._descriptor], [], [], 0)[0]
+
+    def send(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        if self._descriptor is None:
+            os.kill(self._pid, number)
+        else:
+            signal.pidfd_send_signal(self._descriptor, number)
+
+
+@contextlib.contextmanager
+def _opened(pid: int) -> Iterator[_Process]:
+    try:
+        descriptor = os.pidfd_open(pid)
+    except OSError:  # it has gone, or the kernel is older than 5.3
+        yield _Process(pid, None)
+        return
+    try:
+        yield _Process(pid, descriptor)
+    finally:
+        os.close(descriptor)

@@ -107,6 +107,16 @@ class Pool:
                     continue
         return found
 
+    def left(self) -> dict[int, str]:
+        """Return the command of each process of this pool, by process id."""
+        found = {}
+        for pid in self.processes():
+            try:
+                found[pid] = Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
+            except OSError:
+                continue
+        return found
+
     def close(self) -> None:
         """End the pool through the command line, and what is left of it by force."""
         if (self.folder / "home" / "pools").exists():

@@ -40,7 +40,7 @@ def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
     assert flawless(result), (result, faults)
     pool.wait(lambda: pool.ready() == 3)
     pool.fogft("down")
-    assert pool.processes() == []
+    assert pool.left() == {}
 
 
 def test_the_replacement_is_launched_at_the_notice_and_not_at_the_death(pool):
@@ -108,7 +108,7 @@ def test_down_works_when_everything_but_the_replicas_is_dead(pool):
     for pid in (status["manager_pid"], status["proxy_pid"]):
         os.kill(pid, signal.SIGKILL)
     pool.fogft("down")
-    assert pool.processes() == []
+    assert pool.left() == {}
     pool.fogft("down", ok=False)
 
 

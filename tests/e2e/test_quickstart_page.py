@@ -50,6 +50,6 @@ def test_the_quick_start_works_as_it_is_written(tmp_path, ros_domain):
                 check=False,
             )
             assert done.returncode == 0, f"$ {command}\n{done.stdout}\n{done.stderr}"
-        assert pool.processes() == []
+        assert pool.left() == {}
     finally:
         pool.close()

@@ -24,6 +24,8 @@ if "stubborn" in sys.argv:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
 lock = disk.Lock(Path(sys.argv[1]))
 assert lock.acquire(wait=False)
+if "lingering" in sys.argv:
+    signal.signal(signal.SIGTERM, lambda number, frame: lock.release())
 print("held", flush=True)
 time.sleep(60)
 """
@@ -62,16 +64,19 @@ def test_the_holder_of_a_lock_is_known(lock: Path, holders: list[subprocess.Pope
     assert process_control.lock_holder(lock) is None
 
 
-@pytest.mark.parametrize("kind", ["willing", "stubborn", "stopped"])
+@pytest.mark.parametrize("kind", ["willing", "stubborn", "stopped", "lingering"])
 def test_the_holder_is_ended(lock: Path, holders: list[subprocess.Popen[bytes]], kind: str) -> None:
-    """SIGTERM first; SIGKILL for one that ignores it; a stopped one is let go on to hear it."""
+    """SIGTERM first; SIGKILL for one that ignores it; a stopped one is let go on to hear it.
+
+    One that lets go of its lock and then hangs is ended too.
+    """
     pid = hold(lock, holders, kind)
     if kind == "stopped":
         os.kill(pid, signal.SIGSTOP)
     wrong = os.getppid()
     ended = process_control.end_holder(lock, suspected_pid=wrong, patience_s=0.5)
     assert ended == pid
-    expected = signal.SIGKILL if kind == "stubborn" else signal.SIGTERM
+    expected = signal.SIGTERM if kind in ("willing", "stopped") else signal.SIGKILL
     assert holders[0].wait(10) == -expected
 
 

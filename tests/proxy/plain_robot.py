@@ -48,6 +48,9 @@ class Callers:
         pass
 
     def ask(self, count: int, size: int, service: str) -> None:
+        deadline = time.monotonic() + 60  # it is offered once a replica is ready
+        while service not in self._ask and time.monotonic() < deadline:
+            time.sleep(0.01)
         for _ in range(count):
             self.asked += 1
             number = self.asked
