@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from fogft.core import ordering
+from fogft.core import lag, ordering
 from fogft.core.office import Office
 from fogft.core.ordered_log import Checkpoint, OrderedLog
 from fogft.core.ordering import START, Op, Position, Promise
@@ -25,9 +25,7 @@ RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.5
 CHECKPOINT_RETRY_S = 1.0
 CHECK_EVERY_S = 1.0
-WINDOW = 256
-# Further behind than this, a replica is given a new snapshot rather than every request since.
-REPLAY_LIMIT = 256
+WINDOW = 128
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,8 @@ class _Peer:
     retry_at: float = 0.0
     checked_at: float = 0.0
     waits_since: float | None = None
+    lag: lag.Lag = field(default_factory=lag.Lag)
+    lags: bool = False  # it is sent no more: a snapshot takes it further
 
 
 @dataclass(frozen=True)
@@ -236,10 +236,28 @@ class Sequencer:
                 self._bring(replica, peer)
                 self._ask_again(replica, peer, now)
             elif peer.phase is Phase.JOINED:
+                self._look_at_lag(peer, now)
                 self._feed(replica, peer)
                 self._check(replica, peer, now)
         self._see_to_office(now)
         self._see_to_checkpoint(now)
+
+    def _look_at_lag(self, peer: _Peer, now: float) -> None:
+        """Have a replica restored that falls behind, if another can give its state."""
+        log = self.log
+        if peer.phase is not Phase.JOINED or log is None:
+            return
+        given = any(
+            self._keeps_up(other) and self._counts(replica)
+            for replica, other in self._peers.items()
+        )
+        peer.lags = given and (peer.lags or peer.lag.too_far(log.last - peer.acked, now))
+        if peer.lags and not peer.open:
+            peer.lags, peer.phase, peer.retry_at = False, Phase.UNCLAIMED, now
+
+    def _keeps_up(self, peer: _Peer) -> bool:
+        log = self.log
+        return peer.phase is Phase.JOINED and log is not None and log.last - peer.acked <= WINDOW
 
     # -- versions -------------------------------------------------------------------------
 
@@ -395,7 +413,7 @@ class Sequencer:
         ours = self._has_own_state(replica, at)
         may_join = promise.sound and ours and log.covers(at.index)
         from_index = max(at.index if may_join else -1, kept.index if kept else -1)
-        if log.last - from_index > REPLAY_LIMIT and self.ready and not waited:
+        if log.last - from_index > lag.LIMIT and self.ready and not waited:
             return
         if may_join and from_index == at.index:
             peer.phase = Phase.ASKED
@@ -437,6 +455,8 @@ class Sequencer:
     def _feed(self, replica: int, peer: _Peer) -> None:
         log = self.log
         assert log is not None
+        if peer.phase is not Phase.JOINED or peer.lags:
+            return
         if peer.rewind is not None:
             if peer.open:
                 return
@@ -522,12 +542,12 @@ class Sequencer:
         if not needed and not log.half_full:
             return
         joined = [
-            (p.won, r)
+            (not self._keeps_up(p), p.won, r)
             for r, p in self._peers.items()
             if p.phase is Phase.JOINED and self._counts(r)
         ]
         if joined:  # one that seldom answers first: it pauses for the snapshot
-            self._ask_for_checkpoint(min(joined)[1], now)
+            self._ask_for_checkpoint(min(joined)[-1], now)
 
     def _ask_for_checkpoint(self, replica: int, now: float) -> None:
         self._asked_for_checkpoint = replica

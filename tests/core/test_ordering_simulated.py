@@ -6,7 +6,8 @@ import random
 
 import pytest
 
-from fogft.core.sequencer import REPLAY_LIMIT
+from fogft.core import lag, sequencer
+from fogft.core.sequencer import WINDOW
 from tests.core.ordering_world import World
 from tests.linearizability import Call, counter, key_value, linearizable
 
@@ -70,6 +71,15 @@ def check(world: World, step, start) -> None:
         assert len(states) == 1
 
 
+@pytest.fixture(params=["wide", "narrow"])
+def limits(request, monkeypatch) -> None:
+    """With narrow limits replicas fall too far behind all the time."""
+    if request.param == "narrow":
+        monkeypatch.setattr(lag, "LIMIT", 3)
+        monkeypatch.setattr(sequencer, "WINDOW", 2)
+
+
+@pytest.mark.usefixtures("limits")
 @pytest.mark.parametrize("seed", [*range(40), 20223])
 @pytest.mark.parametrize(
     ("questions", "step", "start"),
@@ -85,6 +95,7 @@ def test_histories_are_linearizable_under_faults(seed, questions, step, start):
     check(world, step, start)
 
 
+@pytest.mark.usefixtures("limits")
 @pytest.mark.parametrize("seed", [*range(25), 10622])
 def test_without_losing_every_copy_all_recover_and_agree(seed):
     """While one replica and its service stay, all others come to its state and all is answered."""
@@ -199,7 +210,7 @@ def busy_world(requests: int) -> World:
 
 def test_a_new_replica_gets_a_fresh_snapshot_rather_than_hundreds_of_requests():
     """The log would do, and the checkpoint too; both would keep it from being ready for long."""
-    world = busy_world(REPLAY_LIMIT + 10)
+    world = busy_world(lag.LIMIT + 10)
     newest = world.add_replica()
     world.settle()
     assert world.restored == 1
@@ -220,6 +231,41 @@ def test_a_replica_is_current_only_when_it_has_caught_up_with_the_time_of_its_jo
             world.deliver(0) if world.letters else world.tick()
         world.work(newest)
     assert machine.current
+
+
+def deliver_in_order(world: World) -> None:
+    while world.letters:
+        world.letters.append(world.letters.pop(0))
+        world.deliver(-1)
+
+
+@pytest.mark.parametrize("slower", [2, 4, 10])
+def test_a_slow_replica_does_not_fall_ever_further_behind(slower):
+    """Callers go at the pace of the fast one; when it dies, they wait for what the other lacks."""
+    world = World(counter, 0, replicas=2, log_entries=8000)
+    world.settle()
+    fast, slow = world.hosts
+    worst = 0
+    for asked in range(1, 4001):
+        world.ask(0, ("add", 1))
+        while world.letters or world.hosts[fast].work is not None:
+            if world.hosts[fast].work is not None:
+                world.work(fast)
+            deliver_in_order(world)
+        if asked % slower == 0 and world.hosts[slow].work is not None:
+            world.work(slow)
+        world.tick(0.01)
+        worst = max(worst, asked - world.hosts[slow].machine.position.index)
+    assert len(world.history) == 4000
+    assert lag.LIMIT < worst < lag.LIMIT + (slower + 1) * WINDOW + lag.LONGEST_S / 0.01
+    world.remove_replica(fast)
+    world.ask(0, ("add", 1))
+    for _ in range(worst + WINDOW):
+        deliver_in_order(world)
+        if world.hosts[slow].work is not None:
+            world.work(slow)
+        world.tick()
+    assert world.history[-1].answer == 4001
 
 
 def test_the_checker_would_notice():

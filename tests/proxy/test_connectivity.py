@@ -117,7 +117,6 @@ def links_by_id(robot: Robot) -> dict[tuple[int, int], str]:
     return {(li["slot"], li["generation"]): li["state"] for li in robot.links() if li["ready"]}
 
 
-@pytest.mark.unsteady
 def test_a_second_robot_needs_no_manager_and_replicas_move_under_load(pool, call):
     """Two robots learn of a replica from its own record: its address is told to nobody else.
 
