@@ -32,11 +32,11 @@ def examples() -> Sequence[str]:
     return list(init.examples())
 
 
-def run_proxy(config: Path) -> None:
+def run_proxy(config: Path, *, metrics: str | None = None) -> None:
     """Run a client proxy until a signal ends it."""
     from fogft.proxy import client_process
 
-    client_process.run(config)
+    client_process.run(config, metrics=metrics)
 
 
 def run_server(
@@ -47,6 +47,7 @@ def run_server(
     workdir: Path | None = None,
     notice_file: Path | None = None,
     advertise: str | None = None,
+    metrics: str | None = None,
 ) -> None:
     """Run a server proxy until a signal ends it."""
     from fogft.proxy import server_process
@@ -58,25 +59,26 @@ def run_server(
         workdir=workdir,
         notice_file=notice_file,
         advertise=advertise,
+        metrics=metrics,
     )
 
 
-def run_manager(pool: str) -> None:
+def run_manager(pool: str, *, metrics: str | None = None) -> None:
     """Run a pool's manager until a signal ends it, or the pool has been ended."""
     from fogft.pool import manager
 
-    manager.run(make_store(pool), cloud_of)
+    manager.run(make_store(pool), cloud_of, metrics=metrics)
 
 
-def run_rendezvous(config: Path, *, listen: str | None = None) -> None:
+def run_rendezvous(config: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
     """Run a rendezvous until a signal ends it."""
     from fogft.pool import rendezvous
 
-    rendezvous.run(rendezvous.read_config(config, listen))
+    rendezvous.run(rendezvous.read_config(config, listen, metrics))
 
 
-def run_gateway(config: Path, *, listen: str | None = None) -> None:
+def run_gateway(config: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
     """Run a gateway until a signal ends it."""
     from fogft.proxy import gateway_process
 
-    gateway_process.run(config, listen=listen)
+    gateway_process.run(config, listen=listen, metrics=metrics)

@@ -14,8 +14,27 @@ import typer
 from fogft.cli import complete
 from fogft.cli.sections import Command
 
+
+def _endpoint(value: str | None) -> str | None:
+    from fogft.core.membership import is_endpoint
+
+    if value is not None and not is_endpoint(value):
+        raise typer.BadParameter(f"`{value}` is not HOST:PORT, such as 127.0.0.1:9464")
+    return value
+
+
 Config = Annotated[
     Path, typer.Option("--config", "-c", metavar="FILE", help="Its configuration (YAML).")
+]
+
+Metrics = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        help="Where to answer Prometheus (GET /metrics).",
+        show_default=False,
+        callback=_endpoint,
+    ),
 ]
 
 
@@ -25,7 +44,7 @@ def register(app: typer.Typer) -> None:
         app.command(command.__name__, cls=Command)(command)
 
 
-def proxy(config: Config) -> None:
+def proxy(config: Config, metrics: Metrics = None) -> None:
     """Run a client proxy: the robot's side of a pool.
 
     The manager writes its configuration to the pool's state folder as `proxy.yaml`.
@@ -36,7 +55,7 @@ def proxy(config: Config) -> None:
     """
     from fogft import app
 
-    app.run_proxy(config)
+    app.run_proxy(config, metrics=metrics)
 
 
 def serve(
@@ -74,6 +93,7 @@ def serve(
             show_default=False,
         ),
     ] = None,
+    metrics: Metrics = None,
 ) -> None:
     """Run a server proxy: a replica's side of a pool.
 
@@ -92,6 +112,7 @@ def serve(
         workdir=workdir,
         notice_file=notice_file,
         advertise=advertise,
+        metrics=metrics,
     )
 
 
@@ -99,6 +120,7 @@ def manager(
     pool: Annotated[
         str, typer.Argument(metavar="POOL", help="Its name.", autocompletion=complete.pools)
     ],
+    metrics: Metrics = None,
 ) -> None:
     """Run a pool's manager: it observes, plans and applies.
 
@@ -108,7 +130,7 @@ def manager(
     """
     from fogft import app
 
-    app.run_manager(pool)
+    app.run_manager(pool, metrics=metrics)
 
 
 def rendezvous(
@@ -119,6 +141,7 @@ def rendezvous(
             metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
         ),
     ] = None,
+    metrics: Metrics = None,
 ) -> None:
     """Run a rendezvous: it tells robots and replicas where others are.
 
@@ -130,7 +153,7 @@ def rendezvous(
     """
     from fogft import app
 
-    app.run_rendezvous(config, listen=listen)
+    app.run_rendezvous(config, listen=listen, metrics=metrics)
 
 
 def gateway(
@@ -141,6 +164,7 @@ def gateway(
             metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
         ),
     ] = None,
+    metrics: Metrics = None,
 ) -> None:
     """Run a gateway: robots ask it once, and it asks all replicas.
 
@@ -152,4 +176,4 @@ def gateway(
     """
     from fogft import app
 
-    app.run_gateway(config, listen=listen)
+    app.run_gateway(config, listen=listen, metrics=metrics)

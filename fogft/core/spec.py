@@ -14,6 +14,7 @@ from fogft.core.spec_choices import (
     AvailabilitySpec,
     FallbackSpec,
     GroupSpec,
+    MetricsSpec,
     MigrationSpec,
     OnDemandSpec,
     PlacementSpec,
@@ -145,6 +146,7 @@ class PoolSpec:
         topology: Who talks through whom.
         uplinks: Network interfaces of this machine's robot, the preferred one first; none for
             whatever its routes say.
+        metrics: Where processes listen for Prometheus.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -165,6 +167,7 @@ class PoolSpec:
     dial_in: str = ""
     topology: Topology = field(default_factory=Topology)
     uplinks: tuple[str, ...] = ()
+    metrics: MetricsSpec = field(default_factory=MetricsSpec)
     task: Mapping[str, Any] = field(default_factory=dict)
     discovered: tuple[ServiceSpec, ...] = ()
 

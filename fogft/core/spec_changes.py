@@ -30,7 +30,7 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
         "groups",
         "schedule",
         "migration",
-        *("topology", "uplinks"),
+        *("topology", "uplinks", "metrics"),
     ):
         found += _section(key, getattr(before, key), getattr(after, key))
     found += [

@@ -27,6 +27,26 @@ class AvailabilitySpec:
 
 
 @dataclass(frozen=True)
+class MetricsSpec:
+    """Where processes listen for Prometheus: ``host:port``; empty for nowhere.
+
+    Attributes:
+        proxy: The client proxy of the robot that ran `fogft up`.
+        manager: The manager.
+        replica: The server proxies; replica SLOT has the port plus SLOT.
+    """
+
+    proxy: str = ""
+    manager: str = ""
+    replica: str = ""
+
+    def of_replica(self, slot: int) -> str:
+        """Return the endpoint of a slot's replica."""
+        host, _, port = self.replica.rpartition(":")
+        return f"{host}:{int(port) + slot}" if host else ""
+
+
+@dataclass(frozen=True)
 class OnDemandSpec:
     """How spot and on-demand machines are mixed.
 

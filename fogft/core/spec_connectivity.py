@@ -1,13 +1,16 @@
-"""Judge `rendezvous`, `dial_in`, `uplinks` of a pool file: how its parts reach each other."""
+"""Judge `rendezvous`, `dial_in`, `uplinks`, `metrics` of a pool file: how parts are reached."""
 
 from __future__ import annotations
 
 from fogft.core.membership import is_endpoint
+from fogft.core.spec_choices import MetricsSpec
+from fogft.core.spec_keys import METRICS_KEYS
 from fogft.core.spec_tree import Section, shown
 from fogft.core.uplinks import is_interface
 
 MAX_RENDEZVOUS = 4
 MAX_UPLINKS = 4
+_LAST_REPLICA_PORT = 65535 - 1000  # slots of groups go up to 799
 _UPLINKS_HINT = "write what `ip link` lists, such as `uplinks: [wlan0, wwan0]`"
 _RENDEZVOUS_HINT = "write a list, such as `rendezvous: [meet.example.org:7450]`"
 _DIAL_IN_HINT = (
@@ -69,6 +72,30 @@ def read_uplinks(ours: Section) -> tuple[str, ...]:
     if len(found) > MAX_UPLINKS:
         raise ours.error("uplinks", f"has {len(found)}", f"list {MAX_UPLINKS} at most")
     return tuple(found)
+
+
+def read_metrics(ours: Section) -> MetricsSpec:
+    """Return where processes listen for Prometheus.
+
+    Raises:
+        SpecError: It is no endpoint, or one is there twice.
+    """
+    example = "write an address that only your Prometheus reaches, such as `{}: 127.0.0.1:{}`"
+    section = ours.section("metrics", "write a map, such as `metrics: {proxy: 127.0.0.1:9464}`")
+    section.only(METRICS_KEYS)
+    found: dict[str, str] = {}
+    for number, key in enumerate(METRICS_KEYS):
+        if key not in section.children:
+            continue
+        value = section.children[key].value
+        endpoint = _endpoint(section, key, value, example.format(key, 9464 + number))
+        if endpoint in found.values():
+            raise section.error(key, f"`{endpoint}` stands here twice", "give each its own port")
+        found[key] = endpoint
+    if "replica" in found and int(found["replica"].rpartition(":")[2]) > _LAST_REPLICA_PORT:
+        what = "leaves no room: replica SLOT has this port plus SLOT, which would be above 65535"
+        raise section.error("replica", what, f"write a port up to {_LAST_REPLICA_PORT}")
+    return MetricsSpec(**found)
 
 
 def _endpoint(ours: Section, key: str, value: object, hint: str) -> str:

@@ -26,6 +26,7 @@ FOGFT_KEYS = (
     "dial_in",
     "topology",
     "uplinks",
+    "metrics",
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
@@ -37,6 +38,7 @@ SERVICE_KEYS = (
 TOPOLOGY_KEYS = ("gateways", "robots", "through")
 GATEWAY_KEYS = ("name", "endpoint", "through")
 ROBOT_KEYS = ("name", "through")
+METRICS_KEYS = ("proxy", "manager", "replica")
 FALLBACK_KEYS = ("service", "after_s", "while_none_ready", "limit_s")
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")
 AVAILABILITY_KEYS = (

@@ -16,7 +16,12 @@ from pathlib import PurePath
 
 from fogft.core.names import POOL_NAME_PATTERN
 from fogft.core.spec import MAX_REPLICAS, HealthSpec, PoolSpec
-from fogft.core.spec_connectivity import read_dial_in, read_rendezvous, read_uplinks
+from fogft.core.spec_connectivity import (
+    read_dial_in,
+    read_metrics,
+    read_rendezvous,
+    read_uplinks,
+)
 from fogft.core.spec_keys import DAY_S, FOGFT_KEYS, HEALTH_KEYS, LATER_KEYS, places
 from fogft.core.spec_plan import (
     read_availability,
@@ -105,6 +110,7 @@ def pool_spec(
         dial_in=read_dial_in(ours),
         topology=read_topology(ours, services),
         uplinks=read_uplinks(ours),
+        metrics=read_metrics(ours),
         task=task,
     )
     workdir = spec.task.get("workdir")

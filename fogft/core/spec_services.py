@@ -32,7 +32,7 @@ def read_services(ours: Section) -> tuple[ServiceSpec, ...]:
     lines: dict[str, int] = {}
     for section in ours.sections("services", _SERVICES_HINT):
         section.only(SERVICE_KEYS, later=LATER_KEYS, elsewhere=places(SERVICE_KEYS))
-        service = _service(section)
+        service = read_service(section)
         if service.name in found:
             raise section.error(
                 "name",
@@ -44,7 +44,12 @@ def read_services(ours: Section) -> tuple[ServiceSpec, ...]:
     return tuple(found.values())
 
 
-def _service(section: Section) -> ServiceSpec:
+def read_service(section: Section) -> ServiceSpec:
+    """Return what one entry of `services` asks for.
+
+    Raises:
+        SpecError: The first mistake.
+    """
     written = section.text("name", "write the service's name, such as `name: /detect`")
     try:
         name = ros_names.absolute_service_name(written)

@@ -47,6 +47,17 @@ def plain(node: Node) -> Any:
     return node.value
 
 
+def tree(value: Any, line: int = 1) -> Node:
+    """Return plain lists and dictionaries as a tree: the way back of `plain`, all in one line."""
+    if isinstance(value, Mapping):
+        below: Any = {str(key): tree(child, line) for key, child in value.items()}
+    elif isinstance(value, (list, tuple)):
+        below = tuple(tree(child, line) for child in value)
+    else:
+        below = value
+    return Node(below, line, line)
+
+
 def shown(value: object, limit: int = 60) -> str:
     """Return text in backquotes that is safe to print: one line, no control characters."""
     text = str(value)

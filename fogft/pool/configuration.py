@@ -100,6 +100,7 @@ def proxy_config(
             **({"revocations": paths.revocations.name} if file == "proxy.yaml" else {}),
             "dial_in": "" if robot else spec.dial_in,  # that is where this machine is
             "uplinks": [] if robot else list(spec.uplinks),  # and these are its own
+            "metrics": "" if robot else spec.metrics.proxy,
         },
     )
 
@@ -185,6 +186,7 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "orphan_after_s": spec.health.orphan_after_s,
             "rendezvous": list(spec.rendezvous),
             "dial_out": [spec.dial_in] if spec.dial_in else [],
+            "metrics": spec.metrics.of_replica(id.slot),
         },
     )
 

@@ -25,7 +25,7 @@ from fogft.cloud.port import Cloud
 from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
-from fogft.pool import configuration, farewell, proxy_report, shutdown, status
+from fogft.pool import configuration, farewell, measures, proxy_report, shutdown, status
 from fogft.pool.announcing import ManagerRecords
 from fogft.pool.discovered import Discovery
 from fogft.pool.latency import Distances, Latencies
@@ -35,6 +35,7 @@ from fogft.pool.paths import latency_file
 from fogft.pool.proxy_supervisor import ProxySupervisor
 from fogft.pool.reconciler import Reconciler, Tick
 from fogft.pool.store import Identity, PoolStore
+from fogft.scrape import Scrape
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +57,7 @@ class Manager:
         store: The pool's folder.
         cloud: Where its machines run.
         proxy_command: What to start as client proxy, in place of our own.
+        metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
 
     Raises:
         PoolBusy: The pool has a manager.
@@ -63,7 +65,12 @@ class Manager:
     """
 
     def __init__(
-        self, store: PoolStore, cloud: Cloud, *, proxy_command: Sequence[str] | None = None
+        self,
+        store: PoolStore,
+        cloud: Cloud,
+        *,
+        proxy_command: Sequence[str] | None = None,
+        metrics: str | None = None,
     ) -> None:
         self._store = store
         self._cloud = cloud
@@ -81,6 +88,9 @@ class Manager:
         self._seen: dict[Path, tuple[int, int, int] | None] = {}
         self._digest: object = None
         self._trouble: list[str] = []
+        self._told: status.PoolStatus | None = None
+        self._scrape = Scrape(lambda: measures.of_pool(self._told))
+        self._metrics = metrics
         self._replicas: Sequence[status.ReplicaStatus] = ()
         self._reconciler = Reconciler(
             cloud,
@@ -113,6 +123,7 @@ class Manager:
         except PoolNotFound:
             log.info("manager_stopped pool=%s reason=ended", self._identity.name)
         finally:
+            self._scrape.close()
             self._records.close()
             self._lease.release()
         log.info("manager_stopped pool=%s", self._identity.name)
@@ -130,6 +141,7 @@ class Manager:
         tick = self._attempt_tick()
         if tick is None:
             return False
+        self._scrape.at(tick.spec.metrics.manager if self._metrics is None else self._metrics)
         self._attempt(lambda: self._discover(tick))
         self._attempt(lambda: self._records.look(tick.spec.rendezvous, tick.membership))
         if tick.over and tick.observed.machines == ():
@@ -222,6 +234,7 @@ class Manager:
         if ended:
             seen = replace(seen, ended=ended, proxy_alive=False, proxy_pid=None, notes=[])
             log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
+        self._told = seen
         disk.write_json(self._paths.status, seen.to_json(), durable=False)
 
     # -- waiting ----------------------------------------------------------------------------
@@ -262,6 +275,7 @@ def run(
     cloud_of: Callable[[Identity], Cloud],
     *,
     proxy_command: Sequence[str] | None = None,
+    metrics: str | None = None,
 ) -> None:
     """Run a pool's manager in this process until a signal ends it, or the pool has ended.
 
@@ -269,6 +283,7 @@ def run(
         store: The pool.
         cloud_of: Returns the cloud that a pool runs on.
         proxy_command: What to start as client proxy, in place of our own.
+        metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
 
     Raises:
         PoolBusy: The pool has a manager, or a later one has taken over.
@@ -286,4 +301,4 @@ def run(
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
     cloud = cloud_of(store.identity())
-    Manager(store, cloud, proxy_command=proxy_command).run(stop)
+    Manager(store, cloud, proxy_command=proxy_command, metrics=metrics).run(stop)

@@ -22,6 +22,8 @@ from fogft import disk
 from fogft.core.errors import StateError
 from fogft.core.names import POOL_UID_PATTERN
 from fogft.core.record_set import RecordSet
+from fogft.pool import measures
+from fogft.scrape import Scrape
 from fogft.wire import record_cache
 from fogft.wire.record_exchange import Exchange
 from fogft.wire.rendezvous_server import RendezvousServer
@@ -49,6 +51,7 @@ class RendezvousConfig:
     Attributes:
         records: File that the records are kept in.
         status: File for what was counted; None for nowhere.
+        metrics: ``host:port`` to answer Prometheus at; empty for none.
     """
 
     pool_uid: str
@@ -56,9 +59,12 @@ class RendezvousConfig:
     credentials: Credentials
     records: Path
     status: Path | None = None
+    metrics: str = ""
 
 
-def read_config(path: Path, listen: str | None = None) -> RendezvousConfig:
+def read_config(
+    path: Path, listen: str | None = None, metrics: str | None = None
+) -> RendezvousConfig:
     """Read a rendezvous's configuration; paths in it are relative to its folder.
 
     Raises:
@@ -81,6 +87,7 @@ def read_config(path: Path, listen: str | None = None) -> RendezvousConfig:
             ),
             records=base / str(raw.get("records") or "records.json"),
             status=base / str(raw["status"]) if raw.get("status") else None,
+            metrics=str(raw.get("metrics") or "") if metrics is None else metrics,
         )
     except KeyError as error:
         raise StateError(f"`{path}`: key {error} is missing", hint) from error
@@ -128,6 +135,8 @@ class _Rendezvous:
             loop.add_signal_handler(number, stop.set)
         self._server.bind()
         log.info("rendezvous_listening endpoint=%s pid=%d", self._server.endpoint, os.getpid())
+        scrape = Scrape(lambda: measures.of_rendezvous(self._server.report()))
+        scrape.at(self._config.metrics)
         serving = loop.create_task(self._server.serve())
         try:
             while not stop.is_set() and not serving.done():
@@ -138,6 +147,7 @@ class _Rendezvous:
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
             self._save()
+            scrape.close()
             log.info("rendezvous_stopped")
 
     def _restore(self) -> None:

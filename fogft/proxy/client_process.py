@@ -14,12 +14,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fogft import disk
 from fogft.core import names
 from fogft.core.errors import FogftError, PoolBusy, StateError
 from fogft.core.spec import ServiceSpec
+from fogft.proxy import measures
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.config import ClientProxyConfig, read_client
 from fogft.proxy.dispatcher import Dispatcher
@@ -27,9 +28,15 @@ from fogft.proxy.following import Following
 from fogft.proxy.mark import MarkFile
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.process import Watched, start_log, stop_on_signal
+from fogft.proxy.seen_from_ros import SeenFromRos
 from fogft.proxy.voting import VotingDispatcher
 from fogft.ros import environment, memory_tuning
+from fogft.scrape import Scrape
 from fogft.wire.uplinks import UplinkDialer
+
+if TYPE_CHECKING:
+    from fogft.ros.node import SerialisedNode
+    from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
 
@@ -71,8 +78,12 @@ class ManagerSign:
         return None if self._seen_at is None else self._clock() - self._seen_at
 
 
-def run(config_path: Path) -> None:
+def run(config_path: Path, *, metrics: str | None = None) -> None:
     """Run until a signal ends it.
+
+    Args:
+        config_path: A `proxy.yaml`.
+        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
 
     Raises:
         PoolBusy: This pool's client proxy runs already.
@@ -80,33 +91,51 @@ def run(config_path: Path) -> None:
     """
     start_log()
     stop = stop_on_signal()
-    config = read_client(config_path)
+    config = read_client(config_path, metrics)
     lock = disk.Lock(config.lock)
     if not lock.acquire(wait=False):
         raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
     environment.prepare(os.environ)
     from fogft.ros.definition import definition
     from fogft.ros.node import SerialisedNode
+    from fogft.ros.types import check_ok_field
 
     memory_tuning.tune()
     sign = ManagerSign(config.lease)
-    node = SerialisedNode(_node_name("fogft", config.pool), config.domain_id)
+    node = SerialisedNode(_node_name("fogft_proxy", config.pool), config.domain_id)
     make = functools.partial(
         make_dispatcher, marks=config.status.with_suffix(".marks"), pool_uid=config.pool_uid
     )
     dialer = make_dialer(config, sign.age_s)
     proxy = ClientProxy(config.pool_uid, node, dialer, make, define=definition)
-    proxy.serve(config.services)
+    visible = functools.partial(_make_visible, node, _node_name("fogft", config.pool))
+    seen = SeenFromRos(config.pool, config.robot, visible, check_ok_field)
+    proxy.serve(seen.follow(config.services))
     following = Following(config)
+    scrape = Scrape(lambda: measures.of_client(proxy.report()))
+    scrape.at(config.metrics)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
     try:
-        _loop(config_path, config, _Parts(proxy, following, sign, dialer), stop)
+        parts = _Parts(proxy, following, sign, dialer, seen, scrape, metrics)
+        _loop(config_path, config, parts, stop)
     finally:
+        scrape.close()
         following.close()
         proxy.close()
         node.close()
         lock.release()
         log.info("proxy_stopped pool=%s", config.pool)
+
+
+def _make_visible(
+    node: SerialisedNode, name: str, judge: Callable[[Mapping[str, Any]], str]
+) -> VisibleNode | None:
+    """Make the node that people see. Without it requests flow all the same."""
+    try:
+        return node.make_visible(name, judge)
+    except FogftError as error:
+        log.error("visible_node_off reason=%r", error.message)
+        return None
 
 
 def make_dialer(config: ClientProxyConfig, manager_age: Callable[[], float | None]) -> UplinkDialer:
@@ -179,6 +208,9 @@ class _Parts(NamedTuple):
     following: Following
     sign: ManagerSign
     dialer: UplinkDialer
+    seen: SeenFromRos
+    scrape: Scrape
+    metrics: str | None
 
 
 def _loop(
@@ -187,7 +219,7 @@ def _loop(
     parts: _Parts,
     stop: threading.Event,
 ) -> None:
-    proxy, following, sign, _ = parts
+    proxy, following, sign, seen = parts.proxy, parts.following, parts.sign, parts.seen
     memory = memory_tuning.Trimmer()
     watched_config = Watched(config_path)
     watched_config.changed()
@@ -201,6 +233,7 @@ def _loop(
         sign.look()
         if watched_config.changed():
             _apply(functools.partial(_reconfigure, config_path, config, parts), config_path)
+        _apply(functools.partial(_follow_parameters, parts), config_path)
         _apply(functools.partial(_follow, following, proxy), config.membership)
         if watched_certificate.changed():
             proxy.renew()
@@ -208,6 +241,7 @@ def _loop(
         if revocations is not None and revocations.changed():
             _apply(functools.partial(_tell, revocations.path, proxy), revocations.path)
         now = time.monotonic()
+        seen.diagnose(proxy.report, now)
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
             reported = now
             if not config_path.parent.exists():  # the pool's folder: its end is the pool's
@@ -235,15 +269,22 @@ def _apply(step: Callable[[], None], path: Path) -> None:
 
 
 def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
-    new = read_client(path)
+    new = read_client(path, parts.metrics)
     if (new.pool_uid, new.domain_id) != (old.pool_uid, old.domain_id):
         raise StateError(f"`{path}`: pool_uid and domain_id cannot change while the proxy runs")
     policies = {service.name: service.uplinks for service in new.services}
     if parts.dialer.use(new.uplinks, policies):
         parts.proxy.redial()
-    parts.proxy.serve(new.services)
+    parts.proxy.serve(parts.seen.follow(new.services))
     parts.following.apply(new)
+    parts.scrape.at(new.metrics)
     log.info("config_applied services=%d", len(new.services))
+
+
+def _follow_parameters(parts: _Parts) -> None:
+    services = parts.seen.changed()
+    if services is not None:
+        parts.proxy.serve(services)
 
 
 def _follow(following: Following, proxy: ClientProxy) -> None:

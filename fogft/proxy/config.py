@@ -43,6 +43,7 @@ class ClientProxyConfig:
         dial_in: ``host:port`` that replicas which cannot be reached are told; empty for none.
         dial_in_listen: Where to listen for them; empty for that port on all addresses.
         uplinks: Network interfaces, the preferred one first; none for what the routes say.
+        metrics: ``host:port`` to answer Prometheus at; empty for none.
     """
 
     pool: str
@@ -63,6 +64,7 @@ class ClientProxyConfig:
     dial_in: str = ""
     dial_in_listen: str = ""
     uplinks: tuple[str, ...] = ()
+    metrics: str = ""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,7 @@ class ServerProxyConfig:
         dial_out: Doors of robots and gateways, where this replica cannot be reached.
         notice: Where preemption notices come from: ``none``, ``file:PATH`` with an absolute
             path, or a source of `fogft.cloud.notice.watch`.
+        metrics: ``host:port`` to answer Prometheus at; empty for none.
     """
 
     pool: str
@@ -107,16 +110,17 @@ class ServerProxyConfig:
     rendezvous: tuple[str, ...] = ()
     records: Path | None = None
     dial_out: tuple[str, ...] = ()
+    metrics: str = ""
 
 
-def read_client(path: Path) -> ClientProxyConfig:
-    """Read a client proxy's configuration.
+def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
+    """Read a client proxy's configuration; `metrics` replaces what it says.
 
     Raises:
         StateError: It cannot be read, or a key is missing or of the wrong type.
     """
     with _Reading(path) as (raw, base):
-        return _client(raw, base)
+        return _client({**raw, **({} if metrics is None else {"metrics": metrics})}, base)
     raise AssertionError("unreachable")
 
 
@@ -140,18 +144,22 @@ def _client(raw: Mapping[str, Any], base: Path) -> ClientProxyConfig:
         dial_in=_endpoint(raw.get("dial_in") or ""),
         dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
         uplinks=_interfaces(raw.get("uplinks")),
+        metrics=_endpoint(raw.get("metrics") or ""),
     )
 
 
-def read_gateway(path: Path, listen: str | None = None) -> GatewayConfig:
-    """Read a gateway's configuration; `listen` replaces what it says.
+def read_gateway(
+    path: Path, listen: str | None = None, metrics: str | None = None
+) -> GatewayConfig:
+    """Read a gateway's configuration; `listen` and `metrics` replace what it says.
 
     Raises:
         StateError: It cannot be read, or a key is missing or of the wrong type.
     """
     with _Reading(path) as (raw, base):
+        given = {**raw, **({} if metrics is None else {"metrics": metrics})}
         return GatewayConfig(
-            client=_client({**raw, "robot": raw["gateway"]}, base),
+            client=_client({**given, "robot": raw["gateway"]}, base),
             listen=listen or str(raw.get("listen") or DEFAULT_GATEWAY_LISTEN),
         )
     raise AssertionError("unreachable")
@@ -183,6 +191,7 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
             rendezvous=_endpoints(raw.get("rendezvous")),
             records=base / raw["records"] if raw.get("records") else None,
             dial_out=_endpoints(raw.get("dial_out")),
+            metrics=_endpoint(raw.get("metrics") or ""),
         )
     raise AssertionError("unreachable")
 

@@ -23,6 +23,7 @@ from fogft.core.hedging import NEVER
 from fogft.core.holders import Holder, Role, holder_of
 from fogft.core.model import ReplicaId
 from fogft.core.spec import OnTimeout, ServiceSpec
+from fogft.proxy import measures
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.client_process import make_dialer
 from fogft.proxy.config import GatewayConfig, read_gateway
@@ -30,6 +31,7 @@ from fogft.proxy.dispatcher import Dispatcher
 from fogft.proxy.following import Following
 from fogft.proxy.gateway import Forwarder, NoRos, numbers
 from fogft.proxy.process import Watched, start_log, stop_on_signal
+from fogft.scrape import Scrape
 from fogft.wire.port import Listener, Probe, ProbeAnswer
 from fogft.wire.signing import Signer, common_name
 
@@ -38,12 +40,13 @@ log = logging.getLogger(__name__)
 _REPORT_EVERY_S = 0.5
 
 
-def run(config_path: Path, *, listen: str | None = None) -> None:
+def run(config_path: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
     """Run until a signal ends it.
 
     Args:
         config_path: A `gateway.yaml`.
         listen: ``host:port`` instead of the file's.
+        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
 
     Raises:
         PoolBusy: This gateway runs already.
@@ -51,7 +54,7 @@ def run(config_path: Path, *, listen: str | None = None) -> None:
     """
     start_log()
     stop = stop_on_signal()
-    config = read_gateway(config_path, listen)
+    config = read_gateway(config_path, listen, metrics)
     lock = disk.Lock(config.client.lock)
     if not lock.acquire(wait=False):
         name, pool = config.client.robot, config.client.pool
@@ -85,6 +88,7 @@ class _Gateway:
         self._holder = self._own_holder()
         self._certificate = Watched(client.credentials.certificate)
         self._certificate.changed()
+        self._scrape = Scrape(lambda: measures.of_gateway(self._told()))
 
     def _own_holder(self) -> Holder:
         ours = self._config.client.credentials
@@ -150,6 +154,7 @@ class _Gateway:
         """Pass requests on until told to stop."""
         self._forwarder.start()
         self._listen()
+        self._scrape.at(self._config.client.metrics)
         reported = time.monotonic()
         while not stop.is_set():
             self._proxy.run_once()
@@ -191,15 +196,20 @@ class _Gateway:
         self._proxy.renew()
         self._following.renew()
 
+    def _told(self) -> dict[str, Any]:
+        return {
+            "forwarded": self._forwarder.report(),
+            "listener": dict(self._listener.counters()) if self._listener else {},
+            **self._proxy.report(),
+        }
+
     def _report(self) -> None:
         report = {
             "pid": os.getpid(),
             "written_at": time.time(),
             "gateway": self._holder.short,
             "endpoint": self._listener.endpoint if self._listener else "",
-            "forwarded": self._forwarder.report(),
-            "listener": dict(self._listener.counters()) if self._listener else {},
-            **self._proxy.report(),
+            **self._told(),
             **self._following.report(),
         }
         try:
@@ -209,6 +219,7 @@ class _Gateway:
 
     def close(self) -> None:
         """Refuse what is under way, and leave."""
+        self._scrape.close()
         self._forwarder.close()
         if self._listener is not None:
             self._listener.close()

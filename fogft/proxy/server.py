@@ -18,6 +18,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable
+from typing import Any
 
 from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.core import names
@@ -201,6 +202,18 @@ class ServerProxy:
             self._draining = True
         else:
             self._at_risk = True
+
+    def report(self) -> dict[str, Any]:
+        """Return what became of requests here, for metrics."""
+        answering = self._answering()
+        return {
+            "work": self.responder.report(),
+            "refused": dict(self.responder.refused),
+            "services": {s.name: s.name in answering for s in self._offering.services},
+            "draining": self._draining,
+            "restarts": max(self._supervisor.restarts, 0),
+            "wire": dict(self._listener.counters()),
+        }
 
     def _join_ros(self) -> None:
         node = self._node = self._make_node()

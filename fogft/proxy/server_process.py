@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 
 from fogft.cloud import notice
+from fogft.proxy import measures
 from fogft.proxy.announcing import Presence
 from fogft.proxy.config import ServerProxyConfig, read_server
 from fogft.proxy.process import start_log, stop_on_signal
@@ -20,6 +21,7 @@ from fogft.proxy.server import ServerProxy
 from fogft.proxy.supervisor import Supervisor
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
+from fogft.scrape import Scrape
 from fogft.wire import runtime
 
 log = logging.getLogger(__name__)
@@ -35,6 +37,7 @@ def run(
     workdir: Path | None = None,
     notice_file: Path | None = None,
     advertise: str | None = None,
+    metrics: str | None = None,
 ) -> None:
     """Run until a signal ends it, or until no manager was heard of for `orphan_after_s`.
 
@@ -45,6 +48,7 @@ def run(
         workdir: Folder in which `run` starts, instead of the file's.
         notice_file: File that appears when the machine is about to be preempted.
         advertise: ``host:port`` at which this replica is reached, where it cannot know that.
+        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
 
     Raises:
         FogftError: The configuration, the credentials or ROS cannot be used.
@@ -56,6 +60,7 @@ def run(
         workdir=str(workdir.resolve()) if workdir else None,
         notice=f"file:{notice_file.resolve()}" if notice_file else None,
         advertise=advertise,
+        metrics=metrics,
     )
     start_log(config.log_level)
     stop = stop_on_signal()
@@ -64,11 +69,14 @@ def run(
     proxy = _make(config)
     watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
     presence: Presence | None = None
+    scrape = Scrape(lambda: measures.of_server(proxy.report()))
     try:
         proxy.start()
+        scrape.at(config.metrics)
         presence = Presence(config, proxy.endpoint)
         _loop(config, proxy, presence, stop)
     finally:
+        scrape.close()
         if presence is not None:
             presence.close()
         if watching is not None:

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fogft.core import ros_names
 from fogft.core.errors import RosError
 from fogft.ros import transfer
 from fogft.ros.entities import Client, Server
+from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +28,9 @@ _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a cal
 _NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, and proxies
 _NO_LIMIT = -1  # of rcl_wait: until something happens
 
-# A process that proxies must not leave files in ~/.ros/log; it has a log of its own.
-_ROS_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs"]
+# A process that proxies must not leave files in ~/.ros/log; it has a log of its own, on standard
+# error. What goes through rclpy's loggers goes to /rosout only, or each line would be there twice.
+_ROS_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs", "--disable-stdout-logs"]
 
 
 class SerialisedNode:
@@ -49,6 +51,7 @@ class SerialisedNode:
         self._transfers: dict[str, transfer.Transfer] = {}
         self._stopping = False
         self._ended = threading.Event()
+        self._visible: VisibleNode | None = None
         try:
             self._start_ros(name, domain_id)
         except ImportError as error:
@@ -143,6 +146,24 @@ class SerialisedNode:
         client: Client = self._create(name, type_name, create)
         return client
 
+    def make_visible(
+        self, name: str, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
+    ) -> VisibleNode:
+        """Make a node for people's tools beside this one. It ends with this one.
+
+        Args:
+            name: Its name.
+            judge: Takes parameters that somebody sets, and returns why not.
+
+        Raises:
+            RosError: ROS refuses it, or this node is closed.
+        """
+        with self._create_lock:
+            if self._stopping or self._ended.is_set():
+                raise RosError("the ROS node is closed")
+            self._visible = VisibleNode(name, self._context, judge)
+        return self._visible
+
     def offered(self) -> dict[str, str]:
         """Return name -> type of the services that applications offer, as discovery knows them.
 
@@ -199,6 +220,8 @@ class SerialisedNode:
 
     def close(self) -> None:
         """Stop the thread and leave ROS. Repeatable; from a callback it only asks for the end."""
+        if self._visible is not None:
+            self._visible.close()
         with self._create_lock:
             self._stopping = True
             if not self._ended.is_set():

@@ -10,6 +10,8 @@ Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.ros.memory` (te
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import Any, Protocol
 
 from fogft.core.errors import RosError
@@ -87,3 +89,29 @@ class RosNode(Protocol):
 
     def close(self) -> None:
         """Stop the thread and leave ROS. Repeatable."""
+
+
+class Level(IntEnum):
+    """How bad a status is; the numbers of `diagnostic_msgs/msg/DiagnosticStatus`."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Status:
+    """One status of `/diagnostics`.
+
+    Attributes:
+        name: Whose it is; the same each time.
+        message: In a few words.
+        hardware_id: The robot or the replica.
+        values: What is known, by name.
+    """
+
+    level: Level
+    name: str
+    message: str
+    hardware_id: str
+    values: Mapping[str, str] = field(default_factory=dict)

@@ -59,6 +59,7 @@ MORE_TABLES = {
     "`topology`": spec_keys.TOPOLOGY_KEYS,
     "Each of `gateways`": spec_keys.GATEWAY_KEYS,
     "Each of `robots`": spec_keys.ROBOT_KEYS,
+    "`metrics`": spec_keys.METRICS_KEYS,
 }
 
 

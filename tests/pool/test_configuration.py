@@ -11,6 +11,7 @@ import pytest
 from fogft.core.model import Offer, Placement, ReplicaId
 from fogft.core.planner import PlannedLaunch
 from fogft.core.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
+from fogft.core.spec_choices import MetricsSpec
 from fogft.pool import configuration, credentials
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import Identity
@@ -55,6 +56,22 @@ def test_the_client_proxy_reads_what_was_written(paths: PoolPaths) -> None:
     assert (config.lease, config.lock) == (paths.lease, paths.proxy_lock)
     assert config.credentials.key == paths.credentials / "robot.key"
     assert not configuration.write_proxy_config(paths, identity(paths.folder), spec())
+
+
+def test_where_each_process_answers_prometheus_is_passed_on(paths: PoolPaths) -> None:
+    """To this machine's robot and to each replica; another robot's is not this machine's to say."""
+    asked = dataclasses.replace(spec(), metrics=MetricsSpec("h:1", "h:2", "h:9470"))
+    configuration.write_proxy_config(paths, identity(paths.folder), asked)
+    assert read_client(paths.proxy_config).metrics == "h:1"
+    assert read_client(paths.proxy_config, "h:9").metrics == "h:9"
+    other = configuration.proxy_config(paths, identity(paths.folder), asked, robot="other")
+    (paths.folder / "other.yaml").write_text(other)
+    assert read_client(paths.folder / "other.yaml").metrics == ""
+    id = ReplicaId(UID, 3, 1)
+    (paths.folder / "r.yaml").write_text(
+        configuration.replica_config(identity(paths.folder), asked, id)
+    )
+    assert read_server(paths.folder / "r.yaml").metrics == "h:9473"
 
 
 @pytest.mark.parametrize("run", ["exec serve", NASTY, "yes", "1", "null", ""])

@@ -1,0 +1,194 @@
+"""The node of a proxy that people see: `/diagnostics`, parameters, and its log on `/rosout`.
+
+An ordinary rclpy node on an executor and a thread of its own, in the context of the node that
+takes requests. Other threads only put work into its queue, so nothing here ever stands in a
+request's way, and whatever goes wrong here is logged and ends there.
+
+Owns: that node and its thread. Not here: what is said (`fogft.proxy.seen_from_ros`), the log
+(`ros_log`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.ros.port import Status
+from fogft.ros.ros_log import RosLog
+
+log = logging.getLogger(__name__)
+
+TOPIC = "/diagnostics"
+_LOOK_EVERY_S = 1.0
+_CLOSE_LIMIT_S = 5.0
+
+
+class VisibleNode:
+    """A node for people's tools.
+
+    Args:
+        name: The node's name.
+        context: That of the proxy's own node: `SerialisedNode.context`.
+        judge: Takes parameters that somebody sets, and returns why not; empty where they hold
+            from now on. Called by this node's thread.
+
+    Raises:
+        RosError: ROS refuses the node.
+    """
+
+    def __init__(
+        self, name: str, context: Any, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
+    ) -> None:
+        self._judge = judge
+        self._closing = False
+        self._queue: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._shown: frozenset[str] = frozenset()
+        self._awake = False
+        self._ours = False  # whether we are changing parameters ourselves
+        try:
+            self._start(name, context)
+        except Exception as error:
+            raise RosError(f"the ROS node `{name}` cannot be made: {error}") from error
+        self._thread = threading.Thread(target=self._run, name=f"ros-{name}", daemon=True)
+        self._thread.start()
+
+    def _start(self, name: str, context: Any) -> None:
+        from rclpy.executors import SingleThreadedExecutor
+
+        self._node: Any = _new_node(name, context)
+        self._executor: Any = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._node)
+        self._diagnostics: Any = _diagnostics_publisher(self._node)
+        self._node.add_on_set_parameters_callback(self._on_set)
+        self._log = RosLog(self._node.get_logger(), self._wake)
+
+    # -- any thread -----------------------------------------------------------------------
+
+    def diagnose(self, statuses: Sequence[Status]) -> None:
+        """Publish statuses on `/diagnostics`, where that can be."""
+        if self._diagnostics is not None:
+            self._put(lambda: self._publish(statuses))
+
+    def show(self, values: Mapping[str, Any]) -> None:
+        """Have these parameters with these values, and no others."""
+        self._put(lambda: self._show(dict(values)))
+
+    def _put(self, work: Callable[[], None]) -> None:
+        self._queue.put(work)
+        self._wake()
+
+    def _wake(self) -> None:
+        """End the executor's wait. Only something to do ends it; its guard condition does not."""
+        if not self._awake:
+            self._awake = True
+            self._executor.create_task(_nothing)
+
+    def close(self) -> None:
+        """Leave ROS; before the context ends. Repeatable."""
+        if not self._closing:
+            self._closing = True
+            self._put(lambda: None)
+            self._thread.join(_CLOSE_LIMIT_S)
+
+    # -- its own thread -------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while not self._closing:
+                self._awake = False  # before looking: what comes after that wakes us again
+                self._work()
+                self._log.pass_on()
+                self._executor.spin_once(timeout_sec=_LOOK_EVERY_S)
+        except Exception:
+            log.exception("visible_node_ended")
+        finally:
+            self._log.close()
+            self._executor.shutdown(timeout_sec=0)
+            self._node.destroy_node()
+
+    def _work(self) -> None:
+        while True:
+            try:
+                work = self._queue.get_nowait()
+            except Empty:
+                return
+            try:
+                work()
+            except Exception as error:
+                log.error("visible_node_failed reason=%r", str(error))
+
+    def _publish(self, statuses: Sequence[Status]) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [
+            DiagnosticStatus(
+                level=bytes([one.level]),
+                name=one.name,
+                message=one.message,
+                hardware_id=one.hardware_id,
+                values=[KeyValue(key=key, value=value) for key, value in one.values.items()],
+            )
+            for one in statuses
+        ]
+        self._diagnostics.publish(message)
+
+    def _show(self, values: Mapping[str, Any]) -> None:
+        from rcl_interfaces.msg import ParameterDescriptor
+        from rclpy.parameter import Parameter
+
+        # Dynamic: `timeout_s 3` is as good as 3.0, and a wrong type is refused in our words.
+        about = ParameterDescriptor(
+            description="As in the pool file; holds until that changes it.", dynamic_typing=True
+        )
+        self._ours = True
+        try:
+            for name in self._shown - values.keys():
+                self._node.undeclare_parameter(name)
+            for name in values.keys() - self._shown:
+                self._node.declare_parameter(name, values[name], about)
+            self._shown = frozenset(values)
+            stale = [n for n in values if self._node.get_parameter(n).value != values[n]]
+            self._node.set_parameters([Parameter(name, value=values[name]) for name in stale])
+        finally:
+            self._ours = False
+
+    def _on_set(self, parameters: Sequence[Any]) -> Any:
+        from rcl_interfaces.msg import SetParametersResult
+
+        given = {p.name: p.value for p in parameters if p.name in self._shown}
+        reason = "" if self._ours or not given else self._judge(given)
+        return SetParametersResult(successful=not reason, reason=reason)
+
+
+def _nothing() -> None:
+    """Do nothing, on the executor."""
+
+
+def _new_node(name: str, context: Any) -> Any:
+    import rclpy
+
+    usual: dict[str, Any] = {"context": context, "use_global_arguments": False}
+    try:
+        return rclpy.create_node(name, enable_logger_service=True, **usual)
+    except TypeError:  # ROS 2 Humble has no such service
+        return rclpy.create_node(name, **usual)
+
+
+def _diagnostics_publisher(node: Any) -> Any:
+    """Return the publisher of `/diagnostics`, or None where its type is not to be had."""
+    try:
+        from diagnostic_msgs.msg import DiagnosticArray
+    except ImportError as error:
+        log.warning(
+            "diagnostics_off reason=%r hint='install the package diagnostic_msgs "
+            "(ros-diagnostic-msgs, or ros-DISTRO-diagnostic-msgs) and start the proxy again'",
+            str(error),
+        )
+        return None
+    return node.create_publisher(DiagnosticArray, TOPIC, 10)
