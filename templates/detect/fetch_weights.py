@@ -74,7 +74,9 @@ def fetch(folder: Path) -> None:
 def unpacked(index: str, data: bytes) -> dict[str, bytes]:
     """Cut the wanted files out of the packed ones; the index says where each begins and ends."""
     entry = r'"filename":\s*"([^"]+)",\s*"start":\s*(\d+),\s*"end":\s*(\d+)'
-    found = {m[1].rpartition("/")[2]: data[int(m[2]) : int(m[3])] for m in re.finditer(entry, index)}
+    found = {}
+    for each in re.finditer(entry, index):
+        found[each[1].rpartition("/")[2]] = data[int(each[2]) : int(each[3])]
     return {name: part for name, part in found.items() if name in WANTED}
 
 

@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFilter
 SIZE = (640, 480)
 _DARK, _GLASS = (28, 28, 30), (150, 190, 210)
 Box = tuple[float, float, float, float]
+Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -44,15 +45,14 @@ class _Pen:
     def at(self, x: float, y: float) -> tuple[float, float]:
         return self._x + x * self._unit, self._y + y * self._unit
 
-    def polygon(self, points: list[tuple[float, float]], fill: tuple[int, int, int]) -> None:
+    def polygon(self, points: list[Point], fill: tuple[int, int, int]) -> None:
         self._draw.polygon([self.at(*point) for point in points], fill=fill)
 
     def rectangle(
-        self, x0: float, y0: float, x1: float, y1: float, fill: tuple[int, int, int], r: float = 0
+        self, corner: Point, other: Point, fill: tuple[int, int, int], *, r: float = 0
     ) -> None:
-        self._draw.rounded_rectangle(
-            (*self.at(x0, y0), *self.at(x1, y1)), r * self._unit, fill=fill
-        )
+        place = (*self.at(*corner), *self.at(*other))
+        self._draw.rounded_rectangle(place, r * self._unit, fill=fill)
 
     def disc(self, x: float, y: float, r: float, fill: tuple[int, int, int]) -> None:
         self._draw.ellipse((*self.at(x - r, y - r), *self.at(x + r, y + r)), fill=fill)
@@ -61,9 +61,7 @@ class _Pen:
         place = (*self.at(x - r, y - r), *self.at(x + r, y + r))
         self._draw.ellipse(place, outline=_DARK, width=max(2, round(width * self._unit)))
 
-    def line(
-        self, a: tuple[float, float], b: tuple[float, float], width: float, fill: tuple[int, ...]
-    ) -> None:
+    def line(self, a: Point, b: Point, width: float, fill: tuple[int, ...]) -> None:
         ends = (*self.at(*a), *self.at(*b))
         self._draw.line(ends, fill=fill, width=max(1, round(width * self._unit)))
 
@@ -74,14 +72,14 @@ def _laptop(pen: _Pen) -> None:
         wide, left = 5.5 + row * 0.25, 17 - row * 1.5
         for column in range(12):
             x, y = left + column * wide, 47.5 + row * 2.8
-            pen.rectangle(x, y, x + wide * 0.77, y + 2, (30, 30, 30))
-    pen.rectangle(15, 0, 85, 45, _DARK)
-    pen.rectangle(18, 3, 82, 42, (70, 130, 190))
+            pen.rectangle((x, y), (x + wide * 0.77, y + 2), (30, 30, 30))
+    pen.rectangle((15, 0), (85, 45), _DARK)
+    pen.rectangle((18, 3), (82, 42), (70, 130, 190))
 
 
 def _car(pen: _Pen) -> None:
     red = (190, 20, 25)
-    pen.rectangle(0, 17.5, 100, 41, red, 7)
+    pen.rectangle((0, 17.5), (100, 41), red, r=7)
     pen.polygon([(18.6, 18.6), (32.5, 0), (69.7, 0), (86, 18.6)], red)
     pen.polygon([(23, 17.5), (34.4, 3), (50, 3), (50, 17.5)], _GLASS)
     pen.polygon([(52.8, 17.5), (52.8, 3), (67.9, 3), (80, 17.5)], _GLASS)
@@ -96,12 +94,13 @@ def _bicycle(pen: _Pen) -> None:
         pen.ring(x, 40, 20, 2)
         for turn in range(24):
             angle = turn * math.tau / 24
-            pen.line((x, 40), (x + 19 * math.cos(angle), 40 + 19 * math.sin(angle)), 0.25, (90,) * 3)
+            rim = (x + 19 * math.cos(angle), 40 + 19 * math.sin(angle))
+            pen.line((x, 40), rim, 0.25, (90, 90, 90))
     frame = [((20, 40), (35, 12)), ((35, 12), (67.5, 12)), ((67.5, 12), (47.5, 40))]
     frame += [((47.5, 40), (20, 40)), ((47.5, 40), (32.5, 7)), ((80, 40), (66, 5))]
     for a, b in frame:
         pen.line(a, b, 2.3, red)
-    pen.rectangle(25, 5, 40, 8, _DARK, 1.5)
+    pen.rectangle((25, 5), (40, 8), _DARK, r=1.5)
     pen.line((62, 3), (72, 5), 2, _DARK)
 
 

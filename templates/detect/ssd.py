@@ -17,7 +17,7 @@ LABELS = "labels.txt"
 NAME = "SSD-MobileNetV2, Open Images V4, trained"
 SIDE = 300  # pixels of the network's square input
 _GRIDS = (19, 10, 5, 3, 2, 1)
-_SCALES = tuple(0.2 + 0.15 * level for level in range(6)) + (1.0,)
+_SCALES = (0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.0)
 _OVERLAP = 0.5  # two boxes of a class that overlap more are one object
 
 

@@ -24,7 +24,8 @@ WIDTH, HEIGHT, FOVY_DEG = 640, 480, 42.6
 STEP_S = 0.002
 SLICE_S = 0.02  # of simulated time, between two chances to look or to wait
 HOME = (0.5, -0.3, 1.6, 0.3, 0.0, 0.0)
-ABOVE_M = 0.1
+ABOVE = np.array([0.0, 0.0, 0.1])
+TOUCHING = np.array([0.0, 0.0, 0.002])
 SCAN_M = 0.62  # height of the camera when it looks for the box
 DOWN = np.array([0.0, 0.0, -1.0])
 _FOCUS = HEIGHT / 2 / np.tan(np.radians(FOVY_DEG) / 2)
@@ -66,11 +67,11 @@ class Cell:
 
     def above(self, place: np.ndarray) -> Iterator[None]:
         """Bring the cup over a place."""
-        return self._go(self._reach("cup", place + [0, 0, ABOVE_M]), 1.2)
+        return self._go(self._reach("cup", place + ABOVE), 1.2)
 
     def down(self, place: np.ndarray) -> Iterator[None]:
         """Lower the cup onto a place."""
-        return self._go(self._reach("cup", place + [0, 0, 0.002]), 0.8)
+        return self._go(self._reach("cup", place + TOUCHING), 0.8)
 
     def rest(self, seconds: float) -> Iterator[None]:
         """Stay as it is."""
@@ -138,12 +139,24 @@ class Cell:
         camera = self._data.camera("wrist")
         return camera.xmat.reshape(3, 3) @ (np.array([1, -1, -1]) * seen) + camera.xpos
 
+    def in_camera(self, place: np.ndarray) -> np.ndarray:
+        """Return where the wrist camera sees a point of the world: the inverse of `in_world`."""
+        camera = self._data.camera("wrist")
+        turned: np.ndarray = camera.xmat.reshape(3, 3).T @ (place - camera.xpos)
+        return np.array([1, -1, -1]) * turned
+
     def overview(self) -> np.ndarray:
         """Return a picture of the whole cell: 480 x 640 x 3 bytes."""
         camera = mujoco.MjvCamera()
         camera.lookat[:] = [0.4, 0, 0.35]
         camera.distance, camera.elevation, camera.azimuth = 2.3, -25, 150
         return self._draw(camera)
+
+    def close(self) -> None:
+        """Give back what draws the pictures."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     def _draw(self, camera: str | mujoco.MjvCamera) -> np.ndarray:
         if self._renderer is None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from fogft.core.errors import FogftError
 from fogft.pool import init, pool_file, templates
 
-EXAMPLES = ["echo", "planner", "words"]
+EXAMPLES = ["detect", "echo", "pick", "planner", "segment", "words"]
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
 values = st.recursive(
@@ -167,7 +167,7 @@ class TestRefusals:
             "did you mean `planner`?",
         )
         assert self.refuse(tmp_path, "xyz", tmp_path / "a")[1] == (
-            "known here: `echo`, `planner`, `words`"
+            "known here: `detect`, `echo`, `pick`, `planner`, `segment`, `words`"
         )
 
     def test_a_file_is_in_the_way(self, tmp_path):
