@@ -26,6 +26,7 @@ class Launch:
         files: What the machine needs to serve: file name -> content. Holds
             ``replica.yaml``, ``ca.crt``, ``replica.crt`` and ``replica.key``; the
             configuration names the others relative to its own folder. Kept 0600.
+        dials_out: The replica dials its robots: nobody reaches it, so no port need be open.
     """
 
     id: ReplicaId
@@ -35,6 +36,7 @@ class Launch:
     spec_hash: str
     task: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
+    dials_out: bool = False
 
 
 class Cloud(Protocol):

@@ -164,6 +164,7 @@ def build_order(
             "replica.crt": issued.certificate_pem,
             "replica.key": issued.key_pem,
         },
+        dials_out=bool(spec.dial_in),
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fogft.cloud.sky import naming
-from fogft.cloud.sky.following import DEFAULT_LIMITS
+from fogft.cloud.sky.following import DEFAULT_LIMITS, JOB_PAUSE_S
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
@@ -17,6 +17,8 @@ from tests.sky.scripted_sky import EAST, WEST, replica
 
 ID = replica()
 NAME = naming.cluster_name(ID)
+LOOKED_AT = int(JOB_PAUSE_S) + 10
+"""Rounds until a job was asked about."""
 
 
 @pytest.fixture
@@ -173,7 +175,7 @@ def test_a_failed_setup_shows_the_end_of_its_log_and_ends_the_vm(scene: Scene):
     scene.cloud.launch(scene.order())
     scene.sky.job_logs[NAME] = "collecting\nERROR: no such package: yolo\n"
     scene.sky.finish(NAME, JobState.SETUP_FAILED)
-    scene.work()
+    scene.work(LOOKED_AT)
     machine = scene.machine()
     assert machine.failure.startswith("setup: ")
     assert "no such package: yolo" in machine.failure
@@ -184,8 +186,23 @@ def test_a_server_proxy_that_ends_at_once_is_a_failure_with_its_log(scene: Scene
     scene.cloud.launch(scene.order())
     scene.sky.job_logs[NAME] = "error: `replica.yaml`: key 'run' is missing\n"
     scene.sky.finish(NAME, JobState.ENDED)
-    scene.work()
+    scene.work(LOOKED_AT)
     assert "key 'run' is missing" in scene.machine().failure
+
+
+def test_a_job_is_asked_about_seldom(scene: Scene):
+    """Each question is expensive: none before `setup` can have ended, and none after it has."""
+    scene.cloud.launch(scene.order())
+    scene.sky.finish(NAME, JobState.SETTING_UP)
+    scene.work(int(JOB_PAUSE_S))
+    assert not scene.sky.asked("job")
+    scene.work(int(4 * JOB_PAUSE_S))
+    assert 3 <= len(scene.sky.asked("job")) <= 5
+    scene.sky.jobs[NAME] = JobState.RUNNING
+    scene.work(LOOKED_AT)
+    asked = len(scene.sky.asked("job"))
+    scene.work(LOOKED_AT)
+    assert len(scene.sky.asked("job")) == asked
 
 
 def test_a_setup_that_hangs_ends_at_its_own_limit(scene: Scene):
@@ -229,12 +246,22 @@ def test_a_preempted_machine_is_gone_after_a_refresh_of_it_alone(tmp_path: Path,
     assert [m.id for m in scene.machines()] == [replica(1)]
 
 
-def test_a_machine_that_the_provider_still_lists_is_left_alone(scene: Scene):
+@pytest.mark.parametrize("age_s", [0, 60])
+def test_a_machine_that_the_provider_still_lists_is_left_alone(scene: Scene, age_s: int):
     scene.launched()
-    scene.pass_s(60)
+    scene.pass_s(age_s)
     scene.cloud.refresh(ID)
     assert scene.machine().phase is MachinePhase.RUNNING
     assert not scene.sky.asked("refresh")
+
+
+def test_a_machine_that_the_provider_does_not_list_yet_is_asked_about_at_skypilot(scene: Scene):
+    """A provider's list may miss a machine in its first seconds."""
+    scene.cloud.launch(scene.order())
+    scene.provider.found.clear()
+    scene.cloud.refresh(ID)
+    assert scene.sky.asked("refresh") == [NAME]
+    assert scene.machine().phase is MachinePhase.PROVISIONING
 
 
 def test_a_provider_that_may_not_be_asked_leaves_the_refresh_to_skypilot(scene: Scene):

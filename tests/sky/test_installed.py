@@ -254,6 +254,37 @@ def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: P
 
 
 @needs_skypilot
+def test_an_image_of_the_users_own_is_one_that_skypilot_takes(home: Path, tmp_path: Path):
+    """A container's image, and an image of the cloud."""
+    import sky
+
+    for image in ("docker:ros:jazzy", "docker:registry.example.org/team/robot:1", "ami-1e749f67"):
+        asked = {"resources": {"infra": "aws/us-east-1", "image_id": image}}
+        built = task.build(
+            Scene(tmp_path).order(task=asked), template.read(), files=tmp_path, wheel=tmp_path,
+            owner="ann", base=tmp_path,
+        )  # fmt: skip
+        (resources,) = sky.Task.from_yaml_config(built).resources
+        container = image.removeprefix("docker:") if image.startswith("docker:") else None
+        assert resources.extract_docker_image() == container
+        assert container or resources.image_id == {"us-east-1": image}
+        assert resources.ports == ["7447"], "SkyPilot's containers share the machine's network"
+
+
+@needs_skypilot
+def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: Path):
+    """That of a replica that dials out."""
+    import sky
+
+    built = task.build(
+        Scene(tmp_path).order(dials_out=True), template.read(), files=tmp_path, wheel=tmp_path,
+        owner="ann", base=tmp_path,
+    )  # fmt: skip
+    (resources,) = sky.Task.from_yaml_config(built).resources
+    assert resources.ports is None
+
+
+@needs_skypilot
 def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, Any, Any]):
     """With no network the catalogue's zones have ids, not names: then the region is the offer."""
     installed, _, _ = real

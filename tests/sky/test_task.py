@@ -17,8 +17,10 @@ from fogft.core.model import Placement
 from tests.sky.scripted_sky import EAST, WEST, replica
 
 
-def built(asked: Mapping[str, Any], place: Placement = EAST) -> dict[str, Any]:
-    order = Launch(replica(3, 7), "perception", place, 0.021, "abcd", asked)
+def built(
+    asked: Mapping[str, Any], place: Placement = EAST, *, dials_out: bool = False
+) -> dict[str, Any]:
+    order = Launch(replica(3, 7), "perception", place, 0.021, "abcd", asked, dials_out=dials_out)
     return task.build(
         order,
         template.read(),
@@ -139,6 +141,19 @@ def test_a_single_node_is_what_a_pool_means_anyway():
     assert "num_nodes" not in built({"num_nodes": 1})
 
 
+def test_a_replica_that_dials_out_opens_no_port():
+    """Nor does it listen where another machine could reach it."""
+    made = built({"resources": {"infra": "aws"}}, dials_out=True)
+    assert "ports" not in made["resources"]
+    assert "--listen 127.0.0.1:7447 " in made["run"]
+    assert "--listen 0.0.0.0:7447 " in built({})["run"]
+
+
+def test_no_mark_of_the_template_is_left():
+    made = built({"setup": "colcon build"})
+    assert "@" not in made["setup"].replace("colcon build", "") + made["run"]
+
+
 def test_the_order_is_not_changed_by_building_it():
     asked = {"resources": {"labels": {"a": "b"}}, "file_mounts": {"/m": "m"}}
     before = repr(asked)
@@ -176,6 +191,7 @@ def shell(home: Path, script: str, **environ: str) -> subprocess.CompletedProces
         text=True,
         timeout=60,
         check=False,
+        start_new_session=True,  # as SkyPilot does
     )
 
 
@@ -190,6 +206,38 @@ def test_a_failing_setup_of_the_pool_file_fails_the_whole(vm: Path):
     done = shell(vm, built({"setup": "echo before\nexit 3"})["setup"])
     assert done.returncode != 0
     assert "the pool file's setup failed" in done.stdout
+
+
+HANGING = """\
+setsid sleep 86400 &
+echo $! > ~/apart
+sleep 86400 & sleep 86400
+touch ~/went-on
+"""
+
+
+def test_a_hanging_setup_is_ended_by_the_machine_itself(vm: Path):
+    """No manager is needed; what it started is killed too, a session of its own included.
+
+    `shell` returns only when nobody holds the pipe any more, as SkyPilot does.
+    """
+    script = built({"setup": HANGING})["setup"]
+    limit = f"read -rt {task.SETUP_LIMIT_S} "
+    assert limit in script
+    done = shell(vm, script.replace(limit, "read -rt 1 "))
+    assert done.returncode != 0
+    assert "the set-up took more than 3600 s" in done.stdout
+    assert not (vm / "went-on").exists()
+    apart = int((vm / "apart").read_text())
+    state = Path(f"/proc/{apart}/stat")
+    assert not state.exists() or ") Z " in state.read_text(), "what it started lives on"
+
+
+def test_a_setup_that_ends_in_time_leaves_no_guard_behind(vm: Path):
+    """It would hold the pipe for an hour, and the job with it."""
+    done = shell(vm, built({"setup": "true"})["setup"])
+    assert done.returncode == 0, done.stderr
+    assert "took more than" not in done.stdout
 
 
 @pytest.fixture

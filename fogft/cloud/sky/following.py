@@ -20,15 +20,17 @@ from fogft.cloud.sky.failures import Cause, Failure, classify, tail
 from fogft.cloud.sky.journal import Entry, Journal, Stage
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
+from fogft.cloud.sky.task import SETUP_LIMIT_S
 from fogft.core.errors import CloudError, CloudUnreachable
 from fogft.core.model import ReplicaId
 
 log = logging.getLogger(__name__)
 
-JOB_PAUSE_S = 10.0
-"""Shortest pause between two questions about a job. For each SkyPilot runs a program on the
-machine over ssh, in one of its few workers: others wait meanwhile, so the pause grows with the
-time that an answer takes."""
+JOB_PAUSE_S = 20.0
+"""Shortest pause before and between questions about a job. For each SkyPilot runs three programs
+on the machine over ssh, in one of its few workers, and holds up whoever wants something of the
+same machine: it takes some ten seconds of processor time. So nobody asks before `setup` can have
+ended, and the pause grows with the time that an answer takes."""
 
 UNDER_WAY = frozenset({Stage.ASKING, Stage.LAUNCHING, Stage.SETTING_UP})
 
@@ -45,7 +47,7 @@ class Limits:
 
     ask_s: float = 180.0
     launch_s: float = 900.0
-    setup_s: float = 3600.0
+    setup_s: float = SETUP_LIMIT_S
 
 
 DEFAULT_LIMITS = Limits()
@@ -134,7 +136,7 @@ class Following:
 
     def _setting_up(self, entry: Entry) -> None:
         asked_at = self._clock()
-        if asked_at < self._job_not_before.get(entry.id, 0.0):
+        if asked_at < self._job_not_before.setdefault(entry.id, asked_at + JOB_PAUSE_S):
             return
         try:
             job = self._sky.job(cluster_name(entry.id), entry.job)

@@ -91,10 +91,10 @@ class Presence:
     def refresh(self, id: ReplicaId) -> None:
         """Ask the cloud about one machine. See `SkyCloud.refresh`."""
         entry = self._journal.get(id)
-        old = entry is not None and self._clock() - entry.launched_at > PROVIDER_SURE_AFTER_S
-        if entry is not None and old and self._census.vouches(entry.placement.cloud):
+        if entry is not None and self._census.vouches(entry.placement.cloud):
             gone = self._census.alive(entry) is None
-            if self._census.vouches(entry.placement.cloud):
+            sure = self._clock() - entry.launched_at > PROVIDER_SURE_AFTER_S or not gone
+            if sure and self._census.vouches(entry.placement.cloud):
                 if gone and entry.stage in _ON_THE_MACHINE:
                     self._is_gone(entry)
                     self._submit(lambda: self._drop_record(id))

@@ -22,6 +22,9 @@ from fogft.core.errors import SpecError
 from fogft.core.model import Placement
 
 LINK_PORT = 7447
+SETUP_LIMIT_S = 3600
+"""How long a machine's set-up may take. Seconds; kept by the machine itself, and by who follows
+its launch."""
 OURS = "~/.fogft"
 _PLACE = ("infra", "cloud", "region", "zone")
 _CHOICES = (*_PLACE, "any_of", "ordered", "instance_type", "use_spot", "accelerators")
@@ -90,8 +93,17 @@ def build(
     """
     refuse_what_cannot_be_honoured(order.task)
     setup = str(order.task.get("setup") or ":").rstrip()
-    marks = {"@FILES@": str(files), "@WHEEL@": str(wheel), "@PORT@": str(port), "@SETUP@": setup}
+    marks = {
+        "@FILES@": str(files),
+        "@WHEEL@": str(wheel),
+        "@PORT@": str(port),
+        "@LISTEN@": f"{'127.0.0.1' if order.dials_out else '0.0.0.0'}:{port}",
+        "@SETUP_LIMIT_S@": str(SETUP_LIMIT_S),
+        "@SETUP@": setup,  # the user's text last, as it is
+    }
     ours = _filled(template, marks)
+    if order.dials_out:
+        del ours["resources"]["ports"]
     task = copy.deepcopy({k: v for k, v in order.task.items() if k != "num_nodes"})
     task["name"] = order.pool
     task["setup"], task["run"] = ours["setup"], ours["run"]
@@ -172,6 +184,6 @@ def _filled(value: Any, marks: Mapping[str, str]) -> Any:
         return [_filled(inner, marks) for inner in value]
     if not isinstance(value, str):
         return value
-    for mark in ("@FILES@", "@WHEEL@", "@PORT@", "@SETUP@"):  # the user's text last, as it is
-        value = value.replace(mark, marks[mark])
+    for mark, meant in marks.items():
+        value = value.replace(mark, meant)
     return value
