@@ -33,8 +33,8 @@ def robot(pool: Pool, name: str, kind: str, seconds: float = 20) -> dict:
 
 
 def own(services: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Leave out what every node of rclpy has, the asking one too."""
-    return {n: t for n, t in services.items() if not n.startswith("/robot/")}
+    """Leave out what every node of rclpy has: the asking one, and the proxy's visible one."""
+    return {n: t for n, t in services.items() if not n.startswith(("/robot/", "/fogft_"))}
 
 
 def test_the_robot_is_offered_what_run_advertises(pool: Pool):
