@@ -262,6 +262,9 @@ class Caller:
         end = time.monotonic() + limit_s
         while self._open and time.monotonic() < end:
             self.spin(0.05)
+        if self._open or self.wrong:
+            asked = f"{self._asked} asked, {self.right} right"
+            print(f"{asked}, unanswered: {sorted(self._open)}, wrong: {self.wrong}")
         return not self._open and not self.wrong
 
     def close(self) -> None:

@@ -25,6 +25,9 @@ from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 environment.prepare(os.environ)
 
+# Requests go on while no replica can answer: the service must not be withdrawn meanwhile.
+SERVICES = "[{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 45.0, advertise: once_ready}]"
+
 
 @dataclass(frozen=True)
 class Files:
@@ -43,7 +46,7 @@ class Pool(Parts):
     """Robots and replicas that are told of nothing but a rendezvous; the test is the manager."""
 
     def __init__(self, folder: Path, domain: Callable[[], int]) -> None:
-        super().__init__(folder, domain)
+        super().__init__(folder, domain, services=SERVICES)
         self.meeting = free_endpoint()
         self.issue(names.rendezvous_certificate_name(UID, "a"), Role.RENDEZVOUS, "rendezvous")
         self.issue(names.manager_certificate_name(UID), Role.MANAGER, "manager")
