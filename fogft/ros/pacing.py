@@ -7,6 +7,8 @@ takes, but a client that asks again after it was answered does. So `WINDOW` resp
 on their way to a client; each request of one that has no more open than it usually has, or
 else each `EVERY_S`, makes room for another. A client that proves quick gets a wider window.
 
+A response to a client that discovery has not found yet is sent again until it has.
+
 Owns: when a response is sent. Not here: sending it (`entities`).
 """
 
@@ -20,6 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fogft.core.errors import RosError
+from fogft.ros.port import NotFoundYet
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +32,8 @@ EVERY_S = 0.005  # so a burst may meet a client that takes nothing for 25 ms
 _QUIET_S = 0.05  # after so long without a request a client must prove anew that it is quick
 _USUAL_GROWS = 4  # each `EVERY_S`, and by a twentieth of what is open: faster is a burst
 _CLIENTS_KEPT = 64
+# A client may ask before discovery has told the way back to it. ROS waits 0.1 s a try.
+_FIND_LIMIT_S = 10.0
 _GUID_BYTES = 16
 
 
@@ -103,6 +108,7 @@ class Pacer:
         self._clock = clock
         self._paces: dict[bytes, Pace] = {}
         self._held: dict[bytes, Pace] = {}  # those whose responses wait
+        self._again: list[tuple[Any, bytes, float]] = []  # with when to give up
         self._wake = threading.Condition()
         self._thread: threading.Thread | None = None  # made when the first response waits
         self._closed = False
@@ -132,7 +138,17 @@ class Pacer:
                 self._held[client] = pace
                 self._begin()
                 return
-        self._send(handle, payload)
+        self._try(handle, payload, now + _FIND_LIMIT_S)
+
+    def _try(self, handle: Any, payload: bytes, give_up_at: float) -> None:
+        try:
+            self._send(handle, payload)
+        except NotFoundYet:
+            if self._clock() >= give_up_at:
+                raise
+            with self._wake:
+                self._again.append((handle, payload, give_up_at))
+                self._begin()
 
     def _new(self, client: bytes, now: float) -> Pace:
         if len(self._paces) >= _CLIENTS_KEPT:
@@ -152,24 +168,26 @@ class Pacer:
     def _run(self) -> None:
         while True:
             with self._wake:
+                if self._again and not self._closed:
+                    self._wake.wait(EVERY_S)
                 while not (due := self._due()) and not self._closed:
                     now = self._clock()
                     waits = [pace.wait_s(now) for pace in self._held.values()]
                     self._wake.wait(min(waits, default=None))
                 if self._closed:
                     return
-            for handle, payload in due:
+            for handle, payload, give_up_at in due:
                 try:
-                    self._send(handle, payload)
+                    self._try(handle, payload, give_up_at)
                 except RosError as error:
                     log.warning("response_refused reason=%r", error.message)
 
-    def _due(self) -> list[tuple[Any, bytes]]:
+    def _due(self) -> list[tuple[Any, bytes, float]]:
         now = self._clock()
-        due = []
+        due, self._again = self._again, []
         for client, pace in list(self._held.items()):
             while pace.waiting and pace.take(now):
-                due.append(pace.waiting.popleft())
+                due.append((*pace.waiting.popleft(), now + _FIND_LIMIT_S))
             if not pace.waiting:
                 del self._held[client]
         return due

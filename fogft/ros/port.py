@@ -21,6 +21,10 @@ class Unreadable(RosError):
     """These bytes are no message of the type: sending them again cannot help."""
 
 
+class NotFoundYet(RosError):
+    """Discovery does not know yet the way to who asked: sending again may help."""
+
+
 class RosServer(Protocol):
     """A service that this node offers."""
 

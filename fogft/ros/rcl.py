@@ -33,6 +33,7 @@ from typing import Any
 from fogft.core.errors import RosError
 
 OK = 0
+TIMEOUT = 2  # of a response: whoever asked is not known yet, and was waited for
 CLIENT_TAKE_FAILED = 501  # nothing was there to take
 SERVICE_TAKE_FAILED = 601
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from fogft.core.errors import RosError
 from fogft.ros import rcl
-from fogft.ros.port import Unreadable
+from fogft.ros.port import NotFoundYet, Unreadable
 
 LARGE_BYTES = 256 * 1024
 ENCAPSULATION_BYTES = 4  # the shortest CDR there is: its header
@@ -107,6 +107,8 @@ class _End:
 
     def _check_sent(self, code: int, what: str) -> None:
         self._refused = code != rcl.OK
+        if code == rcl.TIMEOUT:
+            raise NotFoundYet(f"a {what} cannot be sent: {rcl.error_text()}")
         if self._refused:
             raise RosError(f"a {what} cannot be sent: {rcl.error_text()}")
 

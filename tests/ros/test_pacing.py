@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.core.errors import RosError
 from fogft.ros.pacing import EVERY_S, WINDOW, WINDOW_LIMIT, Pace, Pacer
+from fogft.ros.port import NotFoundYet
 
 ORDINARY = 10  # responses that a client with the default quality of service keeps
 
@@ -151,3 +152,39 @@ def test_clients_that_are_gone_are_forgotten():
         pacer.respond(handle(client, 0), b"")
     assert len(pacer._paces) <= 64
     pacer.close()
+
+
+def test_a_response_to_a_client_that_is_not_found_yet_is_sent_again():
+    """Once and no more, when discovery has told the way to it; others are not held up."""
+    sent: list[bytes] = []
+    tries: list[bytes] = []
+    found = threading.Event()
+
+    def send(handle: bytes, payload: bytes) -> None:
+        tries.append(payload)
+        if payload == b"early" and len(tries) < 4:
+            raise NotFoundYet("client will not receive response")
+        sent.append(payload)
+        if payload == b"early":
+            found.set()
+
+    pacer = Pacer(send)
+    pacer.respond(bytes(24), b"early")
+    pacer.respond(bytes(range(24)), b"other")
+    assert found.wait(30)
+    pacer.close()
+    assert sorted(sent) == [b"early", b"other"]
+
+
+def test_a_client_that_is_never_found_is_given_up():
+    """And whoever wants to know is told."""
+    now = 0.0
+
+    def send(handle: bytes, payload: bytes) -> None:
+        nonlocal now
+        now += 1.0
+        raise NotFoundYet("client will not receive response")
+
+    pacer = Pacer(send, clock=lambda: now)
+    with pytest.raises(NotFoundYet):
+        pacer._try(bytes(24), b"early", 0.5)
