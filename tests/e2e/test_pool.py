@@ -18,24 +18,25 @@ def flawless(result: dict) -> bool:
 
 @pytest.mark.parametrize("seed", [20261])
 def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
-    """30 s of requests under kills and freezes, one replica always spared at a time."""
+    """Requests for 26 s and more under kills and freezes, one replica always spared at a time."""
     pool.up()
-    client = pool.client(30, 25)
+    client = pool.client(120, 25)
     chance = random.Random(seed)
     end = time.monotonic() + 26
     faults = []
-    while time.monotonic() < end:
+    while time.monotonic() < end or len({kind for kind, _ in faults}) < 2:
         ready = [r["slot"] for r in pool.status()["replicas"] if r["phase"] == "ready"]
         if len(ready) > 1:
             slot, kind = chance.choice(ready), chance.choice(["kill", "freeze"])
+            if len(faults) == 1:  # both kinds, however few there is time for
+                kind = "kill" if faults[0][0] == "freeze" else "freeze"
             pool.fogft("chaos", kind, str(slot))
             faults.append((kind, slot))
             if kind == "freeze" and chance.random() < 0.5:
                 time.sleep(chance.uniform(1, 4))
                 pool.fogft("chaos", "thaw", str(slot), ok=False)
         time.sleep(chance.uniform(0.5, 2.0))
-    result = client.result()
-    assert {kind for kind, _ in faults} == {"kill", "freeze"}
+    result = client.finish()
     assert result["requests"] > 500
     assert flawless(result), (result, faults)
     pool.wait(lambda: pool.ready() == 3)
