@@ -10,6 +10,7 @@ Not here: why a replica should go (`planner`, `health`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -82,6 +83,11 @@ class Standing:
     def draining_since(self) -> float | None:
         """When it was marked to go."""
         return self.record.draining_since if self.record is not None else None
+
+    @property
+    def marked_at(self) -> float:
+        """When it was marked to go; infinity for never: who was marked first goes first."""
+        return math.inf if self.draining_since is None else self.draining_since
 
 
 @dataclass
@@ -193,26 +199,28 @@ def choose_endings(
         (s for s in census.replaced if s is not first and s.id not in held),
         key=lambda s: (
             s.judged.may_serve,
-            s.draining_since is None,
+            s.marked_at,
             s.slot not in ready_slots,
             s.id,
         ),
     )
-    chooser.end_some(replaced, left, "replaced")
+    ended = chooser.out.ids
+    coming = sum(not s.ever_ready for s in census.good if s.id not in ended)
+    chooser.end_some(replaced, left, "replaced", coming=coming)
     return chooser.out
 
 
 def _by_expendability(standings: Iterable[Standing], *, dear_first: bool) -> list[Standing]:
-    """Not serving first, then already draining, then the most crowded domain, then the top slot."""
+    """Not serving first, then who drains longest, then the most crowded domain, then the top slot."""
     standings = list(standings)
     count = crowding(s.judged.machine.placement for s in standings)
 
-    def rank(s: Standing) -> tuple[bool, bool, bool, float, int, int, int, int, int]:
+    def rank(s: Standing) -> tuple[bool, bool, float, float, int, int, int, int, int]:
         cloud, region, zone = domains(s.judged.machine.placement)
         return (
             s.judged.may_serve,
             s.judged.serving,
-            s.draining_since is None,
+            s.marked_at,
             -s.usd_per_hour if dear_first else 0.0,
             -count[cloud],
             -count[region],
@@ -249,13 +257,21 @@ class _Chooser:
             )
         )
 
-    def end_some(self, standings: Iterable[Standing], count: int, reason: str) -> None:
-        """End up to `count`, in order, where the law allows it."""
+    def end_some(
+        self, standings: Iterable[Standing], count: int, reason: str, *, coming: int = 0
+    ) -> None:
+        """End up to `count`, in order, where the law allows it.
+
+        Args:
+            coming: So many of those that are counted have yet to serve. While they are needed,
+                one that should come back stays: its successor may never come.
+        """
         for standing in standings:
             if count <= 0:
                 return
             others = len(self._pillars - {standing.id})
-            if standing.judged.may_serve and others < self._wanted:
+            is_missed = standing.judged.may_serve or count <= coming
+            if is_missed and others < self._wanted:
                 continue
             count -= 1
             self.counted_out += 1

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -37,6 +37,7 @@ class EventKind(str, Enum):
 
 
 CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
+_ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,23 @@ class History:
             self._open[key] = record
         else:
             self._open.pop(key, None)
+
+    def followed_by(self, events: Iterable[Event]) -> History:
+        """Return this history with launches and marks added; it stays as it is itself."""
+        later = History()
+        later._records, later._open = dict(self._records), dict(self._open)
+        later._generations = dict(self._generations)
+        # Launches and marks change none of these.
+        later._failures, later._proven_at = self._failures, self._proven_at
+        later._losses = self._losses
+        for event in events:
+            if event.kind not in _ORDERS:
+                raise ValueError(f"`{event.kind.value}` is none of our own orders")
+            key = (event.slot, event.generation)
+            if key in later._records:
+                later._records[key] = replace(later._records[key])
+            later.add(event)
+        return later
 
     def _update(self, record: Record, event: Event) -> None:
         kind = event.kind

@@ -27,10 +27,13 @@ from fogft.core.needs import Need, home, needed_launches, part
 from fogft.core.placement import EPSILON_USD
 from fogft.core.sizing import Size, size
 from fogft.core.spec import PoolSpec
+from fogft.core.under_way import under_way
 
 __all__ = ["Plan", "PlannedEnd", "PlannedLaunch", "plan"]
 
 DRAIN_LIMIT_S = 10.0
+# A plan is planned on again so often; two passes are what nearly every world needs.
+MOST_PASSES = 8
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,9 @@ def plan(
 ) -> Plan:
     """Return what brings the pool closer to what is wanted, within the safety laws.
 
+    It is planned again on the world as it is once a plan is under way, until nothing is added: a
+    launch makes a replica superfluous, an ending leaves another one the last of its region.
+
     Args:
         pool_uid: Machines of other pools are ignored.
         spec: The pool file.
@@ -79,6 +85,52 @@ def plan(
         history: What happened before.
         drain_limit_s: The longest that a replica to be ended is waited for.
     """
+    decided = latest = _plan_once(pool_uid, spec, intent, observed, history, drain_limit_s)
+    if observed.machines is None:
+        return decided
+    for _ in range(MOST_PASSES):
+        if not _changes(latest, history):
+            break
+        world, memory = under_way(
+            pool_uid,
+            spec,
+            observed,
+            history,
+            launches=decided.launches,
+            ends={end.id for end in decided.terminations},
+            draining=decided.draining,
+        )
+        latest = _plan_once(pool_uid, spec, intent, world, memory, drain_limit_s)
+        is_done = not latest.launches and not latest.terminations
+        is_done = is_done and set(latest.draining) == set(decided.draining)
+        decided = replace(
+            decided,
+            launches=decided.launches + latest.launches,
+            terminations=decided.terminations + latest.terminations,
+            draining=latest.draining,
+            notes=tuple(dict.fromkeys(decided.notes + latest.notes)),
+        )
+        if is_done:
+            break
+    return decided
+
+
+def _changes(decided: Plan, history: History) -> bool:
+    """Whether a plan makes any difference to what the next one is based on."""
+    if decided.launches or decided.terminations:
+        return True
+    marked = {(r.slot, r.generation) for r in history.open() if r.draining_since is not None}
+    return not marked.issuperset((id.slot, id.generation) for id in decided.draining)
+
+
+def _plan_once(
+    pool_uid: str,
+    spec: PoolSpec,
+    intent: Intent,
+    observed: Observed,
+    history: History,
+    drain_limit_s: float,
+) -> Plan:
     if observed.machines is None:
         known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
         return Plan(known, notes=("the cloud cannot be reached: nothing is changed",))
