@@ -211,7 +211,7 @@ def choose_endings(
 
 
 def _by_expendability(standings: Iterable[Standing], *, dear_first: bool) -> list[Standing]:
-    """Not serving first, then who drains longest, then the most crowded domain, then the top slot."""
+    """Sort: not serving, then longest draining, then most crowded domain, then highest slot."""
     standings = list(standings)
     count = crowding(s.judged.machine.placement for s in standings)
 

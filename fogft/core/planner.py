@@ -12,6 +12,7 @@ is missing (`needs`), where it goes (`buying`, `placement`), who moves (`migrati
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -85,7 +86,8 @@ def plan(
         history: What happened before.
         drain_limit_s: The longest that a replica to be ended is waited for.
     """
-    decided = latest = _plan_once(pool_uid, spec, intent, observed, history, drain_limit_s)
+    step = functools.partial(_plan_once, pool_uid, spec, intent, drain_limit_s=drain_limit_s)
+    decided = latest = step(observed, history)
     if observed.machines is None:
         return decided
     for _ in range(MOST_PASSES):
@@ -100,7 +102,7 @@ def plan(
             ends={end.id for end in decided.terminations},
             draining=decided.draining,
         )
-        latest = _plan_once(pool_uid, spec, intent, world, memory, drain_limit_s)
+        latest = step(world, memory)
         is_done = not latest.launches and not latest.terminations
         is_done = is_done and set(latest.draining) == set(decided.draining)
         decided = replace(
@@ -129,6 +131,7 @@ def _plan_once(
     intent: Intent,
     observed: Observed,
     history: History,
+    *,
     drain_limit_s: float,
 ) -> Plan:
     if observed.machines is None:
