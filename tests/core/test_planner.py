@@ -156,6 +156,13 @@ def test_unready_service_is_never_taken_for_a_failed_launch() -> None:
     assert (launches(world), ends(world)) == ([], [])
 
 
+def test_silence_counts_more_than_what_was_said_before_it() -> None:
+    """Two that disagreed and fell silent are lost, and do not block each other's replacement."""
+    mute = [replica(n, state="silent", silent_s=60, disagrees=True) for n in (0, 1)]
+    world = World(spec(3)).having(*mute, replica(2))
+    assert launches(world) == ["0.2", "1.2"]
+
+
 def test_service_that_stays_away_is_replaced_new_before_old() -> None:
     """A service away past `start_limit_s`, while another replica serves, is replaced."""
     world = World(spec(2)).having(replica(0), replica(1, state="unready", age_s=900, unready_s=301))
