@@ -201,17 +201,16 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     # A mark of our own comes back in the report: it is not the replica's wish.
     if link is not None and link.draining and not (record and record.draining_since):
         return Verdict.LEAVING, "it asked to be left alone"
-    heard = link is not None and was_heard(link, record)
-    if link is not None and context.may_doubt and heard and link.state is not LinkState.UP:
-        if link.silent_for_s > context.patience_s:  # before all doubts about what it said earlier
-            return Verdict.UNRESPONSIVE, f"silent for {link.silent_for_s:.0f} s"
+    silent = link is not None and was_heard(link, record) and link.state is not LinkState.UP
+    if link is not None and silent and context.may_doubt and link.silent_for_s > context.patience_s:
+        return Verdict.UNRESPONSIVE, f"silent for {link.silent_for_s:.0f} s"
     if link is not None and link.disagrees and context.may_doubt:
         return Verdict.DISAGREES, "its answers differ from those of the others"
     if serving and link is not None and link.at_risk and _has_settled(record, now):
         return Verdict.AT_RISK, "the cloud recommends to move it (rebalance)"
     if serving or not context.may_doubt:
         return Verdict.GOOD, ""
-    if link is not None and heard and link.state is not LinkState.UP:
+    if silent:
         return Verdict.GOOD, ""
     if record is None or record.first_ready_at is None:
         since = machine.launched_at if record is None else record.launched_at
