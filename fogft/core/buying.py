@@ -9,7 +9,7 @@ Not here: the order among offers (`placement`) and what is needed (`needs`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fogft.core.endings import Census, Standing
@@ -20,7 +20,14 @@ from fogft.core.intent import Intent
 from fogft.core.model import Observed, Offer, Placement
 from fogft.core.needs import Need, home
 from fogft.core.placement import Choice, Market, is_possible
-from fogft.core.quarantine import avoided, resting
+from fogft.core.quarantine import (
+    EVERYWHERE,
+    Backoff,
+    avoided,
+    disappointing,
+    rested_longest,
+    resting,
+)
 from fogft.core.score import Scale
 from fogft.core.sizing import sold_to
 from fogft.core.spec import PoolSpec
@@ -69,7 +76,7 @@ class Buyer:
         self._spent = sum(self._price(s) for s in self.census.everyone())
         self._resting = resting(self.history, self.observed.now)
         self._avoided = avoided(self.history, self.observed.now)
-        self._markets: dict[tuple[str, bool | None], Market] = {}
+        self._markets: dict[tuple[str, bool | None, bool], Market] = {}
         self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
         wrong = [o.placement.location for o in self.observed.offers if not is_possible(o)]
         if wrong:
@@ -99,18 +106,38 @@ class Buyer:
         self._spent += choice.offer.usd_per_hour
         return True
 
-    def market(self, group: Group, spot: bool | None) -> Market:
-        """Return what is sold to a group: of one kind only unless `spot` is None."""
-        key = (group.offers, spot)
+    def market(self, group: Group, spot: bool | None, *, at_leisure: bool = False) -> Market:
+        """Return what is sold to a group: of one kind only unless `spot` is None.
+
+        Args:
+            at_leisure: For one that need not be launched: nothing that refused lately is in it.
+        """
+        key = (group.offers, spot, at_leisure)
         if key not in self._markets:
-            self._markets[key] = Market(
-                sold_to(self.observed.offers, group.offers, spot),
-                excluded=self.intent.excluded,
-                resting=self._resting,
-                avoid=(*self._avoided, *(s.location for s in self.census.lost)),
-                scale=self.scale,
-            )
+            resting = self._resting
+            if at_leisure:
+                resting = {**disappointing(self.history, self.observed.now), **resting}
+            self._markets[key] = self._market(group, spot, resting)
         return self._markets[key]
+
+    def _market(self, group: Group, spot: bool | None, resting: Mapping[str, Backoff]) -> Market:
+        return Market(
+            sold_to(self.observed.offers, group.offers, spot),
+            excluded=self.intent.excluded,
+            resting=resting,
+            avoid=(*self._avoided, *(s.location for s in self.census.lost)),
+            scale=self.scale,
+        )
+
+    def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
+        """Return the market of what rests longest, where all rests; None to wait for another."""
+        coming = self.launches or any(not s.ever_ready for s in self.census.good)
+        if coming or EVERYWHERE in self._resting:
+            return None
+        supply = rested_longest(self.market(group, spot).resting.items(), self.observed.now)
+        if supply is None:
+            return None
+        return self._market(group, spot, {k: v for k, v in self._resting.items() if k != supply})
 
     def kind(self, group: Group, without: Standing | None) -> bool | None:
         """Return whether a group's next machine is spot (True); None where it does not matter.
@@ -145,13 +172,19 @@ class Buyer:
             avoid.add(old.location)
         taken = self.places(old)
         spot = self.kind(need.group, old)
-        found = self.market(need.group, spot).choose(taken, avoid=avoid, budget_usd_per_hour=budget)
+        moves = old is not None and old.why.startswith("moves")
+        market = self.market(need.group, spot, at_leisure=moves)
+        found = market.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
         if found.offer is None and spot and need.group.on_demand.fallback:
             stand_in = self.market(need.group, False).choose(
                 taken, avoid=avoid, budget_usd_per_hour=budget
             )
             if stand_in.offer is not None:
                 return stand_in, f"{need.reason}; on demand, for no spot: {found.why_not}"
+        last = None if found.offer or moves else self._in_spite(need.group, spot)
+        if last is not None:
+            choice = last.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
+            return choice, f"{need.reason}; all rest, and this location longest"
         return found, need.reason
 
     def _make_room(self, need: Need, cap: float) -> None:

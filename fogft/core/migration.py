@@ -8,9 +8,10 @@ A replica moves when
 * the spread stays as it is, and its score falls by `gain`.
 
 It has then been ready for `stay_s` (a stand-in: `RETURN_AFTER_S`), and the new place is
-neither at rest nor avoided. To move back, the scores must swing by twice the gain: so
-prices that waver within it move nothing, and with steady offers every move lowers the
-crowding or the sum of the scores, so that moves come to an end.
+neither at rest nor avoided, nor has it refused within an hour; a stand-in's only must not be at
+rest. To move back, the scores must swing by twice the gain: so while prices waver within it
+nobody returns to where he was, and with steady offers every move lowers the crowding or the sum
+of the scores, so that moves come to an end.
 
 Owns: who moves, and why.
 Not here: carrying it out, which is a replacement like any other (`needs`, `buying`).
@@ -86,7 +87,7 @@ def _moves(buyer: Buyer, now: float) -> Iterator[Move]:
         kind = buyer.kind(home(buyer.groups, standing.slot), standing)
         if kind is not None and kind != placement.spot:  # `_returns` decides about those
             continue
-        choice = _best(buyer, standing)
+        choice = _best(buyer, standing, at_leisure=True)
         if choice.offer is None or choice.rank[0] or choice.offer.placement == placement:
             continue
         count = crowding(buyer.places(standing))
@@ -100,9 +101,9 @@ def _moves(buyer: Buyer, now: float) -> Iterator[Move]:
             yield Move(standing, f"moves to {there}: {better:.0%} better", (1.0, -better))
 
 
-def _best(buyer: Buyer, standing: Standing) -> Choice:
+def _best(buyer: Buyer, standing: Standing, *, at_leisure: bool = False) -> Choice:
     group = home(buyer.groups, standing.slot)
-    market = buyer.market(group, buyer.kind(group, standing))
+    market = buyer.market(group, buyer.kind(group, standing), at_leisure=at_leisure)
     return market.choose(buyer.places(standing), budget_usd_per_hour=buyer.budget)
 
 

@@ -81,6 +81,9 @@ class Market:
         resting: Supplies in backoff, see `Placement.supply`.
         avoid: Locations to use only when no other is left: one was lost there lately.
         scale: How price and distance are weighed.
+
+    Attributes:
+        resting: The supplies that it would have, where all that it sells rests; else empty.
     """
 
     def __init__(
@@ -101,6 +104,11 @@ class Market:
             allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
         rows = sorted(_rows(allowed, self.scale), key=_WITHOUT_OFFER)
         self.rows = [row for row in rows if _supply(row) not in self._resting]
+        self.resting = {
+            place: self._resting[place]
+            for row in rows
+            if not self.rows and (place := _supply(row)) in self._resting
+        }
         self._clouds = {row.cloud for row in self.rows}
         self._nothing = ""
         if EVERYWHERE in self._resting:

@@ -16,14 +16,18 @@ no other is left, for
 
     min(AVOID_S * 2 ** (n - 1), AVOID_LIMIT_S)
 
-seconds after the last of n losses within AVOID_MEMORY_S. Events from the future, which a clock
+seconds after the last of n losses within AVOID_MEMORY_S.
+
+When every location rests, waiting helps nobody: then the one that was left alone for longest is
+tried, one try in EAGER_S. And a replica that could move, but need not, asks no location that
+refused within FORGIVE_S and has not proved itself since. Events from the future, which a clock
 that jumped back leaves behind, count for nothing.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from fogft.core.history import Failure, History
@@ -32,6 +36,7 @@ BASE_S = 5.0
 LIMIT_S = 600.0
 FORGIVE_S = 3600.0
 EVERYWHERE = "*"
+EAGER_S = 60.0
 AVOID_S = 300.0
 AVOID_LIMIT_S = 3600.0
 AVOID_MEMORY_S = 4 * 3600.0
@@ -42,7 +47,8 @@ class Backoff:
     """A location at rest.
 
     Attributes:
-        until: Seconds since the epoch; from then on it may be tried again.
+        since: Of the last failure, in seconds since the epoch.
+        until: From then on it may be tried again.
         failures: How many in a row.
         cause: Of the last one: ``capacity``, ``quota``, ``setup``, ...
     """
@@ -50,6 +56,7 @@ class Backoff:
     until: float
     failures: int
     cause: str
+    since: float = 0.0
 
 
 def resting(history: History, now: float) -> Mapping[str, Backoff]:
@@ -76,6 +83,29 @@ def resting(history: History, now: float) -> Mapping[str, Backoff]:
     return out
 
 
+def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | None:
+    """Return the supply to try although it rests, as all do; None to wait.
+
+    Only what had no room is tried: a full account or a launch that fails does not get better by it.
+    """
+    known = list(resting)
+    if any(now - rest.since < EAGER_S for _, rest in known):
+        return None
+    full = [(rest.since, supply) for supply, rest in known if rest.cause == "capacity"]
+    return min(full, default=(0.0, None))[1]
+
+
+def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
+    """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
+    out: dict[str, Backoff] = {}
+    for supply, failures in history.failures.items():
+        lately = [f for f in _lately(failures, now) if f.at > history.proven_at(supply)]
+        if lately:
+            last = lately[-1]
+            out[supply] = Backoff(last.at + FORGIVE_S, len(lately), last.cause, since=last.at)
+    return out
+
+
 def _lately(failures: Sequence[Failure], now: float) -> Sequence[Failure]:
     """Return those that still count, of failures in order of time."""
     first = bisect_right(failures, now - FORGIVE_S, key=_at)
@@ -97,7 +127,7 @@ def backoff(failures: list[Failure], now: float) -> Backoff | None:
         rest_s = LIMIT_S
     if now >= last.at + rest_s:
         return None
-    return Backoff(until=last.at + rest_s, failures=len(recent), cause=last.cause)
+    return Backoff(last.at + rest_s, len(recent), last.cause, since=last.at)
 
 
 def avoided(history: History, now: float) -> Mapping[str, float]:
@@ -118,8 +148,10 @@ def next_change(history: History, now: float) -> float:
 
     Infinity for never. An older failure that is forgiven meanwhile may end a rest early.
     """
-    times: list[float] = []
-    for location, rest in resting(history, now).items():
+    rests = resting(history, now)
+    times = [rest.since + EAGER_S for rest in rests.values()]
+    times += [rest.until for rest in disappointing(history, now).values()]
+    for location, rest in rests.items():
         places = list(history.failures) if location == EVERYWHERE else [location]
         forgiven = (f.at + FORGIVE_S for p in places for f in _lately(history.failures[p], now))
         times += [rest.until, *(at for at in forgiven if at < rest.until)]
