@@ -49,7 +49,7 @@ def test_the_papers_figures():
 
 def test_two_zones_of_the_public_traces():
     """Nine zones, each up 65.4 % of the time (so two independent ones 88.0 %): with the measured
-    correlations of 0.43 in a region and 0.14 across, so 0.22 over all pairs, the model says 83 %; the
+    correlations of 0.43 in a region and 0.14 across, 0.22 over all pairs, the model says 83 %; the
     traces say 84.1 %."""
     down = math.sqrt(1 - 0.880)
     near, far = (
