@@ -36,13 +36,13 @@ def order(
     from fogft.pool import named_clouds, pool_file, preview
     from fogft.ros.comparison import check_tolerances
     from fogft.ros.state_bytes import check_state
-    from fogft.ros.types import check_ok_field, check_service_type
+    from fogft.ros.types import check_ok_field, check_type
 
     source = pool_file.text(file)
     spec = pool_file.parse(
         source,
         file=str(file),
-        check_types=check_service_type,
+        check_types=check_type,
         check_fields=check_ok_field,
         check_states=check_state,
         check_tolerances=check_tolerances,

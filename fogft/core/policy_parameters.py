@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import Any, TypeAlias
 
 from fogft.core.errors import SpecError
-from fogft.core.service_form import to_plain
-from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
+from fogft.core.service_form import LONGEST_S, to_plain
+from fogft.core.spec import HedgingMode, OnTimeout, Part, ServiceSpec
 from fogft.core.spec_services import read_service
 from fogft.core.spec_tree import Section, tree
 
@@ -34,6 +34,8 @@ def prefix(service: str) -> str:
 
 def shown(spec: ServiceSpec) -> dict[str, Value]:
     """Return a service's policy by key, as parameters show it."""
+    if spec.part is not Part.NONE:
+        return {"timeout_s": spec.timeout_s}
     unfit: frozenset[str] = _NOT_WITH_QUORUM if spec.quorum > 1 else frozenset()
     if spec.state is not None:
         unfit = _NOT_WITH_STATE
@@ -65,6 +67,8 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         raise ValueError(f"`{spec.name}` has no parameter `{unknown[0]}`")
     if not news:
         return spec
+    if spec.part is not Part.NONE:
+        return replace(spec, timeout_s=_timeout(spec, news["timeout_s"]))
     raw: dict[str, Any] = {**to_plain(spec), **news}
     if raw.get("hedging") != HedgingMode.ADAPTIVE.value and "hedging_budget" not in news:
         raw.pop("hedging_budget", None)
@@ -78,6 +82,12 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         reason = error.message.partition(f"{spec.name}.")[2] or error.message
         raise ValueError(f"{reason}; {error.hint}" if error.hint else reason) from None
     return replace(read, replicas=spec.replicas, traffic=spec.traffic)
+
+
+def _timeout(spec: ServiceSpec, value: Value) -> float:
+    if isinstance(value, (bool, str)) or not 0 < value <= LONGEST_S:
+        raise ValueError(f"timeout_s: must be a number above 0 and at most {LONGEST_S:g}")
+    return float(value)
 
 
 class Policies:

@@ -40,11 +40,16 @@ def absolute_service_name(name: str) -> str:
 
 def is_service_type(name: str) -> bool:
     """Whether this has the form ``package/srv/Name``."""
+    return is_type(name, "srv")
+
+
+def is_type(name: str, kind: str) -> bool:
+    """Whether this has the form ``package/KIND/Name``, with ``srv``, ``msg`` or ``action``."""
     parts = name.split("/")
     return (
         len(parts) == 3
         and bool(_PACKAGE.fullmatch(parts[0]))
-        and parts[1] == "srv"
+        and parts[1] == kind
         and bool(_INTERFACE.fullmatch(parts[2]))
     )
 

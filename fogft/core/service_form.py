@@ -15,7 +15,7 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from fogft.core import spec_state
-from fogft.core.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
+from fogft.core.spec import Advertise, HedgingMode, OnTimeout, Part, ServiceSpec
 from fogft.core.spec_choices import FallbackSpec
 from fogft.core.uplinks import UplinkPolicy
 
@@ -68,6 +68,7 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         trace=bool(raw.get("trace")),
         uplinks=UplinkPolicy(raw.get("uplinks") or ServiceSpec.uplinks),
         advertise=Advertise(raw["advertise"]) if raw.get("advertise") else None,
+        part=Part(raw.get("part") or ""),
     )
 
 

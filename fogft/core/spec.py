@@ -22,6 +22,7 @@ from fogft.core.spec_choices import (
     TrafficSpec,
 )
 from fogft.core.spec_state import StateSpec
+from fogft.core.topics import TopicSpec
 from fogft.core.topology import Topology
 from fogft.core.uplinks import UplinkPolicy
 
@@ -54,6 +55,15 @@ class Advertise(str, Enum):
     ALWAYS = "always"  # from the start
 
 
+class Part(str, Enum):
+    """Which of an action's three services a service is."""
+
+    NONE = ""
+    GOAL = "goal"
+    RESULT = "result"
+    CANCEL = "cancel"
+
+
 @dataclass(frozen=True)
 class ServiceSpec:
     """One proxied service.
@@ -74,6 +84,7 @@ class ServiceSpec:
         tolerance: Path of a float field of the response -> how far apart still agrees.
         state: How its state is taken and given; None for a service that keeps none.
         uplinks: Which of the robot's uplinks its requests take.
+        part: Which part of an action it is.
     """
 
     name: str
@@ -94,6 +105,7 @@ class ServiceSpec:
     trace: bool = False
     uplinks: UplinkPolicy = UplinkPolicy.PREFER
     advertise: Advertise | None = None
+    part: Part = Part.NONE
 
     @property
     def advertised(self) -> Advertise:
@@ -147,6 +159,7 @@ class PoolSpec:
         uplinks: Network interfaces of this machine's robot, the preferred one first; none for
             whatever its routes say.
         metrics: Where processes listen for Prometheus.
+        topics: What passes besides services; those of actions are among them.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -168,6 +181,7 @@ class PoolSpec:
     topology: Topology = field(default_factory=Topology)
     uplinks: tuple[str, ...] = ()
     metrics: MetricsSpec = field(default_factory=MetricsSpec)
+    topics: tuple[TopicSpec, ...] = ()
     task: Mapping[str, Any] = field(default_factory=dict)
     discovered: tuple[ServiceSpec, ...] = ()
 
@@ -202,6 +216,8 @@ class PoolSpec:
             "orphan_after_s": self.health.orphan_after_s,
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
         }
+        if self.topics:
+            asked["topics"] = sorted(str(topic) for topic in self.topics)
         if self.rendezvous or self.dial_in:
             asked["connectivity"] = [self.rendezvous, self.dial_in]
         kinds = _kinds_of_machine(resources)

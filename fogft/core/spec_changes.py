@@ -30,7 +30,7 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
         "groups",
         "schedule",
         "migration",
-        *("topology", "uplinks", "metrics"),
+        *("topology", "uplinks", "metrics", "topics"),
     ):
         found += _section(key, getattr(before, key), getattr(after, key))
     found += [

@@ -27,6 +27,8 @@ FOGFT_KEYS = (
     "topology",
     "uplinks",
     "metrics",
+    "topics",
+    "actions",
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
@@ -38,6 +40,8 @@ SERVICE_KEYS = (
 TOPOLOGY_KEYS = ("gateways", "robots", "through")
 GATEWAY_KEYS = ("name", "endpoint", "through")
 ROBOT_KEYS = ("name", "through")
+TOPIC_KEYS = ("name", "type", "from", "select", "depth", "reliable", "latched")
+ACTION_KEYS = ("name", "type", "timeout_s", "result_timeout_s")
 METRICS_KEYS = ("proxy", "manager", "replica")
 FALLBACK_KEYS = ("service", "after_s", "while_none_ready", "limit_s")
 HEALTH_KEYS = ("suspect_after_s", "replace_after_s", "start_limit_s")

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import PurePath
 
 from fogft.core.names import POOL_NAME_PATTERN
-from fogft.core.spec import MAX_REPLICAS, HealthSpec, PoolSpec
+from fogft.core.spec import MAX_REPLICAS, HealthSpec, PoolSpec, ServiceSpec
 from fogft.core.spec_connectivity import (
     read_dial_in,
     read_metrics,
@@ -34,12 +34,15 @@ from fogft.core.spec_plan import (
 from fogft.core.spec_services import read_services
 from fogft.core.spec_state import StateSpec
 from fogft.core.spec_task import check_task
+from fogft.core.spec_topics import read_actions, read_topics
 from fogft.core.spec_topology import read_topology
 from fogft.core.spec_tree import Node, Section, plain, shown
+from fogft.core.topics import TopicSpec
+from fogft.core.topology import Topology
 
 # What only this machine can tell. Each returns what is wrong, None if nothing is; what to
 # do about it may follow after "; ".
-TypeCheck = Callable[[str], str | None]  # of a service type
+TypeCheck = Callable[[str], str | None]  # of a service or message type
 FieldCheck = Callable[[str, str], str | None]  # of a service type and a boolean response field
 StateCheck = Callable[[StateSpec], str | None]  # of a service's `state`
 ToleranceCheck = Callable[[str, Mapping[str, float]], str | None]  # of a type, by field
@@ -65,8 +68,8 @@ def pool_spec(
         root: The file's tree.
         file: Its name as the user wrote it: begins every message, and its stem is the
             pool's name where the file gives none.
-        check_types: Says why a service type cannot be loaded here. Asked last, once a
-            service, when all else is right.
+        check_types: Says why a type of a service or message cannot be loaded here. Asked last,
+            once for each, when all else is right.
         check_fields: Says why a type's response has no boolean field of that name.
         check_states: Says why a service's state cannot travel by the services that `state` names.
         check_tolerances: Says why a type's responses cannot be compared with such tolerances.
@@ -80,6 +83,8 @@ def pool_spec(
     ours = top.section("fogft", "write `fogft:` with `services:` below it")
     ours.only(FOGFT_KEYS, later=LATER_KEYS, elsewhere=places(FOGFT_KEYS))
     services = read_services(ours)
+    action_services, action_topics = read_actions(ours)
+    topics = (*read_topics(ours), *action_topics)
     cap = hours = None
     if "max_usd_per_hour" in ours.children:
         cap = ours.number("max_usd_per_hour", 1_000_000, "US dollars per hour")
@@ -92,7 +97,7 @@ def pool_spec(
     replicas = ours.whole("replicas", usual, 1, MAX_REPLICAS)
     spec = PoolSpec(
         name=_name(top),
-        services=services,
+        services=(*services, *action_services),
         replicas=replicas,
         max_surge=ours.whole("max_surge", PoolSpec.max_surge, 0, MAX_SURGE),
         max_usd_per_hour=cap,
@@ -108,9 +113,10 @@ def pool_spec(
         migration=read_migration(ours),
         rendezvous=read_rendezvous(ours),
         dial_in=read_dial_in(ours),
-        topology=read_topology(ours, services),
+        topology=_topology(ours, services, topics),
         uplinks=read_uplinks(ours),
         metrics=read_metrics(ours),
+        topics=topics,
         task=task,
     )
     workdir = spec.task.get("workdir")
@@ -127,7 +133,26 @@ def pool_spec(
             _judge(section, "tolerance", reason)
         if service.state is not None and check_states is not None:
             _judge(section, "state", check_states(service.state))
+    _judge_topics(ours, check_types)
     return spec
+
+
+def _topology(
+    ours: Section, services: tuple[ServiceSpec, ...], topics: tuple[TopicSpec, ...]
+) -> Topology:
+    found = read_topology(ours, services)
+    if found and topics:
+        key = "actions" if "actions" in ours.children else "topics"
+        what = "does not go with `topology`: gateways pass services only"
+        raise ours.error(key, what, "remove one of the two")
+    return found
+
+
+def _judge_topics(ours: Section, check_types: TypeCheck | None) -> None:
+    for key, end in (("topics", ""), ("actions", "_SendGoal")):
+        if key in ours.children and check_types is not None:
+            for section in ours.sections(key, ""):
+                _judge(section, "type", check_types(section.text("type", "") + end))
 
 
 def _judge(section: Section, key: str, reason: str | None) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.cloud.port import Launch
-from fogft.core import holders, names
+from fogft.core import holders, names, topics
 from fogft.core.errors import CredentialError
 from fogft.core.groups import replica_hash, services_at, task_at
 from fogft.core.holders import Holder, holder_of
@@ -93,6 +93,7 @@ def proxy_config(
             "certificate": f"{paths.credentials.name}/{stem}.crt",
             "key": f"{paths.credentials.name}/{stem}.key",
             "services": [to_plain(service) for service in spec.proxied],
+            "topics": [topics.to_plain(topic) for topic in spec.topics],
             "suspect_after_s": spec.health.suspect_after_s,
             "rendezvous": list(spec.rendezvous),
             "records": paths.records.name,
@@ -182,6 +183,7 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "slot": id.slot,
             "generation": id.generation,
             "services": [to_plain(service, REPLICA_KEYS) for service in services],
+            "topics": [topics.to_plain(topic) for topic in spec.topics],
             "run": str(spec.task.get("run") or ""),
             "envs": {str(k): "" if v is None else str(v) for k, v in envs.items()},
             "orphan_after_s": spec.health.orphan_after_s,

@@ -23,13 +23,15 @@ from fogft.core.hedging import NEVER
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.records import SignedRecord
 from fogft.core.spec import HedgingMode, ServiceSpec
+from fogft.core.topics import TopicSpec
 from fogft.proxy.dispatcher import Dispatcher, key_of
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.proxied import ProxiedService
 from fogft.proxy.sameness import Define, Sameness
 from fogft.proxy.seen_through import best_of, seen_through
+from fogft.proxy.topics_robot import Merge, TopicsOnRobot
 from fogft.proxy.voting import VotingDispatcher
-from fogft.ros.port import RosNode
+from fogft.ros.port import RosNode, RosTopics
 from fogft.wire.port import Answer, Behind, Dialer, Link, Peer
 from fogft.wire.uplinks import UplinksLink
 
@@ -59,6 +61,7 @@ class ClientProxy:
         dialer: Makes links.
         make_dispatcher: Makes the dispatcher of a service, given how to respond.
         define: Returns the definition of a service type here; None to compare none.
+        merge: Makes one status of an action of what its replicas say.
         clock: Monotonic seconds.
     """
 
@@ -71,6 +74,7 @@ class ClientProxy:
         *,
         clock: Callable[[], float] = time.monotonic,
         define: Define | None = None,
+        merge: Merge = lambda said: None,
     ) -> None:
         self._sameness = Sameness(define)
         self._pool_uid = pool_uid
@@ -86,6 +90,7 @@ class ClientProxy:
         self._membership: Membership | None = None
         self._through_gateways = False
         self._wake = threading.Event()
+        self._topics = TopicsOnRobot(self._wake.set, merge, clock)
         self._next_look = NEVER
         self._changed = False  # set before the event, so that it is not missed
 
@@ -113,6 +118,14 @@ class ClientProxy:
                 self._services[spec.name] = self._new_service(spec)
                 keys_changed = True
             if keys_changed:
+                for id in list(self._links):
+                    self._redial(id)
+        self._change()
+
+    def pass_topics(self, topics: Iterable[TopicSpec], node: RosTopics) -> None:
+        """Pass these topics and no others; `node` publishes and subscribes on the robot's side."""
+        with self._lock:
+            if self._topics.serve(topics, node):
                 for id in list(self._links):
                     self._redial(id)
         self._change()
@@ -217,7 +230,7 @@ class ClientProxy:
         keys = {
             s.spec.name: names.service_key(self._pool_uid, id.slot, s.spec.name, s.spec.type)
             for s in self._services.values()
-        }
+        } | self._topics.keys(self._pool_uid, id.slot)
         self._links[id] = self._dialer.dial(peer, keys, self)
         who = f"gateway={member.gateway}" if member.gateway else f"replica={id.short}"
         log.info("link_dialled %s endpoint=%s", who, member.endpoint)
@@ -236,6 +249,9 @@ class ClientProxy:
 
     def answered(self, link: Link, answer: Answer) -> None:
         """Pass the end of an attempt to its service: the one that knows the request."""
+        if answer.service in self._topics:
+            self._topics.answered(key_of(link), answer)
+            return
         service = self._services.get(answer.service)
         if service is not None:
             service.dispatcher.answered(link, answer)
@@ -277,6 +293,7 @@ class ClientProxy:
                 self._route()
             for link in self._links.values():
                 link.flush()
+            self._topics.tick()
             looks = [service.dispatcher.tick() for service in self._services.values()]
             now = self._clock()
             for service in self._services.values():
@@ -288,6 +305,7 @@ class ClientProxy:
         return self._sameness.differences(link, [s.spec for s in self._services.values()])
 
     def _route(self) -> None:
+        self._topics.route({key_of(link): link for link in self._links.values()})
         differ = {id: self._differences(link) for id, link in self._links.items()}
         for service in self._services.values():
             name = service.spec.name
@@ -337,6 +355,7 @@ class ClientProxy:
             "links": links,
             "gateways": gateways,
             "services": services,
+            "topics": self._topics.report(),
             "uplink_suspected": self.uplink_suspected,
             "certificate": self._dialer.certificate(),
         }
@@ -419,6 +438,7 @@ class ClientProxy:
         with self._lock:
             for id in list(self._links):
                 self._drop(id)
+            self._topics.close()
 
 
 def _good_members(membership: Membership) -> dict[ReplicaId, Member]:

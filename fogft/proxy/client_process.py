@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from fogft import disk
 from fogft.core import names
 from fogft.core.errors import FogftError, PoolBusy, StateError
-from fogft.core.spec import ServiceSpec
+from fogft.core.spec import Part, ServiceSpec
 from fogft.proxy import measures
+from fogft.proxy.actions import Actions
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.config import ClientProxyConfig, read_client
 from fogft.proxy.dispatcher import Dispatcher
@@ -96,6 +97,7 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
     if not lock.acquire(wait=False):
         raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
     environment.prepare(os.environ)
+    from fogft.ros import goal_status
     from fogft.ros.definition import definition
     from fogft.ros.node import SerialisedNode
     from fogft.ros.types import check_ok_field
@@ -104,19 +106,25 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
     sign = ManagerSign(config.lease)
     node = SerialisedNode(_node_name("fogft_proxy", config.pool), config.domain_id)
     make = functools.partial(
-        make_dispatcher, marks=config.status.with_suffix(".marks"), pool_uid=config.pool_uid
+        make_dispatcher,
+        marks=config.status.with_suffix(".marks"),
+        pool_uid=config.pool_uid,
+        actions=Actions(),
     )
     dialer = make_dialer(config, sign.age_s)
-    proxy = ClientProxy(config.pool_uid, node, dialer, make, define=definition)
+    proxy = ClientProxy(
+        config.pool_uid, node, dialer, make, define=definition, merge=goal_status.merged
+    )
     visible = functools.partial(_make_visible, node, _node_name("fogft", config.pool))
     seen = SeenFromRos(config.pool, config.robot, visible, check_ok_field)
     proxy.serve(seen.follow(config.services))
+    proxy.pass_topics(config.topics, node)
     following = Following(config)
     scrape = Scrape(lambda: measures.of_client(proxy.report()))
     scrape.at(config.metrics)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
     try:
-        parts = _Parts(proxy, following, sign, dialer, seen, scrape, metrics)
+        parts = _Parts(proxy, following, sign, dialer, seen, scrape, metrics, node)
         _loop(config_path, config, parts, stop)
     finally:
         scrape.close()
@@ -167,6 +175,7 @@ def make_dispatcher(
     *,
     marks: Path,
     pool_uid: str,
+    actions: Actions,
 ) -> Dispatcher | OrderedDispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
 
@@ -176,7 +185,10 @@ def make_dispatcher(
         wake: Has the dispatcher's `tick` called soon.
         marks: Folder of the stateful services' marks.
         pool_uid: Whose marks they are.
+        actions: Makes those of actions.
     """
+    if spec.part is not Part.NONE:
+        return actions.make(spec, respond, wake)
     from fogft.ros import types
     from fogft.ros.comparison import Comparison
 
@@ -211,6 +223,7 @@ class _Parts(NamedTuple):
     seen: SeenFromRos
     scrape: Scrape
     metrics: str | None
+    node: SerialisedNode
 
 
 def _loop(
@@ -276,6 +289,7 @@ def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
     if parts.dialer.use(new.uplinks, policies):
         parts.proxy.redial()
     parts.proxy.serve(parts.seen.follow(new.services))
+    parts.proxy.pass_topics(new.topics, parts.node)
     parts.following.apply(new)
     parts.scrape.at(new.metrics)
     log.info("config_applied services=%d", len(new.services))

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.notice import SOURCES as NOTICE_SOURCES
-from fogft.core import membership, names
+from fogft.core import membership, names, topics
 from fogft.core.errors import StateError
 from fogft.core.model import ReplicaId
 from fogft.core.service_form import from_plain, seconds
 from fogft.core.spec import ServiceSpec
+from fogft.core.topics import TopicSpec
 from fogft.core.uplinks import is_interface
 from fogft.wire.frame import ROBOT_BYTES_LIMIT
 
@@ -44,6 +45,7 @@ class ClientProxyConfig:
         dial_in_listen: Where to listen for them; empty for that port on all addresses.
         uplinks: Network interfaces, the preferred one first; none for what the routes say.
         metrics: ``host:port`` to answer Prometheus at; empty for none.
+        topics: What passes besides services.
     """
 
     pool: str
@@ -65,6 +67,7 @@ class ClientProxyConfig:
     dial_in_listen: str = ""
     uplinks: tuple[str, ...] = ()
     metrics: str = ""
+    topics: tuple[TopicSpec, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class ServerProxyConfig:
         notice: Where preemption notices come from: ``none``, ``file:PATH`` with an absolute
             path, or a source of `fogft.cloud.notice.watch`.
         metrics: ``host:port`` to answer Prometheus at; empty for none.
+        topics: What passes besides services.
     """
 
     pool: str
@@ -111,6 +115,7 @@ class ServerProxyConfig:
     records: Path | None = None
     dial_out: tuple[str, ...] = ()
     metrics: str = ""
+    topics: tuple[TopicSpec, ...] = ()
 
 
 def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
@@ -145,6 +150,7 @@ def _client(raw: Mapping[str, Any], base: Path) -> ClientProxyConfig:
         dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
         uplinks=_interfaces(raw.get("uplinks")),
         metrics=_endpoint(raw.get("metrics") or ""),
+        topics=tuple(topics.from_plain(t) for t in raw.get("topics") or ()),
     )
 
 
@@ -192,6 +198,7 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
             records=base / raw["records"] if raw.get("records") else None,
             dial_out=_endpoints(raw.get("dial_out")),
             metrics=_endpoint(raw.get("metrics") or ""),
+            topics=tuple(topics.from_plain(t) for t in raw.get("topics") or ()),
         )
     raise AssertionError("unreachable")
 

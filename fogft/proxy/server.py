@@ -18,7 +18,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.core import names
@@ -27,12 +27,14 @@ from fogft.core.errors import RosError
 from fogft.core.model import ReplicaId
 from fogft.core.spec import ServiceSpec
 from fogft.core.spec_state import StateSpec
+from fogft.core.topics import TopicSpec
 from fogft.proxy.interruption import CANCEL_TYPE
 from fogft.proxy.offering import Offering
 from fogft.proxy.ordered_responder import Clients, OrderedResponder, StateBytes
 from fogft.proxy.responder import Responder
 from fogft.proxy.supervisor import Supervisor
-from fogft.ros.port import RosClient, RosNode
+from fogft.proxy.topics_replica import TopicsOnReplica
+from fogft.ros.port import RosClient, RosNode, RosTopics
 from fogft.wire.port import Incoming, Listener, Probe, ProbeAnswer
 
 log = logging.getLogger(__name__)
@@ -49,6 +51,7 @@ class ServerProxy:
         supervisor: The user's command.
         make_state: Says how the state of a stateful service travels.
         define: Returns the definition of a service type here, for the robot to compare.
+        topics: What passes besides services; then nodes publish and subscribe, too.
         max_in_flight: Requests held at once.
         orphan_after_s: With no sign of the pool's manager for so long, `orphaned` is true.
         clock: Monotonic seconds.
@@ -64,6 +67,7 @@ class ServerProxy:
         *,
         make_state: Callable[[StateSpec], StateBytes] | None = None,
         define: Callable[[str], Definition] | None = None,
+        topics: tuple[TopicSpec, ...] = (),
         max_in_flight: int = 512,
         orphan_after_s: float = 3600.0,
         clock: Callable[[], float] = time.monotonic,
@@ -76,6 +80,7 @@ class ServerProxy:
         self._supervisor = supervisor
         self._orphan_after_s = orphan_after_s
         self._clock = clock
+        self._topics = TopicsOnReplica(topics, clock)
         self._incarnation = secrets.token_hex(8)
         self._ready: frozenset[str] = frozenset()
         self._manager_seen = clock()
@@ -99,10 +104,11 @@ class ServerProxy:
 
     def start(self) -> None:
         """Begin to listen and start the user's command."""
-        keys = self._keys(self._offering.services)
+        keys = self._keys(self._offering.services) | self._topic_keys()
         self._join_ros()
         # Where no service is stateful there is nothing to choose, and nothing to pay.
-        request = self._request if self._ordered else self.responder.request
+        chosen = self._ordered or self._topics
+        request = self._request if chosen else self.responder.request
         self._listener.serve(keys, request, self._probe, self.responder.cancel)
         self._supervisor.poll()
         log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
@@ -110,6 +116,11 @@ class ServerProxy:
     def _keys(self, services: tuple[ServiceSpec, ...]) -> dict[str, str]:
         id = self._id
         return {s.name: names.service_key(id.pool_uid, id.slot, s.name, s.type) for s in services}
+
+    def _topic_keys(self) -> dict[str, str]:
+        id, topics = self._id, self._topics.topics
+        return {t.key_name: names.service_key(id.pool_uid, id.slot, t.key_name, t.type)
+                for t in topics}  # fmt: skip
 
     def run_once(self) -> None:
         """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
@@ -122,6 +133,7 @@ class ServerProxy:
         self._take_up_new()
         self._look_for_services()
         self.responder.tick()
+        self._topics.tick()
         for ordered in self._ordered.values():
             ordered.tick(self._supervisor.alive)
 
@@ -219,6 +231,8 @@ class ServerProxy:
         node = self._node = self._make_node()
         self._clients = {}
         self._servers = {}
+        if self._topics:
+            self._topics.use(cast(RosTopics, node))
         services = self._offering.services
         for service in services:
             self._make_client(service)
@@ -250,12 +264,16 @@ class ServerProxy:
     def _leave_ros(self) -> None:
         node, self._node, self._clients = self._node, None, {}
         self.responder.use({})
+        self._topics.use(None)
         for ordered in self._ordered.values():
             ordered.use(None)
         if node is not None:
             node.close()
 
     def _request(self, incoming: Incoming) -> None:
+        if incoming.service in self._topics:
+            self._topics.request(incoming)
+            return
         (self._ordered.get(incoming.service) or self.responder).request(incoming)
 
     def _answering(self) -> frozenset[str]:
@@ -265,6 +283,10 @@ class ServerProxy:
         behind = {name for name, ordered in self._ordered.items() if not ordered.ready}
         return self._ready - behind
 
+    def _passing(self) -> frozenset[str]:
+        """Return the topics that pass now, by their names on the wire."""
+        return self._topics.ready() if self._topics and self._supervisor.alive else frozenset()
+
     def _probe(self, probe: Probe) -> ProbeAnswer:
         if probe.manager_age_s is not None:
             seen = self._clock() - probe.manager_age_s
@@ -273,7 +295,7 @@ class ServerProxy:
             slot=self._id.slot,
             generation=self._id.generation,
             incarnation=self._incarnation,
-            ready=self._answering(),
+            ready=self._answering() | self._passing(),
             draining=self._draining,
             at_risk=self._at_risk,
             restarts=max(self._supervisor.restarts, 0),
@@ -291,6 +313,8 @@ class ServerProxy:
             return self._state_detail()
         for why in self._not_usable.values():
             return why
+        if self._topics.trouble:
+            return self._topics.trouble
         if not self._supervisor.alive:
             if not self._supervisor.last_exit:
                 return "`run` has not started"
@@ -310,6 +334,7 @@ class ServerProxy:
         self._crashed()
         self._listener.close()
         self._leave_ros()
+        self._topics.close()
 
 
 def _limits(services: tuple[ServiceSpec, ...]) -> dict[str, int]:

@@ -105,6 +105,7 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
         Supervisor(config.run, config.workdir, environ, stdout=handshakes.stdout),
         make_state=StateBytes,
         define=definition,
+        topics=config.topics,
         max_in_flight=config.max_in_flight,
         orphan_after_s=config.orphan_after_s,
     )

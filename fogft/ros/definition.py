@@ -35,8 +35,16 @@ def _add(name: str, message: Any, fields: dict[str, Fields]) -> None:
     for _, kind in fields[name]:
         other = nested(kind)
         if other and other not in fields:
-            package, _, short = other.partition("/")
-            _add(other, getattr(importlib.import_module(f"{package}.msg"), short), fields)
+            _add(other, _nested(other), fields)
+
+
+def _nested(name: str) -> Any:
+    """Return what ``package/Type`` stands for: a message, or a part of an action."""
+    package, _, short = name.partition("/")
+    action, _, part = short.rpartition("_")
+    if action and part in ("Goal", "Result", "Feedback"):
+        return getattr(getattr(importlib.import_module(f"{package}.action"), action), part)
+    return getattr(importlib.import_module(f"{package}.msg"), short)
 
 
 def _hash(type_name: str) -> str:

@@ -18,11 +18,15 @@ from typing import Any
 
 from fogft.core import ros_names
 from fogft.core.errors import RosError
-from fogft.ros import transfer
+from fogft.ros import topic_ends, transfer
 from fogft.ros.entities import Client, Server
+from fogft.ros.port import Quality
+from fogft.ros.topic_ends import Publisher, Reader, Subscription
 from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
+
+Entity = Server | Client | Publisher | Subscription
 
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
 _NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, and proxies
@@ -45,8 +49,8 @@ class SerialisedNode:
     """
 
     def __init__(self, name: str, domain_id: int | None = None) -> None:
-        self._entities: tuple[Server | Client, ...] = ()
-        self._changes: list[tuple[Server | Client, bool, threading.Event]] = []
+        self._entities: tuple[Entity, ...] = ()
+        self._changes: list[tuple[Entity, bool, threading.Event]] = []
         self._create_lock = threading.Lock()  # rcl wants one creation at a time
         self._transfers: dict[str, transfer.Transfer] = {}
         self._stopping = False
@@ -146,6 +150,48 @@ class SerialisedNode:
         client: Client = self._create(name, type_name, create)
         return client
 
+    def publisher(self, name: str, type_name: str, quality: Quality) -> Publisher:
+        """Make a publisher of a topic.
+
+        Raises:
+            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
+        """
+        from fogft.ros.types import load_message_type
+
+        message_type = load_message_type(type_name)
+
+        def create() -> Publisher:
+            made: Any = self._node.create_publisher(message_type, name, topic_ends.profile(quality))
+            try:
+                return Publisher(made, Reader(message_type), self._withdraw)
+            except BaseException:
+                self._node.destroy_publisher(made)
+                raise
+
+        publisher: Publisher = self._add(name, create)
+        return publisher
+
+    def subscribe(
+        self, name: str, type_name: str, quality: Quality, on_message: Callable[[bytes], None]
+    ) -> Subscription:
+        """Subscribe to a topic.
+
+        Raises:
+            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
+        """
+        from fogft.ros.types import load_message_type
+
+        message_type = load_message_type(type_name)
+
+        def create() -> Subscription:
+            made: Any = self._node.create_subscription(
+                message_type, name, lambda _: None, topic_ends.profile(quality), raw=True
+            )
+            return Subscription(made, on_message, self._withdraw)
+
+        subscription: Subscription = self._add(name, create)
+        return subscription
+
     def make_visible(
         self, name: str, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
     ) -> VisibleNode:
@@ -192,14 +238,22 @@ class SerialisedNode:
         from fogft.ros.types import load_service_type
 
         service_type = load_service_type(type_name)
-        with self._create_lock:
-            if self._stopping or self._ended.is_set():
-                raise RosError("the ROS node is closed")
+
+        def create_so() -> Any:
             way = self._transfers.get(type_name)
             if way is None:
                 way = self._transfers[type_name] = transfer.choose(type_name)
+            return create(way, service_type)
+
+        return self._add(name, create_so)
+
+    def _add(self, name: str, create: Callable[[], Any]) -> Any:
+        """Create an entity, and have the take loop attend to it."""
+        with self._create_lock:
+            if self._stopping or self._ended.is_set():
+                raise RosError("the ROS node is closed")
             try:
-                entity = create(way, service_type)
+                entity = create()
             except RosError:
                 raise
             except Exception as error:
@@ -208,7 +262,7 @@ class SerialisedNode:
             self._guard.trigger()
         return entity
 
-    def _withdraw(self, entity: Server | Client) -> None:
+    def _withdraw(self, entity: Entity) -> None:
         done = threading.Event()
         with self._create_lock:
             if self._ended.is_set():
@@ -251,7 +305,7 @@ class SerialisedNode:
         finally:
             self._end_ros()
 
-    def _apply_changes(self) -> tuple[Any, list[tuple[Any, tuple[str, int], Server | Client]]]:
+    def _apply_changes(self) -> tuple[Any, list[tuple[Any, tuple[str, int], Any]]]:
         """Return a new wait set and, for each entity, how to add it and where it then stands."""
         with self._create_lock:
             changes, self._changes = self._changes, []
@@ -268,12 +322,15 @@ class SerialisedNode:
             done.set()
         services = [entity for entity in self._entities if isinstance(entity, Server)]
         clients = [entity for entity in self._entities if isinstance(entity, Client)]
+        heard = [entity for entity in self._entities if isinstance(entity, Subscription)]
         context = self._context.handle
-        with context:  # 0 subscriptions, 1 guard condition, 0 timers, ..., 0 events
-            wait_set = self._new_wait_set(0, 1, 0, len(clients), len(services), 0, context)
-        waiting: list[tuple[Any, tuple[str, int], Server | Client]] = [
+        sizes = (len(heard), 1, 0, len(clients), len(services), 0)  # 1 guard condition, no timers
+        with context:
+            wait_set = self._new_wait_set(*sizes, context)
+        waiting: list[tuple[Any, tuple[str, int], Any]] = [
             *((wait_set.add_service, ("service", i), entity) for i, entity in enumerate(services)),
             *((wait_set.add_client, ("client", i), entity) for i, entity in enumerate(clients)),
+            *((wait_set.add_subscription, ("subscription", i), e) for i, e in enumerate(heard)),
         ]
         return wait_set, waiting
 

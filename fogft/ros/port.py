@@ -62,6 +62,40 @@ class RosClient(Protocol):
         """Withdraw the client."""
 
 
+@dataclass(frozen=True)
+class Quality:
+    """Quality of service of a topic: how many messages are kept, and for whom."""
+
+    depth: int = 10
+    reliable: bool = True
+    latched: bool = False
+
+
+class RosPublisher(Protocol):
+    """A publisher of this node's."""
+
+    def publish(self, payload: bytes) -> None:
+        """Publish a serialised message. Any thread.
+
+        Raises:
+            Unreadable: The bytes are no message of this type.
+            RosError: ROS refused it.
+        """
+
+    def subscribers(self) -> int:
+        """Count the subscriptions that discovery lists."""
+
+    def close(self) -> None:
+        """Withdraw the publisher."""
+
+
+class RosSubscription(Protocol):
+    """A subscription of this node's."""
+
+    def close(self) -> None:
+        """Withdraw the subscription."""
+
+
 class RosNode(Protocol):
     """A node of the proxy's own, in one ROS domain."""
 
@@ -93,6 +127,26 @@ class RosNode(Protocol):
 
     def close(self) -> None:
         """Stop the thread and leave ROS. Repeatable."""
+
+
+class RosTopics(Protocol):
+    """A node that publishes and subscribes, too."""
+
+    def publisher(self, name: str, type_name: str, quality: Quality) -> RosPublisher:
+        """Make a publisher of a topic.
+
+        Raises:
+            RosError: The type cannot be loaded.
+        """
+
+    def subscribe(
+        self, name: str, type_name: str, quality: Quality, on_message: Callable[[bytes], None]
+    ) -> RosSubscription:
+        """Subscribe to a topic; `on_message` gets serialised messages.
+
+        Raises:
+            RosError: The type cannot be loaded.
+        """
 
 
 class Level(IntEnum):

@@ -20,7 +20,12 @@ from typing import Any
 
 from fogft.core.errors import RosError
 
-_NAME = re.compile(r"[a-z][a-z0-9_]*/srv/[A-Z][A-Za-z0-9]*")
+_NAME = re.compile(
+    r"[a-z][a-z0-9_]*/(srv/[A-Z][A-Za-z0-9]*|action/[A-Z][A-Za-z0-9]*_(SendGoal|GetResult))"
+)
+_MESSAGE = re.compile(
+    r"[a-z][a-z0-9_]*/(msg/[A-Z][A-Za-z0-9]*|action/[A-Z][A-Za-z0-9]*_FeedbackMessage)"
+)
 _PRIMITIVE_BYTES = {
     **dict.fromkeys(("boolean", "octet", "char", "uint8", "int8"), 1),
     **dict.fromkeys(("uint16", "int16"), 2),
@@ -44,32 +49,76 @@ def load_service_type(name: str) -> Any:
             f"`{name}` is not the name of a service type",
             f"write `package/srv/Type`, as in `std_srvs/srv/SetBool`{_did_you_mean(name)}",
         )
-    package, _, type_name = name.split("/")
+    service_type = _find(name, "services")
+    _load_type_support(name, service_type, service_type.Request, service_type.Response)
+    return service_type
+
+
+def load_message_type(name: str) -> Any:
+    """Return the Python class of a message type with its type support loaded.
+
+    Args:
+        name: ``package/msg/Type``, or ``package/action/Type_FeedbackMessage``.
+
+    Raises:
+        RosError: There is no such type here, or it cannot be loaded; with a hint.
+    """
+    if not _MESSAGE.fullmatch(name):
+        example = "write `package/msg/Type`, as in `sensor_msgs/msg/Image`"
+        raise RosError(f"`{name}` is not the name of a message type", example)
+    message_type = _find(name, "messages")
+    _load_type_support(name, message_type)
+    return message_type
+
+
+def check_type(name: str) -> str | None:
+    """Return why a service or message type cannot be loaded, with what to do; None if it can."""
     try:
-        service_type = getattr(importlib.import_module(f"{package}.srv"), type_name)
+        (load_message_type if "/msg/" in name else load_service_type)(name)
+    except RosError as error:
+        return f"{error.message}; {error.hint}" if error.hint else error.message
+    return None
+
+
+# What an action is made of, by the end of its name: attributes of the action's `Impl`.
+_PARTS = {
+    "SendGoal": "SendGoalService",
+    "GetResult": "GetResultService",
+    "FeedbackMessage": "FeedbackMessage",
+}
+
+
+def _find(name: str, what: str) -> Any:
+    """Return the Python class of a type, or of a part of an action. Raises RosError."""
+    package, kind, type_name = name.split("/")
+    try:
+        module = importlib.import_module(f"{package}.{kind}")
+        if kind == "action":
+            action, _, part = type_name.rpartition("_")
+            return getattr(getattr(module, action).Impl, _PARTS[part])
+        return getattr(module, type_name)
     except ModuleNotFoundError as error:
-        if error.name not in (package, f"{package}.srv"):
+        if error.name not in (package, f"{package}.{kind}"):
             raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
         raise RosError(
-            f"there is no package `{package}` with services here, so `{name}` cannot be loaded",
+            f"there is no package `{package}` with {what} here, so `{name}` cannot be loaded",
             f"is the package installed, and its workspace sourced?{_did_you_mean(name)}",
         ) from error
     except AttributeError as error:
         raise RosError(
-            f"package `{package}` has no service type `{type_name}`",
+            f"package `{package}` has no {_KINDS[kind]} type `{type_name}`",
             f"does the sourced workspace hold its newest build?{_did_you_mean(name)}",
         ) from error
     except Exception as error:  # generated code: anything may go wrong in it
         raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
-    _load_type_support(name, service_type)
-    return service_type
 
 
+_KINDS = {"srv": "service", "msg": "message", "action": "action"}
 _SOURCE_HINT = "source the ROS 2 installation and the workspace that this type was built with"
 
 
-def _load_type_support(name: str, service_type: Any) -> None:
-    for part in (service_type, service_type.Request, service_type.Response):
+def _load_type_support(name: str, *parts: Any) -> None:
+    for part in parts:
         try:
             if type(part)._TYPE_SUPPORT is None:
                 type(part).__import_type_support__()

@@ -25,7 +25,7 @@ from fogft.core.spec_state import STATE_KEYS
 from fogft.pool import pool_file
 
 PAGE = (Path(__file__).parents[2] / "docs" / "pool-file.md").read_text()
-EXAMPLES = [part.split("```")[0] for part in PAGE.split("```yaml\n")[1:3]]
+EXAMPLES = [part.split("```")[0] for part in PAGE.split("```yaml\n")[1:4]]
 EXAMPLE = EXAMPLES[0]
 
 
@@ -61,11 +61,16 @@ MORE_TABLES = {
     "Each of `robots`": spec_keys.ROBOT_KEYS,
     "`metrics`": spec_keys.METRICS_KEYS,
 }
+TOPIC_TABLES = {
+    "Each of `topics`": spec_keys.TOPIC_KEYS,
+    "Each of `actions`": spec_keys.ACTION_KEYS,
+}
 
 
-@pytest.mark.parametrize("title", [*TABLES, *MORE_TABLES])
+@pytest.mark.parametrize("title", [*TABLES, *MORE_TABLES, *TOPIC_TABLES])
 def test_every_key_has_its_row(title):
-    assert [key.strip("`") for key in rows(title)] == list({**TABLES, **MORE_TABLES}[title])
+    keys = {**TABLES, **MORE_TABLES, **TOPIC_TABLES}[title]
+    assert [key.strip("`") for key in rows(title)] == list(keys)
 
 
 def test_every_state_key_has_its_row():
@@ -171,8 +176,14 @@ def test_the_examples_are_complete_and_right():
     spec = pool_file.parse(EXAMPLE, file="pool.yaml")
     assert spec.name == "perception"
     assert pool_file.parse(EXAMPLES[1], file="pool.yaml").name == "picking"
-    for key in (*FOGFT_KEYS, *SERVICE_KEYS, *HEALTH_KEYS, *sum(MORE_TABLES.values(), ())):
-        assert re.search(rf"\b{key}:", EXAMPLE + EXAMPLES[1]), key
+    assert pool_file.parse(EXAMPLES[2], file="pool.yaml").name == "watching"
+    for key in (
+        *FOGFT_KEYS,
+        *SERVICE_KEYS,
+        *HEALTH_KEYS,
+        *sum({**MORE_TABLES, **TOPIC_TABLES}.values(), ()),
+    ):
+        assert re.search(rf"\b{key}:", "".join(EXAMPLES)), key
 
 
 def test_the_mistake_is_told_as_printed():

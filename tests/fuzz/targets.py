@@ -21,7 +21,7 @@ from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.record_set import RecordSet
 from fogft.core.records import RecordError, RecordKind, SignedRecord
 from fogft.pool import bundle, credentials, joining
-from fogft.wire import frame, record_frames
+from fogft.wire import frame, record_frames, topic_frames
 from fogft.wire.frame import FrameError, Greeting
 from fogft.wire.guests import Guests, NotAdmittedError
 from fogft.wire.port import Probe, ProbeAnswer
@@ -206,6 +206,15 @@ def targets() -> dict[str, Target]:
         "record stream": Target(_stream, recorded, (stream,)),
         "records of a link": Target(
             record_frames.unpack, recorded, (record_frames.pack(_records()),)
+        ),
+        "message of a topic": Target(
+            topic_frames.decode_message, framed, (topic_frames.encode_message(TOKEN, 7, b"cdr"),)
+        ),
+        "pull": Target(topic_frames.decode_pull, framed, (topic_frames.encode_pull(TOKEN, 7),)),
+        "batch": Target(
+            topic_frames.decode_batch,
+            framed,
+            (topic_frames.encode_batch(TOKEN, 9, [(8, b"one"), (9, b"")]),),
         ),
         "bundle": Target(bundle.read_label, (CredentialError,), (_bundle(),)),
         "bundle's files": Target(

@@ -1,0 +1,36 @@
+"""One status list of an action out of those of its replicas.
+
+Owns: reading and writing them. Not here: which status counts (`fogft.core.goals`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fogft.core import goals
+
+
+def merged(said: Mapping[int, bytes]) -> bytes | None:
+    """Return one `action_msgs/msg/GoalStatusArray` (CDR) of what replicas said last.
+
+    None where a list cannot be read; what cannot be read comes from no action server.
+    """
+    from action_msgs.msg import GoalStatusArray
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    entries: dict[bytes, Any] = {}
+    statuses: dict[int, dict[bytes, int]] = {}
+    try:
+        for replica, message in said.items():
+            listed = deserialize_message(message, GoalStatusArray).status_list
+            statuses[replica] = {bytes(one.goal_info.goal_id.uuid): one.status for one in listed}
+            for one in listed:
+                entries.setdefault(bytes(one.goal_info.goal_id.uuid), one)
+    except Exception:  # rclpy's own error types are private and vary by release
+        return None
+    found = GoalStatusArray()
+    for goal, status in goals.merged(statuses).items():
+        entries[goal].status = status
+        found.status_list.append(entries[goal])
+    return bytes(serialize_message(found))

@@ -1,0 +1,136 @@
+"""A node's publishers and subscriptions: serialised messages of any type, never a Python one.
+
+Owns: quality of service of topics; that bytes are read once before they are published.
+Not here: the loop (`node`), which messages pass (`fogft.proxy`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from fogft.core.errors import RosError
+from fogft.ros.port import Quality
+
+log = logging.getLogger(__name__)
+
+_BURST = 128  # messages taken before others get their turn
+
+
+def profile(quality: Quality) -> Any:
+    """Return ROS's form of a quality of service."""
+    from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+    reliability, durability = ReliabilityPolicy, DurabilityPolicy
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=quality.depth,
+        reliability=reliability.RELIABLE if quality.reliable else reliability.BEST_EFFORT,
+        durability=durability.TRANSIENT_LOCAL if quality.latched else durability.VOLATILE,
+    )
+
+
+class Reader:
+    """Reads bytes as a message of a type, so that nothing else is published."""
+
+    def __init__(self, message_type: Any) -> None:
+        from fogft.ros.serialised import CMessage
+
+        self._lock = threading.Lock()
+        self._message = CMessage(message_type)
+
+    def check(self, payload: bytes) -> None:
+        """Raise `Unreadable` for bytes that are no such message."""
+        with self._lock:
+            if self._message.address:
+                self._message.read(payload)
+
+    def close(self) -> None:
+        """Free the message."""
+        with self._lock:
+            self._message.close()
+
+
+class Publisher:
+    """A publisher of a node (`fogft.ros.port.RosPublisher`)."""
+
+    def __init__(
+        self, publisher: Any, reader: Reader, withdraw: Callable[[Publisher], None]
+    ) -> None:
+        self._publisher = publisher
+        self._reader = reader
+        self._withdraw = withdraw
+        self._open = True
+
+    def publish(self, payload: bytes) -> None:
+        """Publish a serialised message. Nothing happens once it is withdrawn.
+
+        Raises:
+            Unreadable: The bytes are no such message.
+            RosError: ROS refused it.
+        """
+        self._reader.check(payload)
+        try:
+            if self._open:
+                self._publisher.publish(payload)
+        except Exception as error:
+            if self._open:
+                raise RosError(f"a message cannot be published: {error}") from error
+
+    def subscribers(self) -> int:
+        """Count the subscriptions that discovery lists."""
+        try:
+            return int(self._publisher.get_subscription_count()) if self._open else 0
+        except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
+            return 0
+
+    def close(self) -> None:
+        """Withdraw it; repeatable."""
+        self._open = False
+        self._withdraw(self)
+
+    def destroy(self, node: Any) -> None:
+        """Free everything. Take loop only, once."""
+        self._open = False
+        self._reader.close()
+        node.destroy_publisher(self._publisher)
+
+
+class Subscription:
+    """A subscription of a node (`fogft.ros.port.RosSubscription`)."""
+
+    def __init__(
+        self,
+        subscription: Any,
+        on_message: Callable[[bytes], None],
+        withdraw: Callable[[Subscription], None],
+    ) -> None:
+        self.handle = subscription.handle
+        self._subscription = subscription
+        self._on_message = on_message
+        self._withdraw = withdraw
+        self._open = True
+
+    def close(self) -> None:
+        """Withdraw it; repeatable. On return it is gone, unless the take loop called."""
+        self._open = False
+        self._withdraw(self)
+
+    def drain(self) -> None:
+        """Deliver what has arrived. Take loop only."""
+        for _ in range(_BURST):
+            taken = self.handle.take_message(self._subscription.msg_type, True)
+            if taken is None:
+                return
+            try:
+                if self._open:
+                    self._on_message(bytes(taken[0]))
+            except Exception:
+                log.exception("%s: a message was lost", self._subscription.topic_name)
+
+    def destroy(self, node: Any) -> None:
+        """Free everything. Take loop only, once, when no wait set holds the handle."""
+        self._open = False
+        node.destroy_subscription(self._subscription)

@@ -1,0 +1,231 @@
+"""Both sides of topics, joined by a link that loses, repeats and delays."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from fogft.core.topics import Origin, TopicSpec
+from fogft.proxy.topics_replica import HOLD_S, TopicsOnReplica
+from fogft.proxy.topics_robot import TopicsOnRobot
+from fogft.wire.port import Answer, Refusal
+from tests.proxy.fakes import Clock, FakeLink
+
+
+class FakeTopics:
+    """A node: what it publishes is kept, and the test says what it hears."""
+
+    def __init__(self) -> None:
+        self.published: dict[str, list[bytes]] = {}
+        self.heard: dict[str, object] = {}
+
+    def publisher(self, name, type_name, quality):
+        node, said = self, self.published.setdefault(name, [])
+
+        class Publisher:
+            def publish(self, payload):
+                said.append(payload)
+
+            def subscribers(self):
+                return 1
+
+            def close(self):
+                node.published.pop(name, None)
+
+        return Publisher()
+
+    def subscribe(self, name, type_name, quality, on_message):
+        self.heard[name] = on_message
+        return self.publisher("unused", type_name, quality)
+
+
+class Carried:
+    """A request on its way."""
+
+    def __init__(self, world, slot, link, offered) -> None:
+        self.service, self.request_id, self.payload, self.remaining_s = offered
+        self.robot, self._world, self._slot, self._link = "r", world, slot, link
+        self.ended = False
+
+    def reply(self, payload: bytes) -> None:
+        self._end(Answer(self.request_id, payload=payload, service=self.service))
+
+    def refuse(self, reason: str) -> None:
+        self._end(Answer(self.request_id, refusal=reason, service=self.service))
+
+    def _end(self, answer: Answer) -> None:
+        if not self.ended:
+            self.ended = True
+            self._world.answers.append((self._slot, answer))
+
+
+class World:
+    """One robot, some replicas, and what is under way between them; driven by hand."""
+
+    def __init__(self, topic: TopicSpec, replicas: int = 1) -> None:
+        self.clock = Clock()
+        self.topic = topic
+        self.robot_node = FakeTopics()
+        self.robot = TopicsOnRobot(lambda: None, clock=self.clock)
+        self.robot.serve([topic], self.robot_node)
+        self.nodes = [FakeTopics() for _ in range(replicas)]
+        self.replicas = [TopicsOnReplica([topic], self.clock) for _ in range(replicas)]
+        for one, node in zip(self.replicas, self.nodes, strict=True):
+            one.use(node)
+        self.links = [FakeLink(slot) for slot in range(replicas)]
+        self.sent = [0] * replicas
+        self.answers: list[tuple[int, Answer]] = []
+        for link in self.links:
+            link.ready = frozenset({topic.key_name})
+        self.route()
+
+    def route(self) -> None:
+        self.robot.route({slot + 1: link for slot, link in enumerate(self.links)})
+
+    def carry(self, lose=lambda: False) -> None:
+        """Bring everything that is under way to its end, or lose it."""
+        self.robot.tick()
+        for slot, link in enumerate(self.links):
+            broken = False  # a connection that breaks loses all that comes after
+            for offered in link.offered[self.sent[slot] :]:
+                self.sent[slot] += 1
+                request = Carried(self, slot, link, offered)
+                broken = broken or lose()
+                if broken:
+                    request.refuse(Refusal.LOST)
+                    continue
+                self.replicas[slot].request(request)
+                self._published(slot)
+                if lose():  # it arrived, but nobody hears of it
+                    self._drop(request)
+        while self.answers:
+            slot, answer = self.answers.pop(0)
+            self.robot.answered(slot + 1, answer)
+
+    def _drop(self, request: Carried) -> None:
+        self.answers = [(s, a) for s, a in self.answers if a.request_id != request.request_id]
+        request.ended = False
+        request.refuse(Refusal.LOST)
+
+    def _published(self, slot: int) -> None:
+        """Do what the replica's thread does, here."""
+        replica = self.replicas[slot]
+        while not replica._queue.empty():
+            replica._publish_one(replica._queue.get())
+
+
+@pytest.fixture(autouse=True)
+def no_threads(monkeypatch):
+    monkeypatch.setattr("threading.Thread.start", lambda self: None)
+
+
+TO = TopicSpec("/to", "p/msg/T", Origin.ROBOT, depth=100)
+BACK = TopicSpec("/back", "p/msg/T", Origin.REPLICAS, depth=100)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_message_reaches_every_replica_once_and_in_order(seed):
+    """Also over links that lose a third of what goes either way."""
+    source = random.Random(seed)
+    world = World(TO, replicas=2)
+    said = [b"m%03d" % number for number in range(60)]
+    for message in said:
+        world.robot_node.heard["/to"](message)
+        world.carry(lambda: source.random() < 0.33)
+    for _ in range(200):
+        world.clock.now += 1
+        world.carry()
+    for node in world.nodes:
+        assert node.published["/to"] == said
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_message_of_a_replica_comes_back_once_and_in_order(seed):
+    source = random.Random(seed)
+    world = World(BACK)
+    said = [b"m%03d" % number for number in range(60)]
+    world.carry()
+    world.carry()
+    for message in said:
+        world.nodes[0].heard["/back"](message)
+        world.clock.now += source.random()
+        world.replicas[0].tick()
+        world.carry(lambda: source.random() < 0.33)
+    for _ in range(10):
+        world.clock.now += HOLD_S
+        world.replicas[0].tick()
+        world.carry()
+    assert world.robot_node.published["/back"] == said
+
+
+def test_a_pull_is_held_until_there_is_something_and_not_for_ever():
+    world = World(BACK)
+    world.carry()  # where to begin
+    world.carry()
+    out = len(world.links[0].offered)
+    world.carry()
+    assert len(world.links[0].offered) == out
+    world.clock.now += HOLD_S
+    world.replicas[0].tick()
+    world.carry()
+    world.carry()
+    assert len(world.links[0].offered) == out + 1
+
+
+def test_who_comes_later_gets_what_is_latched_and_nothing_else():
+    for latched, wanted in ((True, [b"two", b"three"]), (False, [])):
+        world = World(TopicSpec("/to", "p/msg/T", Origin.ROBOT, depth=2, latched=latched))
+        link = world.links.pop()
+        world.route()
+        for message in (b"one", b"two", b"three"):
+            world.robot_node.heard["/to"](message)
+        world.links.append(link)
+        world.route()
+        world.carry()
+        assert world.nodes[0].published["/to"] == wanted
+
+
+def test_a_robot_that_comes_later_gets_what_a_replica_latched():
+    world = World(TopicSpec("/back", "p/msg/T", Origin.REPLICAS, depth=1, latched=True))
+    for message in (b"old", b"new"):
+        world.nodes[0].heard["/back"](message)
+    world.carry()
+    world.carry()
+    assert world.robot_node.published["/back"] == [b"new"]
+
+
+def test_a_replica_that_starts_anew_begins_a_new_session():
+    world = World(BACK)
+    world.carry()
+    world.carry()
+    world.nodes[0].heard["/back"](b"before")
+    world.carry()
+    world.replicas[0], world.nodes[0] = TopicsOnReplica([BACK], world.clock), FakeTopics()
+    world.replicas[0].use(world.nodes[0])
+    for out in list(world.links[0].offered[-1:]):
+        world.robot.answered(1, Answer(out[1], refusal=Refusal.LOST, service=out[0]))
+    world.carry()  # is told where to begin
+    world.carry()
+    world.nodes[0].heard["/back"](b"after")
+    world.carry()
+    assert world.robot_node.published["/back"] == [b"before", b"after"]
+
+
+def test_noise_from_a_peer_harms_nobody():
+    world = World(TO)
+    request = Carried(world, 0, world.links[0], ("topic /to", b"i" * 16, b"noise", 5.0))
+    world.replicas[0].request(request)
+    with pytest.raises(ValueError):
+        world._published(0)
+    back = World(BACK)
+    request = Carried(back, 0, back.links[0], ("topic /back", b"i" * 16, b"noise", 5.0))
+    back.replicas[0].request(request)
+    assert back.answers[0][1].refusal == Refusal.MALFORMED
+    back.answers.clear()
+    back.robot.tick()
+    id = back.links[0].offered[-1][1]
+    back.robot.answered(1, Answer(id, payload=b"noise", service="topic /back"))
+    back.clock.now += 1
+    back.robot.tick()
+    assert len(back.links[0].offered) == 2
