@@ -60,7 +60,9 @@ def test_the_glossary_is_in_alphabetical_order():
     assert first == sorted(first)
 
 
-@pytest.mark.parametrize("script", ["setup", "test", "check", "bench", "quickstart", "fuzz"])
+@pytest.mark.parametrize(
+    "script", ["setup", "test", "check", "bench", "quickstart", "fuzz", "reproduce"]
+)
 def test_scripts_are_sound(script):
     """Each can be run, stops at the first error, and says what it is for."""
     path = ROOT / "scripts" / script

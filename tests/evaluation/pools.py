@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -87,10 +88,12 @@ class Pools:
         self.fogft("init", template, "--into", str(folder))
         return folder
 
-    def up(self, file: Path, *, whole: bool = True) -> None:
-        """Start a pool, or change it to what its file says; wait until all of it is ready."""
-        self.fogft("up", str(file), "--yes")
-        if whole:
+    def up(self, *files: Path, whole: bool = True) -> None:
+        """Start pools side by side, or change them to what their files say; wait until all
+        their replicas are ready."""
+        with ThreadPoolExecutor(len(files)) as threads:
+            list(threads.map(lambda file: self.fogft("up", str(file), "--yes"), files))
+        for file in files if whole else ():
             self.wait_whole(pool_file.read(file).name)
 
     def wait_whole(self, pool: str) -> None:
@@ -143,12 +146,15 @@ class Pools:
         """End all pools through the command line, and what is left of them by force."""
         names = [path.name for path in self.home.glob("pools/*") if path.is_dir()]
         uids = [uid for name in names if (uid := self.status(name).get("uid"))]
-        for name in names:
-            with contextlib.suppress(EvaluationError):
-                self.fogft("down", name, "--yes")
+        with ThreadPoolExecutor(max(1, len(names))) as threads:
+            list(threads.map(self._down, names))
         for uid in uids:
             processes.end(processes.find(pool_uid=uid))
         shared_memory.sweep()
+
+    def _down(self, name: str) -> None:
+        with contextlib.suppress(EvaluationError):  # what it leaves is ended by force
+            self.fogft("down", name, "--yes")
 
     def _last_words(self) -> str:
         lines = []

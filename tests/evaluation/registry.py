@@ -7,7 +7,9 @@ import importlib
 from tests.evaluation.experiment import Experiment
 
 # Name -> module with an object `EXPERIMENT`.
-MODULES: dict[str, str] = {}
+MODULES = {
+    "planning": "tests.evaluation.planning",
+}
 
 
 def load(name: str) -> Experiment:

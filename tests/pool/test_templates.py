@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from fogft.core.errors import FogftError
 from fogft.pool import init, pool_file, templates
 
-EXAMPLES = ["detect", "echo", "pick", "planner", "segment", "words"]
+EXAMPLES = ["detect", "echo", "motion", "pick", "planner", "segment", "words"]
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
 values = st.recursive(
