@@ -48,3 +48,15 @@ def edges(samples: Sequence[Sequence[float]], count: int = 25) -> list[float]:
     low = min(min(sample) for sample in samples)
     width = (high - low) / count or 1.0
     return [low + width * i for i in range(count)] + [max(high, low + width * count)]
+
+
+def bars(
+    axis: Any, places: Sequence[float], values: Sequence[float], height: float, ours: bool
+) -> None:
+    """Draw horizontal bars: the paper's grey, ours in colour."""
+    axis.barh(places, values, height=height, color=COLOURS[0] if ours else "#aaaaaa")
+
+
+def curve(axis: Any, x: Sequence[float], y: Sequence[float], colour: str, label: str) -> None:
+    """Draw a line through points, with a mark at each."""
+    axis.plot(x, y, "o-", color=colour, label=label, markersize=3, linewidth=1.2)

@@ -9,6 +9,12 @@ from tests.evaluation.experiment import Experiment
 # Name -> module with an object `EXPERIMENT`.
 MODULES = {
     "planning": "tests.evaluation.planning",
+    "costs": "tests.evaluation.costs",
+    "failures": "tests.evaluation.failures",
+    "overhead": "tests.evaluation.overhead",
+    "uplink": "tests.evaluation.uplink",
+    "recovery": "tests.evaluation.recovery",
+    "markets": "tests.evaluation.markets",
 }
 
 

@@ -130,8 +130,11 @@ def picture(folder: Path, name: str, figure: Any) -> str:
         svg = io.BytesIO()
         figure.savefig(svg, format="svg", metadata={"Date": None})
     (folder / f"{name}.svg").write_bytes(svg.getvalue())
-    data = base64.b64encode(svg.getvalue()).decode()
-    return f"<p><img alt='{html.escape(name)}' src='data:image/svg+xml;base64,{data}'></p>"
+    shown, kind = (folder / f"{name}.svg").read_bytes(), "svg+xml"
+    if (folder / f"{name}.png").stat().st_size < len(shown):
+        shown, kind = (folder / f"{name}.png").read_bytes(), "png"
+    data = base64.b64encode(shown).decode()
+    return f"<p><img alt='{html.escape(name)}' src='data:image/{kind};base64,{data}'></p>"
 
 
 __all__ = ["Finding", "measured", "page_head", "section", "write"]

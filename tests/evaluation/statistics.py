@@ -25,6 +25,8 @@ class Estimate:
     high: float
 
     def __str__(self) -> str:
+        if self.low == self.high:  # of one trial, or of trials that all gave the same
+            return _short(self.value)
         return f"{_short(self.value)} [{_short(self.low)}, {_short(self.high)}]"
 
 

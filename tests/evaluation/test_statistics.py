@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.evaluation.statistics import cumulative, estimate, mean, p50, p99, percentile, ratio
+from tests.evaluation.statistics import (
+    Estimate,
+    cumulative,
+    estimate,
+    mean,
+    p50,
+    p99,
+    percentile,
+    ratio,
+)
 
 samples = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=60)
 
@@ -108,4 +117,5 @@ def test_nothing_has_no_statistic(wrong):
 
 
 def test_an_estimate_shows_its_interval():
-    assert str(estimate([2.0, 2.0], mean)) == "2 [2, 2]"
+    assert str(Estimate(1.23456, 0.99, 1500.4)) == "1.23 [0.99, 1500]"
+    assert str(estimate([2.0, 2.0], mean)) == "2"

@@ -167,7 +167,7 @@ class TestRefusals:
             "did you mean `planner`?",
         )
         assert self.refuse(tmp_path, "xyz", tmp_path / "a")[1] == (
-            "known here: `detect`, `echo`, `pick`, `planner`, `segment`, `words`"
+            "known here: `detect`, `echo`, `motion`, `pick`, `planner`, `segment`, `words`"
         )
 
     def test_a_file_is_in_the_way(self, tmp_path):
