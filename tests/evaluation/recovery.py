@@ -41,12 +41,12 @@ class Recovery(Defaults):
         "gives neither the time to notice nor the requests that were lost meanwhile."
     )
     method = (
-        "A pool of two replicas on the local cloud, asked 20 times a second by an ordinary client; "
-        "one replica's machine is killed (SIGKILL) or frozen (SIGSTOP), and the next trial waits "
-        "until the pool is whole. 'Noticed': the robot's proxy no longer counts on it; 'ordered': its "
-        "replacement is launched; 'whole': that one answers. A machine boots in half a second "
-        "here; on a cloud its minutes are added to 'whole' and to nothing else. A frozen replica "
-        "is replaced after 15 s of silence, as the pool file says (`replace_after_s`)."
+        "A pool of two replicas on the local cloud, asked 20 times a second by an ordinary "
+        "client; one replica's machine is killed (SIGKILL) or frozen (SIGSTOP), and the next "
+        "trial waits until the pool is whole. 'Noticed': the robot's proxy no longer counts on "
+        "it; 'ordered': its replacement is launched; 'whole': that one answers. A machine boots "
+        "in half a second here; on a cloud its minutes are added to 'whole' and to nothing else. "
+        "A frozen replica is replaced after 15 s of silence, the default of `replace_after_s`."
     )
     fields = ("fault", *MOMENTS, "asked", "failed", "longest_gap_s")
 
