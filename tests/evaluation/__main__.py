@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import os
+import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +17,7 @@ from tests.bench.rig import ROOT
 from tests.evaluation import registry, running
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Experiment, Scale
-from tests.evaluation.samples import Samples, Store
+from tests.evaluation.samples import Store
 
 
 def main() -> int:
@@ -33,6 +34,8 @@ def main() -> int:
 
     environment.prepare(os.environ)
     memory_tuning.tune()
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
     try:
         return reproduce(experiments, options)
     except (EvaluationError, FogftError) as error:
@@ -41,6 +44,10 @@ def main() -> int:
     except KeyboardInterrupt:
         print("interrupted: run the same command again to go on", file=sys.stderr)
         return 130
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def arguments(experiments: Mapping[str, Experiment]) -> argparse.Namespace:
@@ -74,16 +81,15 @@ def reproduce(experiments: Mapping[str, Experiment], options: argparse.Namespace
     chosen = options.only or list(experiments)
     for name in chosen:
         check_modules(experiments[name])
-    done: dict[str, Samples] = {}
     with progress.Bars() as bars:
         for name in chosen:
             experiment = experiments[name]
             own = own_options(experiment, options)
             running.check_settings(
-                into / name / "settings.json", {"scale": scale.name, "options": own}
+                into / name / running.SETTINGS, {"scale": scale.name, "options": own}
             )
             try:
-                done[name] = running.complete(
+                running.complete(
                     experiment,
                     Store(into / name, experiment.fields),
                     scale,
@@ -95,7 +101,8 @@ def reproduce(experiments: Mapping[str, Experiment], options: argparse.Namespace
                 print(f"error: {name}: {error}", file=sys.stderr)
                 status = 1
     note_machine(into / "machine.json")
-    written = report.write(into, {name: experiments[name] for name in done}, done)
+    complete = running.found(into, experiments)
+    written = report.write(into, {name: experiments[name] for name in complete}, complete)
     print(f"report: {written}")
     return status
 

@@ -9,6 +9,7 @@ import base64
 import html
 import io
 import json
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,7 @@ def section(into: Path, experiment: Experiment, samples: Samples) -> Iterator[st
     yield f"<h2 id={experiment.name}>{said(experiment.title)}</h2>"
     yield f"<p><b>The paper.</b> {said(experiment.claim)}</p>"
     yield f"<p><b>Here.</b> {said(experiment.method)}</p>"
+    yield f"<p>{said(circumstances(samples))}</p>"
     findings = experiment.findings(samples)
     if findings:
         yield from findings_table(findings)
@@ -76,6 +78,21 @@ def section(into: Path, experiment: Experiment, samples: Samples) -> Iterator[st
         f"<a href='{experiment.name}/{c}.csv'>{c}</a> ({len(samples[c])})" for c in samples
     )
     yield f"<p>Raw samples: {files}</p>"
+
+
+def circumstances(samples: Samples) -> str:
+    """Say when an experiment was run, and beside how much other work."""
+    rows = [row for condition in samples for row in samples[condition]]
+    first, last = (pick(float(row["began_at"]) for row in rows) for pick in (min, max))
+    loads = [float(row["load"]) for row in rows]
+    return (
+        f"{len(rows)} trials, begun between {_moment(first)} and {_moment(last)}; load average "
+        f"{min(loads):.1f} to {max(loads):.1f}, median {statistics.p50(loads):.1f}."
+    )
+
+
+def _moment(seconds: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(seconds))
 
 
 def findings_table(findings: Any) -> Iterator[str]:

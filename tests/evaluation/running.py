@@ -6,17 +6,21 @@ Not here: the trials themselves (the experiments) and their files (`samples`).
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
-import tempfile
+import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from fogft import disk
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Experiment, Scale, Stage
+from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples, Store
 
+SETTINGS = "settings.json"  # of each experiment: how much was run, and with what
 Trial = tuple[str, int]
 Advance = Callable[[int, int], None]
 
@@ -71,16 +75,28 @@ def complete(
         todo = order(trials)
     advance(all_of_them - len(todo), all_of_them)
     if todo:
-        with tempfile.TemporaryDirectory(prefix="fogft-reproduce-") as folder:
-            _run(
-                experiment,
-                store,
-                Stage(scale, options, Path(folder), say),
-                todo,
-                all_of_them,
-                advance,
-            )
+        with _work_folder(store.folder / ".work", say) as folder:
+            stage = Stage(scale, options, folder, say)
+            _run(experiment, store, stage, todo, all_of_them, advance)
     return store.samples(list(trials))
+
+
+@contextlib.contextmanager
+def _work_folder(folder: Path, say: Callable[[str], None]) -> Iterator[Path]:
+    """Make an empty folder for a session, and remove it afterwards.
+
+    Pools that a killed run left in it are ended first.
+    """
+    if folder.exists():
+        say("an earlier run was killed: ending its pools first")
+        for home in folder.glob("*/home"):
+            Pools(home.parent).close()
+        shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _run(
@@ -100,14 +116,29 @@ def _run(
             advance(all_of_them - len(todo) + number + 1, all_of_them)
 
 
+def found(into: Path, experiments: Mapping[str, Experiment]) -> dict[str, Samples]:
+    """Return the samples of every experiment that is complete in a results folder.
+
+    Each with the scale with which it was run: what an earlier run left counts too.
+    """
+    out = {}
+    for name, experiment in experiments.items():
+        settings = disk.read_json(into / name / SETTINGS)
+        if settings is None:
+            continue
+        trials = experiment.trials(Scale(settings["scale"]))
+        store = Store(into / name, experiment.fields)
+        if not missing(store, trials):
+            out[name] = store.samples(list(trials))
+    return out
+
+
 def check_settings(path: Path, settings: Mapping[str, object]) -> None:
     """Hold a results folder to the settings with which it was begun; note them in a new one.
 
     Raises:
         EvaluationError: It was made with others.
     """
-    from fogft import disk
-
     before = disk.read_json(path)
     if before is None:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -55,14 +55,14 @@ class Store:
     """
 
     def __init__(self, folder: Path, fields: Sequence[str]) -> None:
-        self._folder = folder
+        self.folder = folder
         self._head = [*COMMON, *fields]
 
     def file(self, condition: str) -> Path:
         """Return where a condition's rows lie."""
         if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", condition):
             raise ValueError(f"a condition is lower-case letters, digits, dashes: {condition!r}")
-        return self._folder / f"{condition}.csv"
+        return self.folder / f"{condition}.csv"
 
     def append(self, condition: str, row: Row) -> None:
         """Put a row at the end of its file, with one write.
@@ -74,7 +74,7 @@ class Store:
             odd = sorted(set(row) ^ set(self._head))
             raise ValueError(f"{condition}: missing or unknown columns: {odd}")
         path = self.file(condition)
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         text = "" if path.exists() and path.stat().st_size else _line(self._head)
         text += _line([_cell(row[name]) for name in self._head])
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
@@ -117,7 +117,7 @@ class Store:
 
     def clear(self) -> None:
         """Remove all rows."""
-        for path in self._folder.glob("*.csv"):
+        for path in self.folder.glob("*.csv"):
             path.unlink()
 
     def samples(self, conditions: Sequence[str]) -> Samples:

@@ -152,3 +152,20 @@ def test_results_of_other_settings_are_not_mixed(tmp_path):
     check_settings(path, {"scale": "quick", "options": {}})
     with pytest.raises(EvaluationError, match=r"\(scale\).*--into"):
         check_settings(path, {"scale": "full", "options": {}})
+
+
+def test_what_a_killed_run_left_is_removed_first(tmp_path):
+    """Its work folder is not taken for the new session's, whose folder is empty."""
+    left = tmp_path / ".work" / "pools" / "something"
+    left.mkdir(parents=True)
+    said = []
+
+    class Looking(Counting):
+        @contextlib.contextmanager
+        def session(self, stage):
+            assert list(stage.folder.iterdir()) == []
+            yield self.run
+
+    run(Looking(), tmp_path, say=said.append)
+    assert "ending its pools" in said[0]
+    assert not (tmp_path / ".work").exists()
