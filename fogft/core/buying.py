@@ -17,9 +17,10 @@ from fogft.core.groups import Group
 from fogft.core.health import Verdict
 from fogft.core.history import History
 from fogft.core.intent import Intent
+from fogft.core.listing import catalogue
 from fogft.core.model import Observed, Offer, Placement
 from fogft.core.needs import Need, home
-from fogft.core.placement import Choice, Market, is_possible
+from fogft.core.placement import Choice, Market
 from fogft.core.quarantine import (
     EVERYWHERE,
     Backoff,
@@ -29,7 +30,6 @@ from fogft.core.quarantine import (
     resting,
 )
 from fogft.core.score import Scale
-from fogft.core.sizing import sold_to
 from fogft.core.spec import PoolSpec
 
 # Reasons that speak neither against the place nor for it: a replacement may go there again.
@@ -67,20 +67,15 @@ class Buyer:
     sacrificed: list[tuple[Standing, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        ours = {s.judged.machine.placement.region for s in self.census.everyone()}
-        self._offered = {
-            o.placement: o.usd_per_hour
-            for o in self.observed.offers
-            if o.placement.region in ours  # to hash thousands of placements takes a while
-        }
+        self._catalogue = catalogue(self.observed.offers)
         self._spent = sum(self._price(s) for s in self.census.everyone())
         self._resting = resting(self.history, self.observed.now)
         self._avoided = avoided(self.history, self.observed.now)
         self._markets: dict[tuple[str, bool | None, bool], Market] = {}
         self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
-        wrong = [o.placement.location for o in self.observed.offers if not is_possible(o)]
+        wrong = self._catalogue.impossible
         if wrong:
-            self.notes.append(f"offers with impossible prices are ignored, such as `{wrong[0]}`")
+            self.notes.append(f"offers with impossible prices are ignored, such as `{wrong}`")
 
     @property
     def budget(self) -> float | None:
@@ -122,11 +117,9 @@ class Buyer:
 
     def _market(self, group: Group, spot: bool | None, resting: Mapping[str, Backoff]) -> Market:
         return Market(
-            sold_to(self.observed.offers, group.offers, spot),
-            excluded=self.intent.excluded,
+            self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale),
             resting=resting,
             avoid=(*self._avoided, *(s.location for s in self.census.lost)),
-            scale=self.scale,
         )
 
     def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
@@ -163,7 +156,7 @@ class Buyer:
     def _price(self, standing: Standing) -> float:
         """Return what a machine costs: as ordered, or more where its spot price has risen."""
         placement = standing.judged.machine.placement
-        return max(standing.usd_per_hour, self._offered.get(placement, 0.0))
+        return max(standing.usd_per_hour, self._catalogue.prices.get(placement, 0.0))
 
     def _choose(self, need: Need, budget: float | None) -> tuple[Choice, str]:
         old = need.replaces

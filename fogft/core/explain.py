@@ -19,8 +19,9 @@ from fogft.core.cost import Cost, cost
 from fogft.core.groups import group_at, services_at
 from fogft.core.history import History
 from fogft.core.intent import Intent
+from fogft.core.listing import is_possible
 from fogft.core.model import Observed, Offer, Placement
-from fogft.core.placement import crowding, domains, is_possible
+from fogft.core.placement import crowding, domains
 from fogft.core.planner import plan
 from fogft.core.quarantine import AVOID_MEMORY_S, EVERYWHERE, avoided, resting
 from fogft.core.score import Scale

@@ -12,13 +12,15 @@ Not here: the file they are stored in (`fogft.pool.store`) and what to make of f
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from typing import Any, TypeVar
 
 from fogft.core.errors import StateError
 from fogft.core.model import supply
+
+T = TypeVar("T")
 
 
 class EventKind(str, Enum):
@@ -138,11 +140,15 @@ class History:
         self._failures: dict[str, list[Failure]] = {}
         self._proven_at: dict[str, float] = {}
         self._losses: dict[str, list[float]] = {}
+        self.version = 0  # of all facts: counts events
+        self._places = 0  # of failures, proofs and losses alone
+        self._worked_out: dict[Callable[..., Any], tuple[int, float, Any]] = {}
         for event in events:
             self.add(event)
 
     def add(self, event: Event) -> None:
         """Take one more event into account. Events come in the order they happened."""
+        self.version += 1
         key = (event.slot, event.generation)
         latest = self._generations.get(event.slot, 0)
         self._generations[event.slot] = max(latest, event.generation)
@@ -167,6 +173,7 @@ class History:
         # Launches and marks change none of these.
         later._failures, later._proven_at = self._failures, self._proven_at
         later._losses = self._losses
+        later._places, later._worked_out = self._places, self._worked_out
         for event in events:
             if event.kind not in _ORDERS:
                 raise ValueError(f"`{event.kind.value}` is none of our own orders")
@@ -183,6 +190,7 @@ class History:
                 record.first_ready_at = event.at
             record.unready_since = None
             self._proven_at[record.supply] = event.at
+            self._places += 1
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
         elif kind is EventKind.DRAINING:
@@ -199,10 +207,12 @@ class History:
                 self._fail(record, event)
             if kind is EventKind.GONE:
                 insort(self._losses.setdefault(record.location, []), event.at)
+                self._places += 1
             record.closed = kind
             record.closed_at = event.at
 
     def _fail(self, record: Record, event: Event) -> None:
+        self._places += 1
         cause = event.detail.split(":")[0].split(" ")[0] or "error"
         failures = self._failures.setdefault(record.supply, [])
         insort(failures, Failure(event.at, cause), key=lambda failure: failure.at)
@@ -237,6 +247,20 @@ class History:
     def proven_at(self, supply: str) -> float:
         """Return when a replica from there last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
+
+    def of_places(self, work_out: Callable[[History, float], T], now: float) -> T:
+        """Return what follows from failures, proofs and losses at a time; worked out only once.
+
+        Args:
+            work_out: Pure, and looks at nothing else of a history.
+            now: Seconds since the epoch.
+        """
+        known = self._worked_out.get(work_out)
+        if known is None or known[:2] != (self._places, now):
+            known = (self._places, now, work_out(self, now))
+            self._worked_out[work_out] = known
+        found: T = known[2]
+        return found
 
     @property
     def losses(self) -> Mapping[str, list[float]]:

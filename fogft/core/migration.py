@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from fogft.core.buying import Buyer
 from fogft.core.endings import Census, Standing
 from fogft.core.health import Health
+from fogft.core.listing import catalogue
 from fogft.core.needs import home
 from fogft.core.placement import Choice, crowding, domains
 from fogft.core.score import gain
@@ -110,8 +111,8 @@ def _best(buyer: Buyer, standing: Standing, *, at_leisure: bool = False) -> Choi
 def _score(buyer: Buyer, standing: Standing) -> float:
     """Return the score of where it is, at today's price there if that is known."""
     machine = standing.judged.machine
-    today = [o.usd_per_hour for o in buyer.observed.offers if o.placement == machine.placement]
-    price = min(today, default=machine.usd_per_hour)
+    today = catalogue(buyer.observed.offers).cheapest
+    price = today.get(machine.placement, machine.usd_per_hour)
     return buyer.scale.score_of(price, buyer.scale.latency(machine.placement))
 
 

@@ -31,12 +31,16 @@ class Need:
 
 def home(groups: Sequence[Group], slot: int) -> Group:
     """Return the group that a slot's replica counts for: its own, else the last ordinary one."""
+    if len(groups) == 1:
+        return groups[0]
     ordinary = [group for group in groups if group.name != CRITICAL]
     return next((group for group in groups if group.owns(slot)), ordinary[-1])
 
 
 def part(census: Census, groups: Sequence[Group], group: Group) -> Census:
-    """Return the part of a census that counts for a group."""
+    """Return the part of a census that counts for a group; it is not to be changed."""
+    if len(groups) == 1:
+        return census
     return census.of(lambda slot: home(groups, slot) is group)
 
 

@@ -72,6 +72,7 @@ def plan(
     history: History,
     *,
     drain_limit_s: float = DRAIN_LIMIT_S,
+    health: Health | None = None,
 ) -> Plan:
     """Return what brings the pool closer to what is wanted, within the safety laws.
 
@@ -85,9 +86,10 @@ def plan(
         observed: The world now, `observed.now` included.
         history: What happened before.
         drain_limit_s: The longest that a replica to be ended is waited for.
+        health: What `judge` makes of these very arguments, where that is known already.
     """
     step = functools.partial(_plan_once, pool_uid, spec, intent, drain_limit_s=drain_limit_s)
-    decided = latest = step(observed, history)
+    decided = latest = step(observed, history, health=health)
     if observed.machines is None:
         return decided
     for _ in range(MOST_PASSES):
@@ -133,11 +135,12 @@ def _plan_once(
     history: History,
     *,
     drain_limit_s: float,
+    health: Health | None = None,
 ) -> Plan:
     if observed.machines is None:
         known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
         return Plan(known, notes=("the cloud cannot be reached: nothing is changed",))
-    health = judge(pool_uid, spec, observed, history)
+    health = health or judge(pool_uid, spec, observed, history)
     if intent.stopping:
         ends = [PlannedEnd(j.id, "down") for j in health.replicas if j.id not in observed.ending]
         return Plan(0, terminations=tuple(ends), notes=("stopping",), health=health)

@@ -64,6 +64,10 @@ def resting(history: History, now: float) -> Mapping[str, Backoff]:
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """
+    return history.of_places(_resting, now)
+
+
+def _resting(history: History, now: float) -> Mapping[str, Backoff]:
     out: dict[str, Backoff] = {}
     setup_failures: list[Failure] = []
     for location, failures in history.failures.items():
@@ -97,6 +101,10 @@ def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | 
 
 def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
     """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
+    return history.of_places(_disappointing, now)
+
+
+def _disappointing(history: History, now: float) -> Mapping[str, Backoff]:
     out: dict[str, Backoff] = {}
     for supply, failures in history.failures.items():
         lately = [f for f in _lately(failures, now) if f.at > history.proven_at(supply)]
@@ -108,12 +116,14 @@ def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
 
 def _lately(failures: Sequence[Failure], now: float) -> Sequence[Failure]:
     """Return those that still count, of failures in order of time."""
-    first = bisect_right(failures, now - FORGIVE_S, key=_at)
-    return failures[first : bisect_right(failures, now, lo=first, key=_at)]
-
-
-def _at(failure: Failure) -> float:
-    return failure.at
+    if not failures or failures[-1].at <= now - FORGIVE_S:
+        return ()
+    first = end = len(failures)
+    while end and failures[end - 1].at > now:
+        end -= 1
+    while first and failures[first - 1].at > now - FORGIVE_S:
+        first -= 1
+    return failures[first:end]
 
 
 def backoff(failures: list[Failure], now: float) -> Backoff | None:
@@ -132,6 +142,10 @@ def backoff(failures: list[Failure], now: float) -> Backoff | None:
 
 def avoided(history: History, now: float) -> Mapping[str, float]:
     """Return the locations to use only when no other is left, and until when."""
+    return history.of_places(_avoided, now)
+
+
+def _avoided(history: History, now: float) -> Mapping[str, float]:
     out: dict[str, float] = {}
     for location, losses in history.losses.items():
         first = bisect_right(losses, now - AVOID_MEMORY_S)
@@ -143,18 +157,20 @@ def avoided(history: History, now: float) -> Mapping[str, float]:
     return out
 
 
-def next_change(history: History, now: float) -> float:
-    """Return when, if nothing happens, a location may no longer be at rest or avoided.
+def next_change(history: History, now: float, *, needy: bool = True) -> float:
+    """Return when, if nothing happens, another location may be chosen.
 
     Infinity for never. An older failure that is forgiven meanwhile may end a rest early.
+
+    Args:
+        needy: A machine is wanted that a rest keeps from being launched. Else only who could be
+            better off elsewhere waits for anything.
     """
-    rests = resting(history, now)
-    times = [rest.since + EAGER_S for rest in rests.values()]
-    times += [rest.until for rest in disappointing(history, now).values()]
-    for location, rest in rests.items():
+    times = [rest.until for rest in disappointing(history, now).values()]
+    for location, rest in resting(history, now).items() if needy else ():
         places = list(history.failures) if location == EVERYWHERE else [location]
         forgiven = (f.at + FORGIVE_S for p in places for f in _lately(history.failures[p], now))
-        times += [rest.until, *(at for at in forgiven if at < rest.until)]
+        times += [rest.since + EAGER_S, rest.until, *(at for at in forgiven if at < rest.until)]
     for location, until in avoided(history, now).items():
         forgotten = (at + AVOID_MEMORY_S for at in history.losses[location])
         times += [until, *(at for at in forgotten if at < until)]

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from fogft.core.availability import Expected, expected
 from fogft.core.groups import Group, critical_group, groups_of, shares
 from fogft.core.intent import Intent
+from fogft.core.listing import catalogue
 from fogft.core.model import Observed, Offer
 from fogft.core.placement import Market
 from fogft.core.reliability import replicas_needed
@@ -108,8 +109,8 @@ class Markets:
         market: Makes a market of some of them.
     """
 
-    def __init__(self, offers: Iterable[Offer], scale: Scale, excluded: Iterable[str]) -> None:
-        self._offers = tuple(offers)
+    def __init__(self, offers: Sequence[Offer], scale: Scale, excluded: Iterable[str]) -> None:
+        self._catalogue = catalogue(offers)
         self._scale = scale
         self._excluded = frozenset(excluded)
         self._made: dict[tuple[str, bool | None], Market] = {}
@@ -137,14 +138,9 @@ class Markets:
     def _market(self, name: str, spot: bool | None) -> Market:
         key = (name, spot)
         if key not in self._made:
-            mine = sold_to(self._offers, name, spot)
-            self._made[key] = Market(mine, excluded=self._excluded, scale=self._scale)
+            found = self._catalogue.listing(name, spot, self._excluded, self._scale)
+            self._made[key] = Market(found)
         return self._made[key]
-
-
-def sold_to(offers: Iterable[Offer], group: str, spot: bool | None) -> list[Offer]:
-    """Return the offers for a group; of one kind only unless `spot` is None."""
-    return [o for o in offers if o.group == group and spot in (None, o.placement.spot)]
 
 
 @dataclass(frozen=True)

@@ -156,17 +156,20 @@ class Reconciler:
         asked, (spec, trial) = spec, self._updating.look(identity.uid, observed, history)
         if spec is not asked:  # rolled back: what is sold to it may differ
             observed, trouble = self._observe(identity, spec)
+        health, judged_at = None, 0
         if observed.machines is not None:
             self._remember.losses(observed)
             self._ask_about_silent(observed, history)
-            health = judge(identity.uid, spec, observed, history)
+            health, judged_at = judge(identity.uid, spec, observed, history), history.version
             self._remember.health(health, history, observed.now)
+        if history.version != judged_at:  # it remembers more now: judge by all of it
+            health = None
         hours = (spec, intent, identity.created_at, observed.now)
         trouble += lifetime.notes(*hours)
         over = lifetime.is_over(*hours)
         if over:
             intent = replace(intent, stopping=True)
-        decided = plan(identity.uid, spec, intent, observed, history)
+        decided = plan(identity.uid, spec, intent, observed, history, health=health)
         if over:
             ends = tuple(replace(end, reason="`max_hours` is over") for end in decided.terminations)
             decided = replace(decided, terminations=ends)
@@ -237,7 +240,9 @@ class Reconciler:
                 log.info("refresh_ordered replica=%s", id.short)
 
     def _current_offers(self, spec: PoolSpec, now: float, trouble: list[str]) -> tuple[Offer, ...]:
-        key = json.dumps(sales(spec), sort_keys=True, default=str)
+        key = spec.derived.get("sales")
+        if key is None:
+            key = spec.derived["sales"] = json.dumps(sales(spec), sort_keys=True, default=str)
         known = self._offers_for
         if known is None or known[0] != key or not 0 <= now - known[1] < OFFERS_EVERY_S:
             try:

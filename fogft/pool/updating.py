@@ -46,7 +46,7 @@ class Updating:
             trial = Trial(store.applied(), began_at=observed.now)
             store.write_trial(trial)
             log.info("file_applied file=%s", trial.file)
-        if good is None or trial.fault or observed.machines is None:
+        if good is None or good is spec or trial.fault or observed.machines is None:
             return spec, trial
         health = judge(uid, spec, observed, history)
         fault = rollout.fault(spec, good, health, history, trial.began_at)

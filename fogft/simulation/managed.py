@@ -10,9 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fogft.core import migration, quarantine, schedule
+from fogft.core.endings import DRAIN_SETTLE_S
+from fogft.core.groups import groups_of
 from fogft.core.history import Event, History, compacted
 from fogft.core.intent import Intent
-from fogft.core.model import LinkReport, LinkState, Membership
+from fogft.core.model import LinkReport, LinkState, Membership, ReplicaId
+from fogft.core.planner import DRAIN_LIMIT_S
 from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
 from fogft.pool.reconciler import Reconciler, Tick
@@ -20,7 +23,7 @@ from fogft.pool.store import Identity
 from fogft.simulation.world import NEVER, TICK_S, Target, World
 
 UID = "0" * 16
-LOOK_EVERY_S = 900.0  # a safety net: tests show that the results do not depend on it
+LOOK_EVERY_S = 6 * 3600.0  # a safety net: tests show that the results do not depend on it
 _COMPACT_AFTER = 2_000
 
 
@@ -92,6 +95,10 @@ class Memory:
             self._history = History(self.events)
 
 
+def _ids(membership: Membership | None) -> set[ReplicaId]:
+    return {member.id for member in membership.members} if membership else set()
+
+
 _NO_WISHES = Intent()
 _TRIAL = Trial("simulated")
 
@@ -113,24 +120,24 @@ class Managed:
         self.store.compact(now)
         before = self.store.published
         tick = self._reconciler.tick()
-        done = tick.plan.terminations or tick.plan.draining
-        if done or self.store.published is not before:  # its next look sees other links
+        if _ids(self.store.published) - _ids(before):  # its next look sees links to them
             return now + TICK_S
         return min(now + LOOK_EVERY_S, self._next_timer(tick))
 
     def _next_timer(self, tick: Tick) -> float:
         history, now = self.store.history(), tick.observed.now
         health = tick.spec.health
-        times = [quarantine.next_change(history, now)]
+        times = [quarantine.next_change(history, now, needy=self._is_needy(tick))]
         if tick.spec.schedule is not None:
             times.append(schedule.next_change(tick.spec.schedule, now))
         for record in history.open():
             if record.draining_since is not None:
-                return now + TICK_S
+                ends = (DRAIN_SETTLE_S, DRAIN_LIMIT_S)
+                times += [record.draining_since + limit_s for limit_s in ends]
             if record.first_ready_at is None:
                 times.append(record.launched_at + health.start_limit_s + TICK_S)
                 continue
-            stays = [migration.RETURN_AFTER_S]
+            stays = [migration.RETURN_AFTER_S] if record.on_demand else []
             stays += [tick.spec.migration.stay_s] if tick.spec.migration else []
             times += [record.first_ready_at + stay_s for stay_s in stays]
         for vm in self.world.vms.values():
@@ -140,6 +147,12 @@ class Managed:
                     for patience_s in (health.suspect_after_s, health.replace_after_s)
                 ]
         return min((at for at in times if at > now), default=NEVER)
+
+    def _is_needy(self, tick: Tick) -> bool:
+        """Whether a launch may be waiting for a rest to end."""
+        there = [vm for vm in self.world.vms.values() if vm.gone_at == NEVER and not vm.noticed]
+        stand_ins = any(g.on_demand.fallback or g.on_demand.base for g in groups_of(tick.spec))
+        return stand_ins or len(there) < tick.plan.wanted or bool(tick.plan.notes)
 
     def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...]:
         """Report as the client proxy does: of the published members, by what was heard."""

@@ -60,14 +60,30 @@ class Meter:
     longest_outage_s: float = 0.0
     curve: list[tuple[float, int]] = field(default_factory=list)
     _down_s: float = 0.0
+    _pending: tuple[float, float, int, int, float] | None = None
 
     def pass_time(
         self, now_s: float, seconds: float, *, ready: int, wanted: int, usd_per_hour: float
     ) -> None:
-        """Take into account that for so long before `now_s` nothing changed."""
+        """Take into account that for so long before `now_s` nothing changed.
+
+        Stretches in which all stays the same are one, however often somebody looked: so the sums
+        are the same to the last bit.
+        """
         seconds = min(seconds, now_s - self.begin_s)
         if seconds <= 0:
             return
+        if self._pending is not None:
+            _, before_s, *same = self._pending
+            if same == [ready, wanted, usd_per_hour]:
+                self._pending = (now_s, before_s + seconds, ready, wanted, usd_per_hour)
+                return
+            self._add(*self._pending)
+        self._pending = (now_s, seconds, ready, wanted, usd_per_hour)
+
+    def _add(
+        self, now_s: float, seconds: float, ready: int, wanted: int, usd_per_hour: float
+    ) -> None:
         self.seconds += seconds
         self.ready_s += seconds * ready
         self.usd += seconds / 3600.0 * usd_per_hour
@@ -90,6 +106,9 @@ class Meter:
 
     def outcome(self) -> Outcome:
         """Return the figures so far."""
+        if self._pending is not None:
+            self._add(*self._pending)
+            self._pending = None
         return Outcome(
             seconds=self.seconds,
             available=self.up_s / self.wanted_s if self.wanted_s else 1.0,

@@ -71,7 +71,7 @@ def test_text_has_costs_availability_and_response(pool, capsys):
     assert "replicas      2 of 2 wanted" in out
     assert "a month" in out
     assert "one on-demand cpu8" in out
-    assert "0.996549 expected (0.999527 if replicas failed independently)" in out
+    assert "0.996550 expected (0.999527 if replicas failed independently)" in out
     assert "spot up 15 h" in out
     assert "response      11 ms and the service's own time; 23 ms while" in out
     assert "(pool file)" in out
@@ -166,7 +166,7 @@ def test_a_target_out_of_reach_is_a_warning(pool, capsys):
     assert main.run(["plan", str(pool)]) == 0
     captured = capsys.readouterr()
     assert "0.99999 is asked for" in captured.out
-    assert "cannot be met: 2 replicas are expected to reach 0.996549" in captured.err
+    assert "cannot be met: 2 replicas are expected to reach 0.99655" in captured.err
 
 
 def test_regions_that_cannot_be_measured_are_told(pool, tmp_path, capsys):
