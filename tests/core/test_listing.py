@@ -45,7 +45,7 @@ questions = st.lists(
 
 @given(offers, offers, questions)
 def test_what_is_kept_is_what_would_be_worked_out(sold, others, asked):
-    """Whatever was asked before, of these or of other offers, the answer is that of a fresh look."""
+    """Whatever was asked before, of these or other offers, the answer is a fresh look's."""
     for question in asked:
         for some in (sold, others, sold):
             kept = catalogue(some).listing(*question)
