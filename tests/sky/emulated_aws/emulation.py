@@ -33,7 +33,7 @@ def disk_of(instance: dict[str, Any]) -> Path:
     return IMAGE / "vm" / f"f{instance['id'][-8:]}" / "upper"
 
 
-def until(what: str, is_so: Callable[[], Any], limit_s: float = 300.0) -> Any:
+def until(what: str, is_so: Callable[[], Any], limit_s: float = 900.0) -> Any:
     """Wait until something is so; return what it gave."""
     pause, end = threading.Event(), time.monotonic() + limit_s
     while time.monotonic() < end:

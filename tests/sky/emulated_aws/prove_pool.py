@@ -14,20 +14,25 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-from tests.e2e.pool import NODES, Client
+from tests.e2e.pool import Client
 from tests.sky.emulated_aws import timetable
 from tests.sky.emulated_aws.emulation import Steps, control, disk_of, running, until
+from tests.sky.emulated_aws.pool import (
+    HOME,
+    Pool,
+    clusters,
+    machine_of,
+    open_ports,
+    processes,
+    region_of,
+)
 
-ROBOT = Path("/robot")
-FOLDER = ROBOT / "pool"
-HOME = ROBOT / "fogft"
 RATE_HZ = 5.0
 REGIONS = ("us-east-1", "us-west-2", "eu-west-1")
 POOL_FILE = f"""\
@@ -51,73 +56,9 @@ fogft:
 step = Steps()
 
 
-class Pool:
-    """One pool, as a user at the command line has it."""
-
-    def __init__(self) -> None:
-        FOLDER.mkdir(parents=True)
-        self.file = FOLDER / "pool.yaml"
-        self.file.write_text(POOL_FILE)
-        shutil.copy(NODES / "plan_service.py", FOLDER)
-        self.environ = {
-            **os.environ,
-            "FOGFT_HOME": str(HOME),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_LOG_DIR": str(ROBOT / "ros-log"),
-            "NO_COLOR": "1",
-        }
-
-    def fogft(self, *words: str, status: int = 0, limit_s: float = 400.0) -> str:
-        """Run a command; return all that it said."""
-        done = subprocess.run(
-            [sys.executable, "-m", "fogft", *words], env=self.environ, cwd=FOLDER, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-            timeout=limit_s, check=False,
-        )  # fmt: skip
-        assert done.returncode == status, f"fogft {' '.join(words)}\n{done.stdout}"
-        return done.stdout
-
-    def status(self) -> dict[str, Any]:
-        """Return `status.json`, as the manager wrote it last."""
-        return json.loads((HOME / "pools" / "proof" / "status.json").read_text())
-
-    def replicas(self, phase: str = "ready") -> dict[str, dict[str, Any]]:
-        """Return the replicas in a phase, by ``slot.generation``."""
-        found = self.status()["replicas"]
-        return {f"{r['slot']}.{r['generation']}": r for r in found if r["phase"] == phase}
-
-    def others(self, name: str) -> set[str]:
-        """Return the replicas of any phase but the one named."""
-        return {f"{r['slot']}.{r['generation']}" for r in self.status()["replicas"]} - {name}
-
-    def clusters(self) -> set[str]:
-        """Return the names of the replicas' clusters."""
-        status = self.status()
-        return {f"fogft-{status['uid']}-{r['slot']}-{r['generation']}" for r in status["replicas"]}
-
-    def whole(self, count: int) -> bool:
-        """Whether that many replicas are ready, and there is no other."""
-        status = self.status()
-        return status["ready"] == count == len(status["replicas"])
-
-    def pid(self, part: str) -> int:
-        return int(self.status()[f"{part}_pid"])
-
-
-def region_of(replica: dict[str, Any]) -> str:
-    return str(replica["location"].split("/")[1])
-
-
-def machine_of(name: str) -> dict[str, Any]:
-    """Return the instance of a replica, ``slot.generation``."""
-    slot, generation = name.split(".")
-    wanted = {"fogft-slot": slot, "fogft-generation": generation}
-    return next(i for i in running() if wanted.items() <= i["labels"].items())
-
-
 class Proof:
     def __init__(self) -> None:
-        self.pool = Pool()
+        self.pool = Pool(POOL_FILE)
         self.client: Client | None = None
         self.machines = timetable.Machines()
         self.reactions: list[str] = []
@@ -132,7 +73,7 @@ class Proof:
     def react(self, cause: str, words: str, *effects: tuple[str, str]) -> None:
         """Note how long after the cloud's last deed of a kind the manager did what."""
         at = [e["at"] for e in control("/log", post=False) if e["event"] == cause][-1]
-        log = timetable.events(HOME / "pools/proof/manager.log")
+        log = timetable.events(self.pool.state / "manager.log")
         steps = [f"{seconds:.2f} s until {name}" for name, seconds in
                  timetable.reaction(log, at, effects)]  # fmt: skip
         self.reactions.append(f"{words}: {', then '.join(steps)}")
@@ -249,6 +190,7 @@ class Proof:
         self.result = result
 
     def down(self) -> None:
+        self.pool.keep_log()
         with step("`down`, verified with the cloud"):
             print(self.pool.fogft("down"))
         assert not running()
@@ -260,49 +202,13 @@ class Proof:
         until("nothing of it runs here", lambda: not processes(), 60)
 
 
-def open_ports(region: str, cluster: str) -> set[int]:
-    """Return the ports of a cluster's machines that are open to the world."""
-    import boto3
-
-    named = [{"Name": "group-name", "Values": [f"sky-sg-{cluster}"]}]
-    found = boto3.client("ec2", region_name=region).describe_security_groups(Filters=named)
-    (group,) = found["SecurityGroups"]
-    return {
-        port
-        for rule in group["IpPermissions"]
-        for port in range(rule.get("FromPort", 0), rule.get("ToPort", 65535) + 1)
-        if rule["IpRanges"] or rule["Ipv6Ranges"]
-    }
-
-
-def clusters() -> set[str]:
-    """Return the clusters that SkyPilot has a record of."""
-    from sky.client import sdk
-
-    return {record["name"] for record in sdk.get(sdk.status(None, all_users=True))}
-
-
-def processes() -> list[str]:
-    """Return the command line of every process here that descends from one of the pool's."""
-    mark, found = f"FOGFT_HOME={HOME}\0".encode(), []
-    for entry in Path("/proc").iterdir():
-        try:
-            if entry.name.isdigit() and mark in (entry / "environ").read_bytes():
-                found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode())
-        except OSError:
-            continue
-    return found
-
-
 def main() -> int:
     results = Path(os.environ["RESULTS"])
     proof = Proof()
     try:
         proof.run()
     finally:
-        log = HOME / "pools/proof/manager.log"
-        if log.exists():
-            shutil.copy(log, results / "manager.log")
+        proof.pool.keep_log()
     told = [
         timetable.table(step.done, proof.skypilots),
         *(f"{line}\n" for line in proof.reactions),

@@ -110,7 +110,7 @@ def events(log: Path) -> list[tuple[float, str, str]]:
 def reaction(
     log: Sequence[tuple[float, str, str]], since: float, steps: Iterable[tuple[str, str]]
 ) -> list[tuple[str, float]]:
-    """Return how long after `since`, then after each other, events came.
+    """Return how long after `since`, then after each other, events came. Those that did not, miss.
 
     Args:
         log: The manager's events.
@@ -119,7 +119,9 @@ def reaction(
     """
     out = []
     for name, having in steps:
-        at = next(at for at, event, text in log if at >= since and event == name and having in text)
-        out.append((name, at - since))
-        since = at
+        found = (at for at, event, text in log if at >= since and event == name and having in text)
+        at = next(found, None)
+        if at is not None:
+            out.append((name, at - since))
+            since = at
     return out

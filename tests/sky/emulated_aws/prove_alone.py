@@ -1,0 +1,162 @@
+"""VMs that nobody looks after any more end themselves, on unmodified SkyPilot.
+
+Runs inside a world (`world.sh`). Two pools, and two more things that only a VM can show:
+
+* `alone`: its image has ROS 2 at /opt/ros, and its replica dials the robot, so that no port is
+  opened. It answers; then its manager is ended for good.
+* `hangs`: its `setup` never ends. Its manager is ended, too.
+
+So is SkyPilot's API server: the robot is gone. Each VM has to find out by itself, and to ask the
+cloud to end it. To wait for minutes and not for hours, the template's five idle minutes are made
+one, and the limit of a set-up one minute; the change vanishes with the world.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tests.e2e.pool import Client
+from tests.sky.emulated_aws.emulation import Steps, control, disk_of, running, until
+from tests.sky.emulated_aws.pool import HOME, Pool, machine_of, open_ports, processes
+
+TEMPLATE = Path(__file__).resolve().parents[3] / "templates" / "sky_task.yaml"
+DOOR = "10.66.0.1:7460"  # where VMs find the robot
+ORPHAN_AFTER_S = 60
+ALONE = f"""\
+name: alone
+resources: {{cpus: 2, use_spot: true, infra: aws/us-east-1}}
+workdir: .
+setup: |
+  set -e
+  # What an image with ROS 2 has: an installation at /opt/ros that is of no use until it is sourced.
+  ros=/opt/ros/proof
+  sudo mkdir -p $ros && sudo chown "$(id -un)" $ros
+  ~/.local/bin/uv venv -q --python /usr/bin/python3 $ros
+  ~/.local/bin/uv pip install -q --python $ros/bin/python /opt/wheelhouse/ros_*.whl numpy
+  packages=$(echo $ros/lib/python3*/site-packages)
+  rm $packages/ros_wheels_bootstrapper.pth
+  cat > $ros/setup.bash <<SETUP
+  export ROS_DISTRO=proof PYTHONPATH=$packages
+  export LD_LIBRARY_PATH=$(printf "%s:" $packages/ros_*.libs)$ros/lib
+  SETUP
+run: exec python3 plan_service.py
+fogft:
+  replicas: 1
+  dial_in: {DOOR}
+  orphan_after_s: {ORPHAN_AFTER_S}
+  services:
+    - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}}
+"""
+HANGS = """\
+name: hangs
+resources: {cpus: 2, use_spot: true, infra: aws/us-west-2}
+workdir: .
+setup: touch ~/setup-begun; setsid sleep 86400 & sleep 86400
+run: exec python3 plan_service.py
+fogft:
+  replicas: 1
+  services:
+    - {name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}
+"""
+step = Steps()
+
+
+def make_impatient() -> None:
+    """Shorten the template's waits."""
+    text = TEMPLATE.read_text()
+    for old, new in (("idle_minutes: 5", "idle_minutes: 1"), ("@SETUP_LIMIT_S@", "60")):
+        assert old in text
+        text = text.replace(old, new)
+    TEMPLATE.write_text(text)
+
+
+def up_and_left(pool: Pool) -> subprocess.Popen[bytes]:
+    """Start `up`, which would wait for a pool that never answers."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "fogft", "up", str(pool.file), "--yes"],
+        env=pool.environ, cwd=pool.folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+def of_pool(pool: Pool) -> list[dict[str, Any]]:
+    uid = pool.status()["uid"]
+    return [i for i in running() if i["labels"]["fogft-pool"] == uid]
+
+
+def reaches(host: str, port: int) -> bool:
+    with socket.socket() as one:
+        one.settimeout(5)
+        return one.connect_ex((host, port)) == 0
+
+
+def what_the_machine_has(pool: Pool) -> None:
+    """No port but ssh's is open, and the ROS 2 that serves is the image's."""
+    (name,) = pool.replicas()
+    machine = machine_of(name)
+    cluster = f"fogft-{pool.status()['uid']}-{name.replace('.', '-')}"
+    assert open_ports(machine["region"], cluster) == {22}
+    assert reaches(machine["ip"], 22)
+    assert not reaches(machine["ip"], 7447)
+    disk = disk_of(machine)
+    assert list(disk.glob("opt/ros/proof/lib/python3*/site-packages/rclpy"))
+    (packages,) = disk.glob("home/ubuntu/.fogft/venv/lib/python3*/site-packages")
+    assert (packages / "fogft").is_dir()
+    assert not (packages / "rclpy").exists(), "fogft has brought another ROS 2"
+
+
+def kill(pool: Pool) -> None:
+    os.kill(pool.pid("manager"), signal.SIGKILL)
+
+
+def main() -> int:
+    make_impatient()
+    alone, hangs = Pool(ALONE), Pool(HANGS)
+    with step("`up` with ROS 2 in the image and a replica that dials out, until it answers"):
+        print(alone.fogft("up", str(alone.file), "--yes"))
+    client = Client(alone.environ, 3600.0, 5.0, 15.0)
+    what_the_machine_has(alone)
+    waiting = up_and_left(hangs)
+
+    def hanging() -> bool:
+        mine = of_pool(hangs) if (hangs.state / "status.json").exists() else []
+        return any((disk_of(i) / "home/ubuntu/setup-begun").exists() for i in mine)
+
+    with step("`up` whose `setup` hangs, until it does"):
+        until("it hangs", hanging)
+    result = client.finish()
+    print(result)
+    assert result["answered"] == result["requests"] > 10, result
+    assert result["failed"] == result["wrong"] == result["twice"] == 0, result
+    assert len(running()) == 2
+    kill(hangs)
+    kill(alone)
+    waiting.kill()
+    waiting.wait()
+    subprocess.run(["sky", "api", "stop"], env=alone.environ, check=True, capture_output=True)
+    with step("manager and API server are gone: until the VM that hangs has ended itself"):
+        until("it is gone", lambda: not of_pool(hangs))
+    with step("... until the orphan has ended itself, too"):
+        until("it is gone", lambda: not of_pool(alone))
+    assert not running()
+    told = [e for e in control("/log", post=False) if e["event"] in ("preempt", "refused")]
+    assert not told, told
+    for pool in (alone, hangs):
+        with step(f"`down` of `{pool.name}`, which finds nothing"):
+            print(pool.fogft("down", pool.name))
+    assert not list((HOME / "pools").glob("*"))
+    subprocess.run(["sky", "api", "stop"], env=alone.environ, check=True, capture_output=True)
+    until("nothing of it runs here", lambda: not processes(), 60)
+    table = "".join(f"{end - begin:7.1f} s  {name}\n" for name, begin, end in step.done)
+    Path(os.environ["RESULTS"], "alone.txt").write_text(table)
+    print("every step passed")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
