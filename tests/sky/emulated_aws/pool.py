@@ -101,15 +101,17 @@ def machine_of(name: str) -> dict[str, Any]:
     return next(i for i in running() if wanted.items() <= i["labels"].items())
 
 
-def open_ports(region: str, cluster: str) -> set[int]:
-    """Return the ports of a cluster's machines that are open to the world."""
+def open_ports(instance: dict[str, Any]) -> set[int]:
+    """Return the ports of a machine that are open to the world."""
     import boto3
 
-    named = [{"Name": "group-name", "Values": [f"sky-sg-{cluster}"]}]
-    found = boto3.client("ec2", region_name=region).describe_security_groups(Filters=named)
-    (group,) = found["SecurityGroups"]
+    ec2 = boto3.client("ec2", region_name=instance["region"])
+    (reservation,) = ec2.describe_instances(InstanceIds=[instance["id"]])["Reservations"]
+    groups = [g["GroupId"] for g in reservation["Instances"][0]["SecurityGroups"]]
+    assert groups, "nothing protects it"
     return {
         port
+        for group in ec2.describe_security_groups(GroupIds=groups)["SecurityGroups"]
         for rule in group["IpPermissions"]
         for port in range(rule.get("FromPort", 0), rule.get("ToPort", 65535) + 1)
         if rule["IpRanges"] or rule["Ipv6Ranges"]
