@@ -12,6 +12,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests.wire.rmw_router import Router, running
+
 # No test asserts wall-clock time; Hypothesis would, by default.
 # In CI the same examples each time: a new one is found by a person, who can look at it.
 hypothesis.settings.register_profile("fogft", deadline=None, derandomize=bool(os.environ.get("CI")))
@@ -57,3 +59,10 @@ def ros_domains() -> Iterator[Callable[[], int]]:
 def ros_domain(ros_domains: Callable[[], int]) -> int:
     """Return a ROS domain id that no other test has, until this test ends."""
     return ros_domains()
+
+
+@pytest.fixture
+def rmw_router() -> Iterator[Router]:
+    """A Zenoh router, by which nodes of `rmw_zenoh` find each other."""
+    with running() as router:
+        yield router

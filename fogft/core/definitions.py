@@ -34,11 +34,19 @@ class Definition:
         fields: `REQUEST`, `RESPONSE` and each nested ``package/Message`` -> its fields, each a
             name and a type as the generated Python code tells them, in order.
         trouble: Why the type cannot be loaded there; empty when it can.
+        service_hash: Of the whole service, its event message included, as `rmw_zenoh` writes
+            it into names; empty where it is not known.
     """
 
     hash: str = ""
     fields: Mapping[str, Fields] = field(default_factory=dict)
     trouble: str = ""
+    service_hash: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether it says anything."""
+        return bool(self.hash or self.fields or self.trouble or self.service_hash)
 
 
 def to_plain(definition: Definition) -> dict[str, Any]:
@@ -46,6 +54,7 @@ def to_plain(definition: Definition) -> dict[str, Any]:
     return {
         "hash": definition.hash,
         "trouble": definition.trouble,
+        "service_hash": definition.service_hash,
         "fields": {name: [list(one) for one in of] for name, of in definition.fields.items()},
     }
 
@@ -61,7 +70,8 @@ def from_plain(raw: Any) -> Definition:
             _text(name): tuple((_text(key), _text(kind)) for key, kind in of)
             for name, of in raw["fields"].items()
         }
-        return Definition(_text(raw["hash"]), fields, _text(raw["trouble"]))
+        service_hash = _text(raw.get("service_hash", ""))  # an older replica tells none
+        return Definition(_text(raw["hash"]), fields, _text(raw["trouble"]), service_hash)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"not a definition: {error!r}") from error
 
@@ -92,6 +102,8 @@ def difference(type_name: str, here: Definition, there: Definition) -> str:
             return f"`{type_name}` cannot be loaded {side}: {definition.trouble}"
     if here.hash and here.hash == there.hash:
         return ""
+    if not (here.fields and there.fields):  # on either side only its hash is known
+        return _of_service_hashes(type_name, here.service_hash, there.service_hash)
     for part in (REQUEST, RESPONSE):
         found = _first_difference(part, part, here, there, set())
         if found:
@@ -99,6 +111,13 @@ def difference(type_name: str, here: Definition, there: Definition) -> str:
     if here.hash and there.hash and here.hash.partition("_")[0] == there.hash.partition("_")[0]:
         return f"`{type_name}` is not the same: its hash is {here.hash} here, {there.hash} there"
     return ""
+
+
+def _of_service_hashes(type_name: str, here: str, there: str) -> str:
+    comparable = here and there and here.partition("_")[0] == there.partition("_")[0]
+    if not comparable or here == there:
+        return ""
+    return f"`{type_name}` is not the same: its hash is {here} here, {there} there"
 
 
 def _first_difference(

@@ -41,6 +41,10 @@ class RosError(FogftError):
     """ROS 2, or one of its types, is not usable here."""
 
 
+class Unreadable(RosError):
+    """These bytes are no message of the type: sending them again cannot help."""
+
+
 class WireError(FogftError):
     """A link or a listener cannot be made."""
 

@@ -10,6 +10,7 @@ from enum import Enum
 from functools import cached_property
 from typing import Any
 
+from fogft.core.middleware import Middleware, Speaks
 from fogft.core.spec_choices import (
     AvailabilitySpec,
     FallbackSpec,
@@ -108,6 +109,12 @@ class ServiceSpec:
     part: Part = Part.NONE
 
     @property
+    def needs_type(self) -> bool:
+        """Whether the policy looks into responses, or makes one: the type must be loadable."""
+        looks = bool(self.ok_field) or self.quorum > 1 or self.state is not None
+        return looks or self.on_timeout is OnTimeout.EMPTY
+
+    @property
     def advertised(self) -> Advertise:
         """When it is offered: as told; else while it can be answered.
 
@@ -160,6 +167,7 @@ class PoolSpec:
             whatever its routes say.
         metrics: Where processes listen for Prometheus.
         topics: What passes besides services; those of actions are among them.
+        rmw: How the proxies speak ROS.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
@@ -182,6 +190,7 @@ class PoolSpec:
     uplinks: tuple[str, ...] = ()
     metrics: MetricsSpec = field(default_factory=MetricsSpec)
     topics: tuple[TopicSpec, ...] = ()
+    rmw: Middleware = field(default_factory=Middleware)
     task: Mapping[str, Any] = field(default_factory=dict)
     discovered: tuple[ServiceSpec, ...] = ()
 
@@ -220,6 +229,8 @@ class PoolSpec:
             asked["topics"] = sorted(str(topic) for topic in self.topics)
         if self.rendezvous or self.dial_in:
             asked["connectivity"] = [self.rendezvous, self.dial_in]
+        if self.rmw.replica is not Speaks.RCLPY:
+            asked["rmw"] = self.rmw.replica.value
         kinds = _kinds_of_machine(resources)
         if kinds != ["{}"]:
             asked["machine"] = kinds

@@ -30,7 +30,7 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
         "groups",
         "schedule",
         "migration",
-        *("topology", "uplinks", "metrics", "topics"),
+        *("topology", "uplinks", "metrics", "topics", "rmw"),
     ):
         found += _section(key, getattr(before, key), getattr(after, key))
     found += [

@@ -1,10 +1,13 @@
-"""Judge `rendezvous`, `dial_in`, `uplinks`, `metrics` of a pool file: how parts are reached."""
+"""Judge `rendezvous`, `dial_in`, `uplinks`, `metrics`, `rmw`: how a pool's parts are reached."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from fogft.core.membership import is_endpoint
+from fogft.core.middleware import Middleware, Speaks
 from fogft.core.spec_choices import MetricsSpec
-from fogft.core.spec_keys import METRICS_KEYS
+from fogft.core.spec_keys import METRICS_KEYS, RMW_KEYS
 from fogft.core.spec_tree import Section, shown
 from fogft.core.uplinks import is_interface
 
@@ -96,6 +99,23 @@ def read_metrics(ours: Section) -> MetricsSpec:
         what = "leaves no room: replica SLOT has this port plus SLOT, which would be above 65535"
         raise section.error("replica", what, f"write a port up to {_LAST_REPLICA_PORT}")
     return MetricsSpec(**found)
+
+
+def read_rmw(ours: Section) -> Middleware:
+    """Return how the proxies speak ROS: one way for all, or one for each side.
+
+    Raises:
+        SpecError: It is none of the ways there are.
+    """
+    node = ours.children.get("rmw")
+    if node is None or not isinstance(node.value, Mapping):
+        both = ours.choice("rmw", Speaks.RCLPY)
+        return Middleware(both, both)
+    section = ours.section("rmw")
+    section.only(RMW_KEYS)
+    return Middleware(
+        section.choice("robot", Speaks.RCLPY), section.choice("replica", Speaks.RCLPY)
+    )
 
 
 def _endpoint(ours: Section, key: str, value: object, hint: str) -> str:

@@ -29,6 +29,7 @@ FOGFT_KEYS = (
     "metrics",
     "topics",
     "actions",
+    "rmw",
 )
 SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
@@ -37,6 +38,7 @@ SERVICE_KEYS = (
     "uplinks",
     *("replicas", "traffic", "quorum", "tolerance", "state"),
 )
+RMW_KEYS = ("robot", "replica")
 TOPOLOGY_KEYS = ("gateways", "robots", "through")
 GATEWAY_KEYS = ("name", "endpoint", "through")
 ROBOT_KEYS = ("name", "through")

@@ -14,12 +14,14 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import PurePath
 
+from fogft.core.middleware import Speaks
 from fogft.core.names import POOL_NAME_PATTERN
 from fogft.core.spec import MAX_REPLICAS, HealthSpec, PoolSpec, ServiceSpec
 from fogft.core.spec_connectivity import (
     read_dial_in,
     read_metrics,
     read_rendezvous,
+    read_rmw,
     read_uplinks,
 )
 from fogft.core.spec_keys import DAY_S, FOGFT_KEYS, HEALTH_KEYS, LATER_KEYS, places
@@ -117,6 +119,7 @@ def pool_spec(
         uplinks=read_uplinks(ours),
         metrics=read_metrics(ours),
         topics=topics,
+        rmw=read_rmw(ours),
         task=task,
     )
     workdir = spec.task.get("workdir")
@@ -124,7 +127,8 @@ def pool_spec(
         _judge(top, "workdir", check_workdir(workdir))
     sections = ours.sections("services", "") if services else ()
     for section, service in zip(sections, services, strict=True):
-        if check_types is not None:
+        passes_through = spec.rmw.robot is Speaks.ZENOH and not service.needs_type
+        if check_types is not None and not passes_through:
             _judge(section, "type", check_types(service.type))
         if service.ok_field and check_fields is not None:
             _judge(section, "ok_field", check_fields(service.type, service.ok_field))
@@ -134,7 +138,16 @@ def pool_spec(
         if service.state is not None and check_states is not None:
             _judge(section, "state", check_states(service.state))
     _judge_topics(ours, check_types)
+    _check_passes(ours, spec)
     return spec
+
+
+def _check_passes(ours: Section, spec: PoolSpec) -> None:
+    """Refuse what does not pass over Zenoh yet."""
+    if spec.topics and Speaks.ZENOH in (spec.rmw.robot, spec.rmw.replica):
+        key = "actions" if "actions" in ours.children else "topics"
+        what = "does not go with `rmw: zenoh`: services only pass there"
+        raise ours.error(key, what, "remove one of the two")
 
 
 def _topology(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.core.errors import CredentialError, FogftError
+from fogft.core.middleware import Speaks
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
 from fogft.pool import credentials
 from fogft.pool.paths import PoolPaths
@@ -25,6 +26,9 @@ def pool_file(situation: Situation) -> Iterator[Finding]:
     from fogft.ros.types import check_service_type
 
     for service in situation.spec.services:
+        if situation.spec.rmw.robot is Speaks.ZENOH and not service.needs_type:
+            yield ok("pool file", f"service `{service.name}` passes through, of whatever type")
+            continue
         problem = check_service_type(service.type)
         if problem:
             yield fail(

@@ -98,7 +98,11 @@ def proxy_config(
             "rendezvous": list(spec.rendezvous),
             "records": paths.records.name,
             # A gateway's replicas hear of revocations from a rendezvous.
-            **({"revocations": paths.revocations.name} if file == "proxy.yaml" else {}),
+            **(
+                {"revocations": paths.revocations.name, "rmw": spec.rmw.robot.value}
+                if file == "proxy.yaml"
+                else {}
+            ),
             "dial_in": "" if robot else spec.dial_in,  # that is where this machine is
             "uplinks": [] if robot else list(spec.uplinks),  # and these are its own
             "metrics": "" if robot else spec.metrics.proxy,
@@ -190,6 +194,7 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "rendezvous": list(spec.rendezvous),
             "dial_out": [spec.dial_in] if spec.dial_in else [],
             "metrics": spec.metrics.of_replica(id.slot),
+            "rmw": spec.rmw.replica.value,
         },
     )
 

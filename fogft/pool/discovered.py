@@ -12,6 +12,7 @@ from fogft import disk
 from fogft.core import discovery, ros_names
 from fogft.core.discovery import Discovered
 from fogft.core.errors import StateError
+from fogft.core.middleware import Speaks
 from fogft.core.model import Observed
 from fogft.core.spec import PoolSpec
 
@@ -49,7 +50,7 @@ class Discovery:
         if spec.services:
             return False
         told = discovery.offered(spec.replica_hash, observed.machines or (), observed.links or ())
-        usable = {name: kind for name, kind in told.items() if not self._refusal(name, kind)}
+        usable = {name: kind for name, kind in told.items() if not self._refusal(spec, name, kind)}
         grown = discovery.grown(self._known, spec.replica_hash, usable)
         if grown == self._known:
             return False
@@ -58,17 +59,17 @@ class Discovery:
         self._known = grown
         return True
 
-    def _refusal(self, name: str, kind: str) -> str:
+    def _refusal(self, spec: PoolSpec, name: str, kind: str) -> str:
         """Return why a service cannot be offered here; it is left out then, and noted."""
         if (name, kind) not in self._refused:
-            self._refused[(name, kind)] = _check(name, kind)
+            self._refused[(name, kind)] = _check(name, kind, load=spec.rmw.robot is Speaks.RCLPY)
         why = self._refused[(name, kind)]
         if why:
             self.notes.append(f"`{name}` is not offered here: {why}")
         return why
 
 
-def _check(name: str, kind: str) -> str:
+def _check(name: str, kind: str, *, load: bool) -> str:
     from fogft.ros.types import check_service_type
 
     try:
@@ -76,4 +77,4 @@ def _check(name: str, kind: str) -> str:
             return "its name is not absolute"
     except ValueError as error:
         return str(error)
-    return check_service_type(kind) or ""
+    return (check_service_type(kind) if load else None) or ""

@@ -216,6 +216,10 @@ class ClientProxy:
         log.error("robot_revoked certificate=%s", own)
         return True
 
+    def types_changed(self) -> None:
+        """Have routes worked out anew: a type may be known here that was not. Any thread."""
+        self._change()
+
     def redial(self) -> None:
         """Dial everybody anew, by other uplinks; what is in flight is sent again."""
         with self._lock:

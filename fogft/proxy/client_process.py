@@ -14,13 +14,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from fogft import disk
 from fogft.core import names
 from fogft.core.errors import FogftError, PoolBusy, StateError
+from fogft.core.middleware import Speaks
 from fogft.core.spec import Part, ServiceSpec
-from fogft.proxy import measures
+from fogft.proxy import measures, middleware
 from fogft.proxy.actions import Actions
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.config import ClientProxyConfig, read_client
@@ -31,12 +32,12 @@ from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.process import Watched, start_log, stop_on_signal
 from fogft.proxy.seen_from_ros import SeenFromRos
 from fogft.proxy.voting import VotingDispatcher
-from fogft.ros import environment, memory_tuning
+from fogft.ros import memory_tuning
+from fogft.ros.port import RosNode, RosTopics
 from fogft.scrape import Scrape
 from fogft.wire.uplinks import UplinkDialer
 
 if TYPE_CHECKING:
-    from fogft.ros.node import SerialisedNode
     from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
@@ -96,51 +97,57 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
     lock = disk.Lock(config.lock)
     if not lock.acquire(wait=False):
         raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
-    environment.prepare(os.environ)
+    middleware.prepare(config.rmw)
     from fogft.ros import goal_status
-    from fogft.ros.definition import definition
-    from fogft.ros.node import SerialisedNode
     from fogft.ros.types import check_ok_field
 
-    memory_tuning.tune()
     sign = ManagerSign(config.lease)
-    node = SerialisedNode(_node_name("fogft_proxy", config.pool), config.domain_id)
+    made: list[ClientProxy] = []  # the node asks the proxy that is made with it
+    joined = middleware.join(
+        config.rmw,
+        _node_name("fogft_proxy", config.pool),
+        config.domain_id,
+        told=lambda: made[0].types_behind() if made else {},
+        noticed=lambda: made[0].types_changed() if made else None,
+    )
     make = functools.partial(
         make_dispatcher,
         marks=config.status.with_suffix(".marks"),
         pool_uid=config.pool_uid,
         actions=Actions(),
+        speaks=config.rmw,
     )
     dialer = make_dialer(config, sign.age_s)
     proxy = ClientProxy(
-        config.pool_uid, node, dialer, make, define=definition, merge=goal_status.merged
+        config.pool_uid, joined.node, dialer, make, define=joined.define, merge=goal_status.merged
     )
-    visible = functools.partial(_make_visible, node, _node_name("fogft", config.pool))
+    made.append(proxy)
+    visible = functools.partial(_make_visible, joined, _node_name("fogft", config.pool))
     seen = SeenFromRos(config.pool, config.robot, visible, check_ok_field)
     proxy.serve(seen.follow(config.services))
-    proxy.pass_topics(config.topics, node)
+    proxy.pass_topics(config.topics, cast(RosTopics, joined.node))
     following = Following(config)
     scrape = Scrape(lambda: measures.of_client(proxy.report()))
     scrape.at(config.metrics)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
     try:
-        parts = _Parts(proxy, following, sign, dialer, seen, scrape, metrics, node)
+        parts = _Parts(proxy, following, sign, dialer, seen, scrape, metrics, joined.node)
         _loop(config_path, config, parts, stop)
     finally:
         scrape.close()
         following.close()
         proxy.close()
-        node.close()
+        joined.node.close()
         lock.release()
         log.info("proxy_stopped pool=%s", config.pool)
 
 
 def _make_visible(
-    node: SerialisedNode, name: str, judge: Callable[[Mapping[str, Any]], str]
+    joined: middleware.Joined, name: str, judge: Callable[[Mapping[str, Any]], str]
 ) -> VisibleNode | None:
     """Make the node that people see. Without it requests flow all the same."""
     try:
-        return node.make_visible(name, judge)
+        return joined.make_visible(name, judge)
     except FogftError as error:
         log.error("visible_node_off reason=%r", error.message)
         return None
@@ -176,6 +183,7 @@ def make_dispatcher(
     marks: Path,
     pool_uid: str,
     actions: Actions,
+    speaks: Speaks = Speaks.RCLPY,
 ) -> Dispatcher | OrderedDispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
 
@@ -186,13 +194,18 @@ def make_dispatcher(
         marks: Folder of the stateful services' marks.
         pool_uid: Whose marks they are.
         actions: Makes those of actions.
+        speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
+
+    Raises:
+        RosError: The type is needed and cannot be loaded.
     """
     if spec.part is not Part.NONE:
         return actions.make(spec, respond, wake)
     from fogft.ros import types
     from fogft.ros.comparison import Comparison
 
-    empty = types.default_response(spec.type)  # the policy may become `empty` later
+    # The policy may become `empty` later.
+    empty = middleware.empty_response(speaks, spec.type, needed=spec.needs_type)
     if spec.state is not None:
         mark = MarkFile(
             marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}", pool_uid
@@ -223,7 +236,7 @@ class _Parts(NamedTuple):
     seen: SeenFromRos
     scrape: Scrape
     metrics: str | None
-    node: SerialisedNode
+    node: RosNode
 
 
 def _loop(
@@ -283,13 +296,16 @@ def _apply(step: Callable[[], None], path: Path) -> None:
 
 def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
     new = read_client(path, parts.metrics)
-    if (new.pool_uid, new.domain_id) != (old.pool_uid, old.domain_id):
-        raise StateError(f"`{path}`: pool_uid and domain_id cannot change while the proxy runs")
+    fixed = (new.pool_uid, new.domain_id, new.rmw)
+    if fixed != (old.pool_uid, old.domain_id, old.rmw):
+        raise StateError(
+            f"`{path}`: pool_uid, domain_id and rmw cannot change while the proxy runs"
+        )
     policies = {service.name: service.uplinks for service in new.services}
     if parts.dialer.use(new.uplinks, policies):
         parts.proxy.redial()
     parts.proxy.serve(parts.seen.follow(new.services))
-    parts.proxy.pass_topics(new.topics, parts.node)
+    parts.proxy.pass_topics(new.topics, cast(RosTopics, parts.node))
     parts.following.apply(new)
     parts.scrape.at(new.metrics)
     log.info("config_applied services=%d", len(new.services))

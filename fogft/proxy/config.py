@@ -14,6 +14,7 @@ from typing import Any
 from fogft.cloud.notice import SOURCES as NOTICE_SOURCES
 from fogft.core import membership, names, topics
 from fogft.core.errors import StateError
+from fogft.core.middleware import Speaks
 from fogft.core.model import ReplicaId
 from fogft.core.service_form import from_plain, seconds
 from fogft.core.spec import ServiceSpec
@@ -46,6 +47,7 @@ class ClientProxyConfig:
         uplinks: Network interfaces, the preferred one first; none for what the routes say.
         metrics: ``host:port`` to answer Prometheus at; empty for none.
         topics: What passes besides services.
+        rmw: How it speaks ROS.
     """
 
     pool: str
@@ -68,6 +70,7 @@ class ClientProxyConfig:
     uplinks: tuple[str, ...] = ()
     metrics: str = ""
     topics: tuple[TopicSpec, ...] = ()
+    rmw: Speaks = Speaks.RCLPY
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class ServerProxyConfig:
         rendezvous: ``host:port`` of each.
         records: File that keeps what was learned there.
         dial_out: Doors of robots and gateways, where this replica cannot be reached.
+        rmw: How it speaks ROS.
         notice: Where preemption notices come from: ``none``, ``file:PATH`` with an absolute
             path, or a source of `fogft.cloud.notice.watch`.
         metrics: ``host:port`` to answer Prometheus at; empty for none.
@@ -116,6 +120,7 @@ class ServerProxyConfig:
     dial_out: tuple[str, ...] = ()
     metrics: str = ""
     topics: tuple[TopicSpec, ...] = ()
+    rmw: Speaks = Speaks.RCLPY
 
 
 def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
@@ -151,6 +156,7 @@ def _client(raw: Mapping[str, Any], base: Path) -> ClientProxyConfig:
         uplinks=_interfaces(raw.get("uplinks")),
         metrics=_endpoint(raw.get("metrics") or ""),
         topics=tuple(topics.from_plain(t) for t in raw.get("topics") or ()),
+        rmw=_speaks(raw),
     )
 
 
@@ -199,6 +205,7 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
             dial_out=_endpoints(raw.get("dial_out")),
             metrics=_endpoint(raw.get("metrics") or ""),
             topics=tuple(topics.from_plain(t) for t in raw.get("topics") or ()),
+            rmw=_speaks(raw),
         )
     raise AssertionError("unreachable")
 
@@ -230,6 +237,13 @@ class _Reading:
 
 def _credentials(raw: Mapping[str, str], base: Path) -> CredentialFiles:
     return CredentialFiles(base / raw["ca"], base / raw["certificate"], base / raw["key"])
+
+
+def _speaks(raw: Mapping[str, Any]) -> Speaks:
+    speaks = Speaks(raw.get("rmw") or Speaks.RCLPY)
+    if speaks is Speaks.ZENOH and raw.get("topics"):
+        raise ValueError("rmw: zenoh passes services only; it has topics")
+    return speaks
 
 
 def _endpoints(raw: Any) -> tuple[str, ...]:

@@ -77,12 +77,14 @@ class Offering:
         return dict(self._seen)
 
     def types(self) -> dict[str, Definition]:
-        """Return the definitions of all types here."""
+        """Return the definitions of all types here; nothing until each is known."""
         if self._define is not None:
             for service in self.services:
-                if service.type not in self._definitions:
+                found = self._definitions.get(service.type)
+                if found is None or not found.known:
                     self._definitions[service.type] = self._define(service.type)
-        return dict(self._definitions)
+        told = dict(self._definitions)
+        return told if all(definition.known for definition in told.values()) else {}
 
     def missing(self, ready: frozenset[str]) -> str:
         """Return in words what is missing, and what `run` offers instead; empty if nothing is."""

@@ -17,10 +17,10 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from fogft.core import ordering
-from fogft.core.errors import RosError
+from fogft.core.errors import RosError, Unreadable
 from fogft.core.ordered_replica import Begin, OrderedReplica, Refuse, Reply
 from fogft.core.ordering import Op, OrderError
-from fogft.ros.port import RosClient, Unreadable
+from fogft.ros.port import RosClient
 from fogft.wire.port import Incoming, Refusal
 
 log = logging.getLogger(__name__)

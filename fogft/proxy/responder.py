@@ -22,10 +22,10 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping
 
-from fogft.core.errors import RosError
+from fogft.core.errors import RosError, Unreadable
 from fogft.proxy.interruption import Interruptions
 from fogft.proxy.line import Line, Work
-from fogft.ros.port import RosClient, Unreadable
+from fogft.ros.port import RosClient
 from fogft.wire.port import Incoming, Refusal
 
 log = logging.getLogger(__name__)

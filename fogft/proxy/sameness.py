@@ -55,7 +55,10 @@ class Sameness:
             return known[1]
         ours = self._ours.get(type_name)
         if ours is None and self._define is not None:
-            ours = self._ours[type_name] = self._define(type_name)
+            ours = self._define(type_name)
+            if not ours.known:
+                return ""  # until it is: where no types are loaded, a client tells its hash
+            self._ours[type_name] = ours
         why = difference(type_name, ours or Definition(), theirs)
         if why and (known is None or known[1] != why):
             log.error("type_differs replica=%s reason=%r", id.short, why)

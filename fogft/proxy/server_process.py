@@ -13,7 +13,8 @@ import threading
 from pathlib import Path
 
 from fogft.cloud import notice
-from fogft.proxy import measures
+from fogft.core.definitions import Definition
+from fogft.proxy import measures, middleware
 from fogft.proxy.announcing import Presence
 from fogft.proxy.config import ServerProxyConfig, read_server
 from fogft.proxy.process import start_log, stop_on_signal
@@ -64,8 +65,7 @@ def run(
     )
     start_log(config.log_level)
     stop = stop_on_signal()
-    environment.prepare(os.environ)
-    memory_tuning.tune()
+    middleware.prepare(config.rmw)
     proxy = _make(config)
     watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
     presence: Presence | None = None
@@ -86,16 +86,21 @@ def run(
 
 
 def _make(config: ServerProxyConfig) -> ServerProxy:
-    from fogft.ros.definition import definition
-    from fogft.ros.node import SerialisedNode
     from fogft.ros.state_bytes import StateBytes
     from fogft.wire.handshakes import HandshakeLog
     from fogft.wire.zenoh_listener import ZenohListener
 
-    def make_node() -> RosNode:
-        return SerialisedNode(f"fogft_replica_{config.id.slot}", config.domain_id)
-
     environ = run_environment(config)
+    joined: list[middleware.Joined] = []  # the newest last: the node is made anew after a crash
+
+    def define(type_name: str) -> Definition:
+        return joined[0].define(type_name)
+
+    def make_node() -> RosNode:
+        name = f"fogft_replica_{config.id.slot}"
+        joined[:] = [middleware.join(config.rmw, name, config.domain_id, environ=environ)]
+        return joined[0].node
+
     handshakes = HandshakeLog()
     return ServerProxy(
         config.id,
@@ -104,7 +109,7 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
         make_node,
         Supervisor(config.run, config.workdir, environ, stdout=handshakes.stdout),
         make_state=StateBytes,
-        define=definition,
+        define=define,
         topics=config.topics,
         max_in_flight=config.max_in_flight,
         orphan_after_s=config.orphan_after_s,

@@ -18,10 +18,10 @@ import time
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 
-from fogft.core.errors import RosError
+from fogft.core.errors import RosError, Unreadable
 from fogft.core.topic_queues import Ring, Seen
 from fogft.core.topics import Origin, TopicSpec
-from fogft.ros.port import Quality, RosPublisher, RosTopics, Unreadable
+from fogft.ros.port import Quality, RosPublisher, RosTopics
 from fogft.wire import topic_frames
 from fogft.wire.frame import FrameError
 from fogft.wire.port import Incoming, Refusal

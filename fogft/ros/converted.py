@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fogft.core.errors import RosError
-from fogft.ros.port import Unreadable
+from fogft.core.errors import RosError, Unreadable
 
 
 def _to_bytes(message: Any) -> bytes:

@@ -26,7 +26,15 @@ def definition(type_name: str) -> Definition:
         return Definition(trouble=error.message)
     except Exception as error:  # generated code: anything may go wrong in it
         return Definition(trouble=f"its fields cannot be read: {error!r}")
-    return Definition(_hash(type_name), fields)
+    hashes = _hashes(type_name)
+    parts = [hashes.get(f"{type_name}_{part}", "") for part in ("Request", "Response")]
+    return Definition(
+        # Of request and response: the service's own also covers its event message, which never
+        # travels and may change with the distribution.
+        "+".join(parts) if all(parts) else "",
+        fields,
+        service_hash=hashes.get(type_name, ""),
+    )
 
 
 def _add(name: str, message: Any, fields: dict[str, Fields]) -> None:
@@ -47,20 +55,15 @@ def _nested(name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.msg"), short)
 
 
-def _hash(type_name: str) -> str:
-    """Return a type's hash from the file that was installed with its code; empty without one.
-
-    That of request and response together: the service's own also covers its event message,
-    which never travels and may change with the distribution.
-    """
+def _hashes(type_name: str) -> dict[str, str]:
+    """Return type -> hash from the file that was installed with a type's code, if there is one."""
     package, _, short = type_name.split("/")
     code = Path(str(importlib.import_module(package).__file__)).resolve()
     for prefix in code.parents:
         path = prefix / "share" / package / "srv" / f"{short}.json"
         try:
             told = json.loads(path.read_text())["type_hashes"]
-            hashes = {one["type_name"]: str(one["hash_string"]) for one in told}
-            return "+".join(hashes[f"{type_name}_{part}"] for part in ("Request", "Response"))
+            return {str(one["type_name"]): str(one["hash_string"]) for one in told}
         except (OSError, ValueError, KeyError, TypeError):
             continue
-    return ""
+    return {}

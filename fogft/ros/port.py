@@ -4,7 +4,8 @@ One context, one node and one thread that takes (one wait set) for each `RosNode
 Callbacks come from that thread and must not block. Responses and requests may be sent
 from any thread.
 
-Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.ros.memory` (tests).
+Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.wire.rmw_node.RmwZenohNode`
+(Zenoh, no ROS installed), `fogft.ros.memory` (tests).
 """
 
 from __future__ import annotations
@@ -15,10 +16,6 @@ from enum import IntEnum
 from typing import Any, Protocol
 
 from fogft.core.errors import RosError
-
-
-class Unreadable(RosError):
-    """These bytes are no message of the type: sending them again cannot help."""
 
 
 class NotFoundYet(RosError):

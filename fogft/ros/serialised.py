@@ -17,9 +17,9 @@ from __future__ import annotations
 from ctypes import addressof, byref, c_int64, string_at
 from typing import Any
 
-from fogft.core.errors import RosError
+from fogft.core.errors import RosError, Unreadable
 from fogft.ros import rcl
-from fogft.ros.port import NotFoundYet, Unreadable
+from fogft.ros.port import NotFoundYet
 
 LARGE_BYTES = 256 * 1024
 ENCAPSULATION_BYTES = 4  # the shortest CDR there is: its header

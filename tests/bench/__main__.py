@@ -31,6 +31,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     }
     for replicas in (1, 2, 3):
         found[f"overhead-{replicas}"] = functools.partial(speed.overhead, replicas=replicas)
+    found["rmw_zenoh"] = speed.overhead_over_zenoh
     found["throughput"] = speed.throughput
     found["stalls"] = faults.stalls
     found["killed"] = faults.killed

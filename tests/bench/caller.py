@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import random
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from fogft.core.middleware import Speaks
+from fogft.proxy import middleware
 from tests.bench.service import FLAG, MAP
 
 LARGE_BYTES = 640 * 480 * 3
@@ -44,10 +47,15 @@ class Flood:
 class Caller:
     """Calls the bench's services in one ROS domain."""
 
-    def __init__(self, domain_id: int, name: str) -> None:
-        from fogft.ros.node import SerialisedNode
-
-        self._node = SerialisedNode(name, domain_id)
+    def __init__(
+        self,
+        domain_id: int,
+        name: str,
+        *,
+        speaks: Speaks = Speaks.RCLPY,
+        environ: Mapping[str, str] = os.environ,
+    ) -> None:
+        self._node = middleware.join(speaks, name, domain_id, environ=environ).node
         self._clients: dict[str, Any] = {n: self._node.client(n, t) for n, t in (FLAG, MAP)}
 
     def wait(self) -> None:

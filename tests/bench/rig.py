@@ -16,9 +16,10 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from fogft import disk
@@ -29,7 +30,7 @@ from fogft.core.spec_state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateServi
 from fogft.pool import credentials
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
-from tests.bench.service import FLAG, MAP, STATEFUL
+from tests.bench.service import FLAG, MAP, SPEAKS, STATEFUL
 
 ROOT = Path(__file__).resolve().parents[2]
 _READY_LIMIT_S = 60.0
@@ -100,6 +101,8 @@ class Rig:
         policy: More of it for the client proxy's.
         stateful: Whether its services keep state, so that their requests are ordered.
         tell_losers: Whether the client proxy tells replicas what is no longer wanted.
+        rmw: How proxies, services and callers speak ROS.
+        environ: More of the environment for every process.
     """
 
     def __init__(
@@ -114,6 +117,8 @@ class Rig:
         policy: dict[str, Any] | None = None,
         stateful: bool = False,
         tell_losers: bool = True,
+        rmw: str = "rclpy",
+        environ: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._folder = folder
         self._uid = secrets.token_hex(8)
@@ -122,6 +127,8 @@ class Rig:
         self._arguments = services or [str(sleep_s)] * replicas
         self._of_replica = replica or {}
         self._tell_losers = tell_losers
+        self._rmw = rmw
+        self._environ = environ
         self._stateful = stateful
         self._policy: dict[str, Any] = policy or {}
         self.robot_domain, *domains = free_domains(replicas + 1)
@@ -204,7 +211,8 @@ class Rig:
             "listen": f"127.0.0.1:{port}",
             "services": self._services(self._of_replica),
             "run": f"exec {sys.executable} -m tests.bench.service {self._arguments[slot]}",
-            "envs": {STATEFUL: "1"} if self._stateful else {},
+            "envs": {SPEAKS: self._rmw, **({STATEFUL: "1"} if self._stateful else {})},
+            "rmw": self._rmw,
             "workdir": str(ROOT),
             "credentials": _pair(name, "replica"),
             "domain_id": self.domains[slot],
@@ -247,6 +255,7 @@ class Rig:
             "services": self._services(self._policy),
             "domain_id": self.robot_domain,
             "tell_losers": self._tell_losers,
+            "rmw": self._rmw,
         }
         disk.write_whole(self._folder / "proxy.yaml", json.dumps(config))
 
@@ -282,7 +291,7 @@ class Rig:
         return services
 
     def _start(self, name: str, module: str, *arguments: str) -> subprocess.Popen[bytes]:
-        environ = {**child_environment(), "PYTHONPATH": str(ROOT)}
+        environ = {**child_environment(), "PYTHONPATH": str(ROOT), **self._environ}
         environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         with (self._folder / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(

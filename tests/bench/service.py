@@ -17,11 +17,13 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from fogft.ros import environment, memory_tuning
+from fogft.core.middleware import Speaks
+from fogft.proxy import middleware
 
 FLAG = ("/bench_flag", "std_srvs/srv/SetBool")
 MAP = ("/bench_map", "nav_msgs/srv/SetMap")
 STATEFUL = "FOGFT_BENCH_STATEFUL"  # set: both services can be given a state, which is empty
+SPEAKS = "FOGFT_BENCH_RMW"  # how the service speaks ROS, as `rmw` in a pool file
 CANCEL = ("/bench_cancel", "std_srvs/srv/Trigger")
 _DEFAULTS = ("0", "0", "0", "0", "16")
 
@@ -29,15 +31,13 @@ _DEFAULTS = ("0", "0", "0", "0", "16")
 def main() -> None:
     given = sys.argv[1:]
     sleep_s, sigma, stalled, stall_s, workers = map(float, (*given, *_DEFAULTS[len(given) :]))
-    environment.prepare(os.environ)
+    speaks = Speaks(os.environ.get(SPEAKS, "rclpy"))
+    middleware.prepare(speaks)
     from nav_msgs.srv import SetMap
     from rclpy.serialization import serialize_message
     from std_srvs.srv import SetBool, Trigger
 
-    from fogft.ros.node import SerialisedNode
-
-    memory_tuning.tune()
-    node = SerialisedNode("bench_service")
+    node = middleware.join(speaks, "bench_service", None).node
     pool = ThreadPoolExecutor(int(workers))
     sleeps = Sleeps(sleep_s, sigma, stalled, stall_s)
     answers = {

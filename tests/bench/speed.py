@@ -5,27 +5,45 @@ from __future__ import annotations
 import gc
 import os
 import random
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+from fogft.core.middleware import Speaks
 from tests.bench import machine
 from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.floor import Floor
 from tests.bench.rig import Rig
 from tests.bench.service import FLAG, MAP
 from tests.bench.statistics import Estimate, estimate, median, overhead_ratio, percentile
+from tests.wire import rmw_router
 
 _WARM_UP = 30
 _IN_FLIGHT = 64
 
 
-def overhead(folder: Path, replicas: int, *, quick: bool) -> list[dict[str, Any]]:
+def overhead_over_zenoh(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Do the same with `rmw: zenoh` at both ends, two replicas and a router."""
+    with rmw_router.running() as router:
+        return overhead(folder, 2, quick=quick, speaks=Speaks.ZENOH, environ=router.environ)
+
+
+def overhead(
+    folder: Path,
+    replicas: int,
+    *,
+    quick: bool,
+    speaks: Speaks = Speaks.RCLPY,
+    environ: Mapping[str, str] = MappingProxyType({}),
+) -> list[dict[str, Any]]:
     """Compare direct calls, proxied calls and bare round trips, in turns, in one run."""
     sizes = {FLAG[0]: (300 if quick else 1500, "flag"), MAP[0]: (80 if quick else 300, "map")}
     rows = []
-    with Rig(folder, replicas) as rig:
-        direct = Caller(rig.domains[0], "bench_direct")
-        proxied = Caller(rig.robot_domain, "bench_proxied")
+    with Rig(folder, replicas, rmw=speaks.value, environ=environ) as rig:
+        of_caller = {"speaks": speaks, "environ": environ}
+        direct = Caller(rig.domains[0], "bench_direct", **of_caller)
+        proxied = Caller(rig.robot_domain, "bench_proxied", **of_caller)
         floor = Floor(rig.floor_folder, rig.floor_port)
         direct.wait()
         proxied.wait()

@@ -23,6 +23,7 @@ definitions = st.builds(
     hash=st.sampled_from(["", "RIHS01_a", "RIHS01_b"]),
     fields=st.fixed_dictionaries(dict.fromkeys(("request", "response", "a/B", "c/D"), fields)),
     trouble=st.sampled_from(["", "no such package"]),
+    service_hash=st.sampled_from(["", "RIHS01_s", "RIHS01_t"]),
 )
 
 
@@ -107,3 +108,16 @@ def test_what_is_no_definition_is_refused(raw: object) -> None:
 )  # fmt: skip
 def test_what_a_field_is_made_of(kind: str, of: str) -> None:
     assert nested(kind) == of
+
+
+def test_where_one_side_knows_no_fields_the_service_s_hash_decides() -> None:
+    """A proxy that loads no type knows it by the hash in `rmw_zenoh`'s names alone."""
+    here, same = (
+        Definition(service_hash="RIHS01_s"),
+        Definition(fields=HERE, service_hash="RIHS01_s"),
+    )
+    other = Definition(fields=HERE, service_hash="RIHS01_t")
+    assert difference(TYPE, here, same) == ""
+    assert "its hash is RIHS01_s here, RIHS01_t there" in difference(TYPE, here, other)
+    for unknown in (Definition(fields=HERE), Definition(service_hash="TypeHashNotSupported")):
+        assert difference(TYPE, here, unknown) == ""

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from fogft.core import ros_names
 from fogft.core.errors import SpecError
+from fogft.core.middleware import Middleware, Speaks
 from fogft.core.names import POOL_NAME_PATTERN
 from fogft.core.service_form import to_plain
 from fogft.core.spec import HealthSpec, HedgingMode, OnTimeout, PoolSpec, ServiceSpec
@@ -230,3 +231,48 @@ def test_plain_undoes_the_tree(value):
 def test_shown_text_is_one_printable_line(text):
     """Nothing that a file holds can break a message or reach the terminal as a command."""
     assert shown(text).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("rmw", "robot", "replica"),
+    [
+        (None, "rclpy", "rclpy"),
+        ("zenoh", "zenoh", "zenoh"),
+        ({"robot": "zenoh"}, "zenoh", "rclpy"),
+        ({"replica": "zenoh", "robot": "rclpy"}, "rclpy", "zenoh"),
+    ],
+)
+def test_rmw_is_one_word_or_one_for_each_side(rmw, robot, replica):
+    """Client proxies and server proxies may speak ROS differently; only replicas are replaced."""
+    spec = read(document(**({} if rmw is None else {"rmw": rmw})))
+    assert spec.rmw == Middleware(Speaks(robot), Speaks(replica))
+    same = read(document()).replica_hash == spec.replica_hash
+    assert same == (replica == "rclpy")
+
+
+@pytest.mark.parametrize("rmw", ["dds", 3, ["zenoh"], {"robots": "zenoh"}, {"robot": "rmw_zenoh"}])
+def test_rmw_is_one_of_the_ways_there_are(rmw):
+    with pytest.raises(SpecError, match=r"pool.yaml:1: fogft\.rmw"):
+        read(document(rmw=rmw))
+
+
+def test_a_robot_over_zenoh_needs_no_type_but_where_a_policy_looks_into_responses():
+    """What passes through untouched need not be known; what is made or read must be."""
+    refuse = {"check_types": lambda name: f"there is no `{name}`"}
+    assert read(document(rmw="zenoh"), **refuse).rmw.robot is Speaks.ZENOH
+    for rmw in ("rclpy", {"replica": "zenoh"}):
+        with pytest.raises(SpecError, match="there is no"):
+            read(document(rmw=rmw), **refuse)
+    for policy in ({"on_timeout": "empty"}, {"ok_field": "success"}, {"quorum": 2}):
+        asked = document(rmw="zenoh")
+        asked["fogft"]["services"][0].update(policy)
+        with pytest.raises(SpecError, match="there is no"):
+            read(asked, **refuse)
+
+
+def test_topics_and_actions_do_not_pass_over_zenoh():
+    topic = {"name": "/t", "type": "std_msgs/msg/Header", "from": "robot"}
+    with pytest.raises(SpecError, match=r"fogft\.topics: does not go with `rmw: zenoh`"):
+        read(document(rmw={"replica": "zenoh"}, topics=[topic]))
+    with pytest.raises(SpecError, match=r"fogft\.actions: does not go with `rmw: zenoh`"):
+        read(document(rmw="zenoh", actions=[{"name": "/a2", "type": "a/action/B"}]))

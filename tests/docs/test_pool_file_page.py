@@ -10,6 +10,7 @@ import pytest
 from fogft.core import spec_keys
 from fogft.core.availability import Assumption, Correlation
 from fogft.core.errors import SpecError
+from fogft.core.middleware import Middleware
 from fogft.core.score import Weights
 from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.core.spec_choices import MigrationSpec, OnDemandSpec, ScheduleSpec
@@ -56,6 +57,7 @@ MORE_TABLES = {
     "`schedule`": spec_keys.SCHEDULE_KEYS,
     "Each of `windows`": spec_keys.WINDOW_KEYS,
     "`migration`": spec_keys.MIGRATION_KEYS,
+    "`rmw`": spec_keys.RMW_KEYS,
     "`topology`": spec_keys.TOPOLOGY_KEYS,
     "Each of `gateways`": spec_keys.GATEWAY_KEYS,
     "Each of `robots`": spec_keys.ROBOT_KEYS,
@@ -96,6 +98,7 @@ def test_defaults_are_the_codes():
         "`orphan_after_s`": f"{HealthSpec.orphan_after_s:g}",
         "`timeout_s`": f"{ServiceSpec.timeout_s:g}",
         "`on_timeout`": f"`{ServiceSpec.on_timeout.value}`",
+        "`rmw`": f"`{Middleware().robot.value}`",
         "`hedging`": f"`{ServiceSpec.hedging.value}`",
         "`hedging_budget`": f"{ServiceSpec.hedging_budget:g}",
         "`trace`": f"`{str(ServiceSpec.trace).lower()}`",

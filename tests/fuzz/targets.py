@@ -14,7 +14,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from fogft.core import holders, membership, records
+from fogft.core import holders, membership, records, rmw_zenoh
 from fogft.core.definitions import Definition
 from fogft.core.errors import CredentialError, StateError
 from fogft.core.model import Member, Membership, ReplicaId
@@ -146,6 +146,11 @@ def _json(data: bytes) -> Any:
         raise RecordError("malformed", "no JSON") from None
 
 
+def _token(data: bytes) -> None:
+    if rmw_zenoh.read_token(data.decode("latin-1")) is None:
+        raise ValueError("no token")
+
+
 def _bundle() -> bytes:
     label = bundle.Label("id", "pool", ROBOT, 1.0, 2.0)
     return bundle.seal(label, {"files": {"a/b": "c"}}, "a passphrase of mine")
@@ -184,6 +189,11 @@ def targets() -> dict[str, Target]:
             frame.decode_greeting, framed, (greeting, frame.encode_greeting(Greeting(TOKEN)))
         ),
         "greeting, judged": Target(_judge_greeting, (FrameError, NotAdmittedError), (greeting,)),
+        "rmw_zenoh token": Target(
+            _token,
+            (ValueError,),
+            (f"@ros2_lv/7/a/0/1/SS/%/%/n/%s/a::srv::dds_::B_/{rmw_zenoh.NO_HASH}/::2".encode(),),
+        ),
         "common name": Target(
             lambda data: holders.holder_of(data.decode("latin-1")),
             (ValueError,),

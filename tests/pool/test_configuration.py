@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from fogft.core.middleware import Middleware, Speaks
 from fogft.core.model import Offer, Placement, ReplicaId
 from fogft.core.planner import PlannedLaunch
 from fogft.core.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
@@ -39,6 +41,17 @@ def identity(tmp: Path) -> Identity:
 def spec(**task: object) -> PoolSpec:
     health = HealthSpec(suspect_after_s=3.5, orphan_after_s=120.0)
     return PoolSpec("pool", SERVICES, health=health, task={"run": "exec serve", **task})
+
+
+def test_each_side_is_told_how_it_speaks_ros(paths: PoolPaths) -> None:
+    """The robot's way stands in its proxy's configuration, the replica's in its own."""
+    asked = replace(spec(), rmw=Middleware(robot=Speaks.ZENOH, replica=Speaks.RCLPY))
+    configuration.write_proxy_config(paths, identity(paths.folder), asked)
+    assert read_client(paths.proxy_config).rmw is Speaks.ZENOH
+    order = configuration.build_order(paths, identity(paths.folder), asked, planned())
+    for name, content in order.files.items():
+        (paths.folder / name).write_bytes(content)
+    assert read_server(paths.folder / "replica.yaml").rmw is Speaks.RCLPY
 
 
 def planned() -> PlannedLaunch:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.core.errors import RosError
+from fogft.core.errors import RosError, Unreadable
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.core.spec_state import StateService, StateSpec
 from fogft.proxy.mark import MarkFile
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
 from fogft.proxy.ordered_responder import Clients, OrderedResponder
-from fogft.ros.port import Unreadable
 from fogft.wire.port import Answer, Refusal
 from tests.proxy.fakes import UID, Clock, FakeClient, FakeLink
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.core.errors import RosError
+from fogft.core.errors import RosError, Unreadable
 from fogft.proxy.interruption import EMPTY_REQUEST
 from fogft.proxy.responder import Responder
-from fogft.ros.port import Unreadable
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
 
 A = b"a" * 16

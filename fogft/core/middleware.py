@@ -1,0 +1,29 @@
+"""How the proxies speak ROS, on the robot and on the replicas. Pure values.
+
+Owns: the choice. Not here: what carries it out (`fogft.proxy.middleware`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Speaks(str, Enum):
+    """How a proxy speaks ROS."""
+
+    RCLPY = "rclpy"  # by the ROS 2 that is installed where it runs, whatever its middleware
+    ZENOH = "zenoh"  # as the nodes of `rmw_zenoh` do, with no ROS installed
+
+
+@dataclass(frozen=True)
+class Middleware:
+    """How each side's proxy speaks ROS.
+
+    Attributes:
+        robot: The client proxy of every robot.
+        replica: The server proxy of every replica.
+    """
+
+    robot: Speaks = Speaks.RCLPY
+    replica: Speaks = Speaks.RCLPY

@@ -1,0 +1,115 @@
+"""The node of a proxy and what types are there, by how the proxy speaks ROS.
+
+With rclpy a type is what its installed package says. Over Zenoh it is known by the hash that
+nodes write into their names; where its package is installed too, its fields are known besides.
+
+Owns: which implementation of `fogft.ros.port.RosNode` a process gets.
+Not here: the implementations, and what the node is for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from fogft.core.definitions import Definition
+from fogft.core.errors import RosError
+from fogft.core.middleware import Speaks
+from fogft.ros import environment, memory_tuning
+from fogft.ros.port import RosNode
+
+if TYPE_CHECKING:
+    from fogft.ros.visible import VisibleNode
+
+Told = Callable[[], Mapping[str, Definition]]
+
+
+Judge = Callable[[Mapping[str, Any]], str]
+
+
+class Joined(NamedTuple):
+    """A node, what defines types for it, and what makes the node that people see.
+
+    Over Zenoh there is none to see: `/diagnostics` and parameters need types.
+    """
+
+    node: RosNode
+    define: Callable[[str], Definition]
+    make_visible: Callable[[str, Judge], VisibleNode | None] = lambda name, judge: None
+
+
+def prepare(speaks: Speaks) -> None:
+    """Prepare this process for ROS. Before anything else of it."""
+    if speaks is Speaks.RCLPY:
+        environment.prepare(os.environ)
+    memory_tuning.tune()
+
+
+def join(
+    speaks: Speaks,
+    name: str,
+    domain_id: int | None,
+    *,
+    told: Told = dict,
+    noticed: Callable[[], None] = lambda: None,
+    environ: Mapping[str, str] = os.environ,
+) -> Joined:
+    """Make a node.
+
+    Args:
+        speaks: How.
+        name: The node's name.
+        domain_id: The ROS domain; None for what the environment says.
+        told: Returns the definitions of types as replicas tell them.
+        noticed: Called, from any thread, when a type may be known that was not.
+        environ: Where the variables of ROS and Zenoh are, for Zenoh.
+
+    Raises:
+        RosError: ROS, or Zenoh, is not usable here.
+    """
+    from fogft.ros.definition import definition
+
+    if speaks is Speaks.RCLPY:
+        from fogft.ros.node import SerialisedNode
+
+        serialised = SerialisedNode(name, domain_id)
+        return Joined(serialised, definition, serialised.make_visible)
+    from fogft.wire.rmw_node import RmwZenohNode
+
+    def hash_of(type_name: str) -> str:
+        there = told().get(type_name)
+        return (there.service_hash if there else "") or definition(type_name).service_hash
+
+    node = RmwZenohNode(name, domain_id, hash_of=hash_of, noticed=noticed, environ=environ)
+
+    def define(type_name: str) -> Definition:
+        found, hash = definition(type_name), node.graph.hash_of(type_name)
+        if found.trouble:  # its package is not installed, nor need it be
+            return Definition(service_hash=hash)
+        return replace(found, service_hash=hash or found.service_hash)
+
+    return Joined(node, define)
+
+
+def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | None:
+    """Return the serialised default response of a type; None where it is not known, nor needed.
+
+    Raises:
+        RosError: It is needed, or rclpy is, and it cannot be had.
+    """
+    try:
+        from fogft.ros import types
+
+        return types.default_response(type_name)
+    except ImportError as error:
+        if needed or speaks is Speaks.RCLPY:
+            raise RosError(
+                f"`{type_name}` cannot be loaded here: {error}",
+                "install `fogft[ros]` and the package of that type, or source a workspace with it",
+            ) from error
+    except RosError:
+        if needed or speaks is Speaks.RCLPY:
+            raise
+    return None
