@@ -58,6 +58,16 @@ class Cell:
         """The middle of the tag, truly, in metres."""
         return self._data.site("tag").xpos.copy()
 
+    @property
+    def state(self) -> str:
+        """All that a picture of the cell needs: numbers, for `show`."""
+        return " ".join(f"{number:.5g}" for number in self._data.qpos)
+
+    def show(self, state: str) -> None:
+        """Put everything where it was when `state` was told."""
+        self._data.qpos[:] = [float(number) for number in state.split()]
+        mujoco.mj_forward(self._model, self._data)
+
     # -- moving -----------------------------------------------------------------------------
 
     def scan(self, side: int) -> Iterator[None]:

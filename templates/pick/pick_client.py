@@ -28,7 +28,6 @@ import rclpy
 import tag
 from cell import CAMERA, HEIGHT, SLICE_S, WIDTH, Cell
 from pick_interfaces.srv import LocateTag
-from PIL import Image
 from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
@@ -38,7 +37,7 @@ from rclpy.utilities import remove_ros_args
 KEEP_ALL = QoSProfile(history=QoSHistoryPolicy.KEEP_ALL)
 PLACED_M = 0.02
 SEEN_M = 0.01
-FIELDS = ("began_at", "cycle", "scan", "latency_s", "answered", "found", "error_m")
+FIELDS = ("began_at", "cycle", "scan", "latency_s", "answered", "found", "error_m", "state")
 
 
 class CycleError(Exception):
@@ -53,7 +52,25 @@ class Asked:
     began: float
     scan: bool
     future: Future
+    state: str  # of the cell
     truth: np.ndarray
+
+
+class Samples:
+    """A line for each request, written when it has ended; nowhere where there is no path."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file = path.open("w", newline="", buffering=1) if path else None
+        if self._file:
+            self._file.write(",".join(FIELDS) + "\n")
+
+    def write(self, row: dict[str, object]) -> None:
+        if self._file:
+            csv.DictWriter(self._file, FIELDS, lineterminator="\n").writerow(row)
+
+    def close(self) -> None:
+        if self._file:
+            self._file.close()
 
 
 class Picker(Node):
@@ -67,9 +84,9 @@ class Picker(Node):
         self._client = self.create_client(LocateTag, options.service, qos_profile=KEEP_ALL)
         self._open: Asked | None = None
         self._answer: LocateTag.Response | None = None
-        self._next_at = self._wall = self._frame_at = 0.0
+        self._next_at = self._wall = 0.0
+        self._samples = Samples(options.samples)
         self.rows: list[dict[str, object]] = []
-        self.frames: list[dict[str, object]] = []
         self.cycles = 0
         self.faults: list[str] = []
         self.ending = False
@@ -128,12 +145,8 @@ class Picker(Node):
         """Carry a motion out at the pace that was asked for, with an eye on the camera."""
         for _ in motion:
             self._wall += SLICE_S / self._options.pace
-            now = time.monotonic()
-            if now >= self._next_at and not self._open:
+            if time.monotonic() >= self._next_at and not self._open:
                 self._ask(scan=False)
-            if self._options.frames and now >= self._frame_at:
-                self._keep_frame()
-                self._frame_at = now + self._options.frame_period_s
             self._spin(max(0.0, self._wall - time.monotonic()))
             self._wall = max(self._wall, time.monotonic() - 0.5)
 
@@ -147,7 +160,7 @@ class Picker(Node):
         self._next_at = time.monotonic() + self._options.period_s
         began_at, began = time.time(), time.perf_counter()
         future = self._client.call_async(asked)
-        self._open = Asked(began_at, began, scan, future, truth)
+        self._open = Asked(began_at, began, scan, future, self._cell.state, truth)
 
     def _spin(self, seconds: float = 0.05) -> None:
         """Let ROS work for so long; take an answer, or give a request up."""
@@ -172,17 +185,13 @@ class Picker(Node):
         found = answer is not None and answer.found
         error_m = float(np.linalg.norm(_place(answer) - asked.truth)) if found else ""
         values = (asked.began_at, self.cycles, int(asked.scan), round(took_s, 6))
-        values = (*values, int(answer is not None), int(found), error_m)
+        values = (*values, int(answer is not None), int(found), error_m, asked.state)
         self.rows.append(dict(zip(FIELDS, values, strict=True)))
-
-    def _keep_frame(self) -> None:
-        name = f"frame-{len(self.frames):04d}.jpg"
-        picture = Image.fromarray(self._cell.overview())
-        picture.resize((320, 240)).save(self._options.frames / name, quality=85)
-        self.frames.append({"at": time.time(), "file": name})
+        self._samples.write(self.rows[-1])
 
     def close(self) -> None:
         self._cell.close()
+        self._samples.close()
 
     def summary(self) -> dict[str, object]:
         errors = [row["error_m"] for row in self.rows if row["error_m"] != ""]
@@ -212,22 +221,11 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--service", default="/locate_tag", help="name of the service")
     parser.add_argument("--seed", type=int, default=1, help="seed of the places")
     parser.add_argument("--samples", type=Path, help="write a line for each request to this file")
-    parser.add_argument("--frames", type=Path, help="write pictures of the cell to this folder")
-    parser.add_argument("--frame-period-s", type=float, default=0.5, help="between two of them")
     return parser.parse_args(remove_ros_args(sys.argv)[1:])
-
-
-def write_samples(path: Path, rows: list[dict[str, object]]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, FIELDS)
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def main() -> int:
     options = arguments()
-    if options.frames:
-        options.frames.mkdir(parents=True, exist_ok=True)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         picker = Picker(options)
@@ -239,10 +237,6 @@ def main() -> int:
         picker.run()
         picker.close()
         summary = picker.summary()
-        if options.samples:
-            write_samples(options.samples, picker.rows)
-        if options.frames:
-            (options.frames / "frames.json").write_text(json.dumps(picker.frames))
         print(json.dumps(summary, indent=2), flush=True)
         return 1 if summary["failed_cycles"] or summary["failed"] or summary["wrong"] else 0
     finally:

@@ -9,6 +9,9 @@ from tests.evaluation.experiment import Experiment
 # Name -> module with an object `EXPERIMENT`.
 MODULES = {
     "planning": "tests.evaluation.planning",
+    "detection": "tests.evaluation.detection",
+    "segmentation": "tests.evaluation.segmentation",
+    "picking": "tests.evaluation.picking",
     "costs": "tests.evaluation.costs",
     "failures": "tests.evaluation.failures",
     "overhead": "tests.evaluation.overhead",
