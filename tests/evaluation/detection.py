@@ -79,8 +79,7 @@ class Detection(Defaults):
         type = workspaces.adopt(workspace, TYPE)
         with stage.pools() as pools:
             files = [_pool_file(pools, workspace, weights, c) for c in CONDITIONS]
-            with ThreadPoolExecutor(len(files)) as threads:
-                list(threads.map(pools.up, files))
+            pools.up(*files)
             with Caller(pools.domain) as caller:
                 trial = _Trial(pools, caller, type, workspace)
                 trial.slow_down()

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import ctypes.util
 import json
+import os
 import shlex
 import signal
 import subprocess
@@ -86,6 +88,10 @@ class Picking(Defaults):
     @contextlib.contextmanager
     def session(self, stage: Stage) -> Iterator[Run]:
         """Start the pool and the arm."""
+        if "MUJOCO_GL" not in os.environ and not ctypes.util.find_library("EGL"):
+            raise EvaluationError(
+                "the arm's camera needs EGL to draw (Debian: apt install libegl1 libgl1-mesa-dri)"
+            )
         workspace = workspaces.ready("pick")
         workspaces.adopt(workspace, TYPE)
         count = self.trials(stage.scale)[ALL]

@@ -13,7 +13,6 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +77,7 @@ class Segmentation(Defaults):
             more += ["--weights", stage.options["sam"]]
         with stage.pools() as pools:
             files = [_pool_file(pools, workspace, count, more) for count in (1, 2)]
-            with ThreadPoolExecutor(len(files)) as threads:
-                list(threads.map(pools.up, files))
+            pools.up(*files)
             machines = dict(_machines(pools))
             question = _question(type)
             services = {name: f"{SERVICE}_{name.partition('/')[0]}" for name in machines}

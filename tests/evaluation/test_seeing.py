@@ -49,7 +49,7 @@ def made_up(experiment, latencies, **more) -> Samples:
     )
 
 
-def steady(seconds: float, count: int = 100) -> list[float]:
+def steady(seconds: float, count: int = 30) -> list[float]:
     source = random.Random(round(seconds * 1000))
     return [seconds + source.uniform(0, 0.01) for _ in range(count)]
 
@@ -73,7 +73,7 @@ class TestFindings:
         )
 
     @pytest.mark.parametrize("experiment", [detection.EXPERIMENT, segmentation.EXPERIMENT])
-    @pytest.mark.parametrize("slow", [0.05, 0.19, 9.0])
+    @pytest.mark.parametrize("slow", [0.05, 9.0])
     def test_every_difference_has_a_reason(self, experiment, slow):
         samples = made_up(experiment, {**FAULTED, "single-fault": steady(slow)}, busy=0.5)
         samples = Samples({c: [{**r, "rtt_west_1_s": 0.1} for r in samples[c]] for c in samples})
@@ -90,7 +90,7 @@ class TestFindings:
             line = drawn[comparing.LABELS[condition]]
             assert list(line.get_xdata()) == sorted(FAULTED[condition])
         for axis in (figure.axes[0], figure.axes[1], figure.axes[3], figure.axes[4]):
-            assert sum(bar.get_height() for bar in axis.patches) == 100
+            assert sum(bar.get_height() for bar in axis.patches) == 30
 
 
 class TestContender:
