@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fogft.core.spec import PoolSpec
     from fogft.pool.latency import Distance
     from fogft.pool.offers import Seller
+    from fogft.pool.traffic import Measured
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class PlanShown:
         now: Seconds since the epoch.
         cloud: The adapter or the table that the prices are from.
         distances: ``cloud/region`` -> how far it is, and how that is known.
+        traffic: Service name -> what its client proxy counted, where the file says nothing.
         notes: What may surprise, besides the plan's own notes.
     """
 
@@ -37,6 +39,7 @@ class PlanShown:
     explanation: Explanation
     distances: Mapping[str, Distance]
     notes: tuple[str, ...]
+    traffic: Mapping[str, Measured] = field(default_factory=dict)
 
 
 def plan(
@@ -66,6 +69,7 @@ def plan(
     from fogft.core.intent import Intent
     from fogft.core.model import Observed
     from fogft.pool import named_clouds, offers, pool_file
+    from fogft.pool.traffic import is_stated, measured, with_measured
 
     source = pool_file.text(file)
     spec = pool_file.parse(source, file=str(file), folder=file.parent)
@@ -88,12 +92,19 @@ def plan(
     try:
         store = make_store(spec.name)
         intent, history = store.intent(), History(store.recent(1 << 30))
+        counted = measured(store.paths.proxy_status, store.identity().uid)
     except PoolNotFound:
-        intent, history = Intent(), History()
+        intent, history, counted = Intent(), History(), {}
+    counted = {
+        service.name: counted[service.name]
+        for service in spec.services
+        if service.name in counted and not is_stated(service)
+    }
+    spec = with_measured(spec, counted)
     now = time.time()
     observed = Observed(now, (), None, sold, rtt_s={r: d.rtt_s for r, d in distances.items()})
     explained = explain(spec, intent, observed, history, on_demand)
-    return PlanShown(spec, now, name, explained, distances, tuple(notes))
+    return PlanShown(spec, now, name, explained, distances, tuple(notes), counted)
 
 
 def far(

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from fogft.core.cost import Cost
     from fogft.core.explain import Considered
     from fogft.core.model import Offer
+    from fogft.core.spec import ServiceSpec
 
 _HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST", "WHY NOT")
 
@@ -74,8 +75,19 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
                 "correlation": vars(plan.assumed.correlation),
             },
         },
+        "traffic": {service.name: _traffic_json(shown, service) for service in shown.spec.services},
         "first_response": {"round_trips_s": plan.round_trips_s},
         "notes": [*shown.notes, *plan.notes],
+    }
+
+
+def _traffic_json(shown: PlanShown, service: ServiceSpec) -> dict[str, Any]:
+    measured, traffic = shown.traffic.get(service.name), service.traffic
+    source = "pool file" if traffic.requests_per_s else None
+    return {
+        **vars(traffic),
+        "source": "measured" if measured else source,
+        "measured_over_s": measured.over_s if measured else None,
     }
 
 
@@ -129,6 +141,12 @@ def _summary(shown: PlanShown) -> list[str]:
             out.append(f"  slot {replica.slot}{group} carries {', '.join(replica.services)}")
     cap = "" if plan.cap is None else f"; the cap is ${plan.cap:.2f}/h"
     out.append(f"cost          {_money(plan.cost)}{cap}")
+    for name, one in shown.traffic.items():
+        out.append(
+            f"  {name} measured over {one.over_s / 3600:.3g} h: "
+            f"{one.traffic.requests_per_s:.3g} requests/s of {one.traffic.request_bytes:.0f} B, "
+            f"responses of {one.traffic.response_bytes:.0f} B"
+        )
     if plan.single is not None:
         offer, alone = plan.single
         if plan.cost.usd_per_hour:

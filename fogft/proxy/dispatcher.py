@@ -115,7 +115,7 @@ class Dispatcher:
         now = self._clock()
         count = self._outcomes.count
         with self._lock:
-            count["received"] += 1
+            self._outcomes.received(len(payload))
             if self._pending_bytes + len(payload) > self._max_pending_bytes:
                 count["turned_away"] += 1
                 turned_away = count["turned_away"]
@@ -201,7 +201,7 @@ class Dispatcher:
             else:
                 losers = self._hedging.answered(request, pending.open, replica, now)
                 self._close(request, pending)
-                self._outcomes.won(link.peer.id, now - pending.item.arrived)
+                self._outcomes.won(link.peer.id, now - pending.item.arrived, len(payload))
                 note_end(
                     self._outcomes, request, pending,
                     outcome="answered", now=now, replica=link.peer.id.short,

@@ -18,6 +18,8 @@ _COUNTS = {
     "received": ("fogft_requests_total", "Requests that callers sent."),
     "sent": ("fogft_copies_total", "Copies of requests that were sent to replicas."),
     "late": ("fogft_late_answers_total", "Answers that came too late to be used."),
+    "request_bytes": ("fogft_request_bytes_total", "Bytes of all requests that callers sent."),
+    "response_bytes": ("fogft_response_bytes_total", "Bytes of the first answers of replicas."),
     "rejected": ("fogft_rejected_answers_total", "Responses whose ok_field was false."),
     "undelivered": ("fogft_undelivered_responses_total", "Responses that ROS did not take."),
     "fallback_failed": ("fogft_fallback_failed_total", "Calls of a fallback that gave nothing."),

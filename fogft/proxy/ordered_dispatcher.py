@@ -112,7 +112,7 @@ class OrderedDispatcher:
         caller = _Caller(payload, handle, now, now + self.spec.timeout_s)
         count = self._outcomes.count
         with self._lock:
-            count["received"] += 1
+            self._outcomes.received(len(payload))
             if self._early or not self._number(caller):
                 if self._early_bytes + len(payload) > self._max_waiting_bytes:
                     count["turned_away"] += 1
@@ -190,7 +190,7 @@ class OrderedDispatcher:
                     self._mark.write(sequencer.mark, sequencer.office.holder or "")
                     caller = self._numbered.pop(index, None)
                 if caller is not None:
-                    self._outcomes.won(link.peer.id, now - caller.arrived)
+                    self._outcomes.won(link.peer.id, now - caller.arrived, len(payload))
             ends = sequencer.deposed_by is not None or sequencer.handover is not None
             sends = sequencer.sends or ends or (op is Op.APPLY and sequencer.changing)
         if caller is not None and payload is not None:

@@ -23,6 +23,7 @@ BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 
 _COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
     *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
+    *("request_bytes", "response_bytes"),
 )
 
 # Refusals that speak against the service; not those about load, links, who was faster, or a
@@ -39,7 +40,8 @@ class Outcomes:
             fallback that came to nothing (``fallback_failed``); answers that came too late
             to be used (``late``); responses that were not ok (``rejected``); responses that
             ROS did not take (``undelivered``); requests that a gateway's caller took back
-            (``cancelled``).
+            (``cancelled``). ``request_bytes`` are those of all received requests together,
+            ``response_bytes`` those of the first answers of replicas.
         refused: Refusals by reason.
         trace: How each request ended, until somebody takes it; None where it is not wanted.
     """
@@ -56,9 +58,15 @@ class Outcomes:
         self._late_lock = threading.Lock()
         self.trace: deque[dict[str, Any]] | None = None
 
-    def won(self, replica: ReplicaId, took_s: float) -> None:
-        """Count a request that a replica has answered first."""
+    def received(self, size_bytes: int) -> None:
+        """Count a request that came."""
+        self.count["received"] += 1
+        self.count["request_bytes"] += size_bytes
+
+    def won(self, replica: ReplicaId, took_s: float, size_bytes: int) -> None:
+        """Count a request that a replica has answered first, and the size of its response."""
         self.count["answered"] += 1
+        self.count["response_bytes"] += size_bytes
         self._won[replica] = self._won.get(replica, 0) + 1
         self._latencies.append(took_s)
         self._buckets[bisect.bisect_left(BUCKETS_S, took_s)] += 1

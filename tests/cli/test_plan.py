@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from fogft import app
 from fogft.cli import main
-from fogft.pool import startup
+from fogft.pool import startup, traffic
 from fogft.pool.paths import PoolPaths
 
 POOL = """
@@ -90,6 +91,63 @@ def test_egress_is_what_leaves_every_replica(pool, tmp_path, capsys):
     ages = [o["price_age_s"] for o in shown["offers"]]
     assert ages[0] > 86_400
     assert ages[1] is None
+
+
+def test_egress_is_measured_where_it_is_not_stated(pool, tmp_path, capsys):
+    """1000 requests in 100 s with responses of 100 kB: as if the file had said 10 a second."""
+    pool.write_text(re.sub(r",\s*traffic: {[^}]*}", "", POOL))
+    order = app.order(pool)
+    store = app.make_store("planner")
+    startup.write(store, order.spec, source=order.source, file=pool, cloud="local")
+    count = {"received": 1000, "answered": 500, "request_bytes": 5e5, "response_bytes": 5e7}
+    report = {
+        "pid": 1,
+        "written_at": time.time() - 9000,
+        "uptime_s": 100.0,
+        "links": [],
+        "services": {"/plan": count, "/other": count},
+    }
+    store.paths.proxy_status.write_text(json.dumps(report))
+    prices = table(
+        tmp_path, "aws,us-west-1,a,m,8,32,0.4,0.1,2024-03-15", "aws,us-west-2,a,m,8,32,0.4,0.1,"
+    )
+    asked = ["plan", str(pool), "--prices", prices, "--offline"]
+    assert main.run([*asked, "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["cost"]["egress_usd_per_hour"] == pytest.approx(2 * 3.6 * 0.09)
+    assert shown["traffic"]["/plan"] == {
+        "requests_per_s": 10.0,
+        "request_bytes": 500.0,
+        "response_bytes": 100_000.0,
+        "source": "measured",
+        "measured_over_s": 100.0,
+    }
+    assert main.run(asked) == 0
+    assert "/plan measured over 0.0278 h: 10 requests/s of 500 B" in capsys.readouterr().out
+    pool.write_text(POOL)  # the file's word goes first
+    assert main.run([*asked, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["traffic"]["/plan"]["source"] == "pool file"
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        {"uptime_s": 59.0},
+        {"uptime_s": "nan"},
+        {"services": {"/plan": {"received": 0, "answered": 0}}},
+        {"services": {"/plan": {"received": 5, "answered": 5, "request_bytes": -1}}},
+        {"services": {"/plan": {"received": 5, "answered": 5, "request_bytes": "x"}}},
+        {"services": {"/plan": {"received": 5, "answered": 5}}},
+    ],
+)
+def test_a_report_that_says_nothing_is_not_guessed_from(tmp_path, report):
+    usual = {"pid": 1, "written_at": 0.0, "uptime_s": 100.0, "links": []}
+    count = {"received": 5, "answered": 5, "request_bytes": 5, "response_bytes": 5}
+    file = tmp_path / "proxy-status.json"
+    file.write_text(json.dumps({**usual, "services": {"/plan": count}}))
+    assert list(traffic.measured(file, "0" * 16)) == ["/plan"]
+    file.write_text(json.dumps({**usual, "services": {"/plan": count}, **report}))
+    assert traffic.measured(file, "0" * 16) == {}
 
 
 def test_losses_of_the_pool_are_shown(pool, capsys):

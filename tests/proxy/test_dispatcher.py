@@ -67,6 +67,16 @@ def test_the_first_answer_is_returned_and_the_second_is_late():
     assert scene.dispatcher.won(scene.links[1].peer.id) == 1
 
 
+def test_bytes_of_requests_and_of_first_answers_are_counted():
+    scene = Scene()
+    for payload in (b"four", b"q"):
+        scene.dispatcher.submit(payload, "caller")
+    scene.answer(1, b"three", 0)
+    scene.answer(0, b"late ones do not count", 0)
+    report = scene.dispatcher.report()
+    assert (report["request_bytes"], report["response_bytes"]) == (5, 5)
+
+
 def test_losers_are_told_to_forget():
     scene = Scene(3)
     scene.dispatcher.submit(b"q", "caller")
