@@ -76,7 +76,7 @@ class Market:
         self._nothing = listing.trouble
         self.resting: Mapping[str, Backoff] = {}
         self.rows, self._clouds = listing.rows, listing.clouds
-        asleep = listing.supplies.intersection(rests)
+        asleep = listing.supplies.intersection(rests) if rests else frozenset()
         if asleep:
             self.rows = tuple(row for row in self.rows if row.supply not in asleep)
             self._clouds = frozenset(row.cloud for row in self.rows)
