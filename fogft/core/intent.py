@@ -67,8 +67,8 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
     """Want `change` more replicas (fewer when negative).
 
     Raises:
-        FogftError: Fewer than one, or more than 16, would be wanted, or the number follows
-            from an availability target.
+        FogftError: Fewer than one, or more than 16, would be wanted, or fewer than a quorum,
+            or the number follows from an availability target.
     """
     if spec.availability is not None:
         raise FogftError(
@@ -85,6 +85,13 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
         raise FogftError(
             f"cannot scale `{spec.name}` to {wanted} replicas: at most {MAX_REPLICAS} can be had"
         )
+    for service in spec.services:
+        if service.quorum > max(wanted, service.replicas):
+            raise FogftError(
+                f"cannot scale `{spec.name}` to {wanted} replicas: `{service.name}` has a quorum "
+                f"of {service.quorum}, and no answer could win",
+                "change `quorum` in the pool file, and `fogft up` it",
+            )
     if wanted == spec.replicas:
         return replace(intent, target=None, scaled_from=None)
     return replace(intent, target=wanted, scaled_from=spec.replicas)

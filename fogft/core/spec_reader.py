@@ -127,6 +127,8 @@ def pool_spec(
         _judge(top, "workdir", check_workdir(workdir))
     sections = ours.sections("services", "") if services else ()
     for section, service in zip(sections, services, strict=True):
+        _check_quorum(section, service, spec)
+    for section, service in zip(sections, services, strict=True):
         passes_through = spec.rmw.robot is Speaks.ZENOH and not service.needs_type
         if check_types is not None and not passes_through:
             _judge(section, "type", check_types(service.type))
@@ -166,6 +168,20 @@ def _judge_topics(ours: Section, check_types: TypeCheck | None) -> None:
         if key in ours.children and check_types is not None:
             for section in ours.sections(key, ""):
                 _judge(section, "type", check_types(section.text("type", "") + end))
+
+
+def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> None:
+    """Refuse a quorum that can never be reached, or at some time of the week cannot."""
+    windows = spec.schedule.windows if spec.schedule else ()
+    fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas is not None)])
+    carry = max(fewest, service.replicas)
+    if service.quorum > carry:
+        where = " in a window of `schedule`" if fewest < spec.replicas else ""
+        raise section.error(
+            "quorum",
+            f"is {service.quorum}, but only {carry} can be asked{where}: no answer could win",
+            f"write `replicas: {service.quorum}` or more there, or a smaller `quorum`",
+        )
 
 
 def _judge(section: Section, key: str, reason: str | None) -> None:

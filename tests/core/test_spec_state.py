@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fogft.core import service_form
-from fogft.core.errors import SpecError
+from fogft.core.errors import FogftError, SpecError
+from fogft.core.intent import Intent, scale
 from fogft.core.spec_state import StateService, StateSpec
 from fogft.pool import pool_file
 
@@ -129,3 +130,45 @@ def test_a_quorum_and_its_tolerances_reach_the_client_proxy():
 def test_mistakes_with_a_quorum_are_told(file, what):
     with pytest.raises(SpecError, match=what):
         pool_file.parse(file, file="p.yaml")
+
+
+WINDOW = "  schedule: {time_zone: UTC, windows: [{days: mon, replicas: %d}]}\n"
+
+
+@pytest.mark.parametrize(
+    ("more", "fewest"),
+    [
+        ("      quorum: 3\n", 2),
+        ("      quorum: 5\n      replicas: 4\n", 4),
+        ("      quorum: 3\n  replicas: 2\n", 2),
+        ("      quorum: 2\n  availability: 0.99\n", 1),
+        ("      quorum: 2\n  groups: [{name: a, replicas: 1}]\n", 1),
+        ("      quorum: 3\n  replicas: 4\n" + WINDOW % 2, 2),
+    ],
+)
+def test_a_quorum_that_cannot_be_reached_is_refused(more, fewest):
+    """No answer could win, ever or at some time: that is said with file, line and key."""
+    expected = rf"p.yaml:8: fogft.services\[0\].quorum: is \d, but only {fewest} can be asked"
+    with pytest.raises(SpecError, match=expected) as refused:
+        pool_file.parse(FILE + more, file="p.yaml")
+    assert "a smaller `quorum`" in refused.value.hint
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        "      quorum: 2\n",
+        "      quorum: 4\n      replicas: 4\n",
+        "      quorum: 3\n  replicas: 3\n" + WINDOW % 4,
+        "      quorum: 2\n  replicas: 2\n  availability: 0.99\n",
+    ],
+)
+def test_a_quorum_that_can_be_reached_is_taken(more):
+    assert pool_file.parse(FILE + more, file="p.yaml").services[0].quorum > 1
+
+
+def test_a_pool_is_not_scaled_below_a_quorum():
+    spec = pool_file.parse(FILE + "      quorum: 2\n  replicas: 3\n", file="p.yaml")
+    fewer = scale(Intent(), spec, -1)
+    with pytest.raises(FogftError, match=r"cannot scale `p` to 1 replicas: .* has a quorum of 2"):
+        scale(fewer, spec, -1)

@@ -7,13 +7,17 @@ from dataclasses import replace
 import pytest
 
 from fogft.core.history import Event, EventKind
-from fogft.core.model import Observed
+from fogft.core.model import Member, Membership, Observed
 from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
 from fogft.pool.paths import PoolPaths
+from fogft.pool.proxy_report import parse as parse_report
 from fogft.pool.store import Identity, PoolStore, write_identity
 from fogft.pool.updating import Updating
+from fogft.proxy.client import ClientProxy
+from fogft.proxy.dispatcher import Dispatcher
 from tests.core.pool_worlds import NOW, SERVICE, UID, World, replica
+from tests.proxy.fakes import Clock, FakeDialer, FakeNode
 
 
 def parse(text: str, file: str) -> PoolSpec:
@@ -130,3 +134,46 @@ def test_an_update_begins_when_the_manager_first_sees_it(store):
     tick(store, replace(world, events=(*world.events, *failures)))
     assert store.trial().began_at == NOW
     assert not store.trial().fault
+
+
+def test_answers_that_say_no_end_an_update_and_bring_the_good_file_back(store):
+    """From the robot's requests to the file in force, with all parts between but processes.
+
+    The new version serves and answers, but with `success: false`; each request is answered all
+    the same, by the old version. What the proxy reports of it is proof enough.
+    """
+    tick(store, whole(store))
+    store_paths = store.paths
+    store_paths.spec.write_text("new")
+    old, new = replica(0, of=store.good()), replica(1, 2, of=store.spec())
+    assert run(store) == "new"
+    clock, dialer, node = Clock(), FakeDialer(), FakeNode()
+    proxy = ClientProxy(
+        UID, node, dialer,
+        lambda spec, respond, wake: Dispatcher(
+            spec, respond, ok_of=lambda field: lambda payload: payload == b"yes", wake=wake,
+            clock=clock,
+        ),
+        clock=clock,
+    )  # fmt: skip
+    service = replace(SERVICE, ok_field="success")
+    proxy.serve([service])
+    members = tuple(Member(part.machine.id, f"h:{part.machine.id.slot}") for part in (old, new))
+    proxy.follow(Membership("pool", UID, 1, 1, members))
+    for link in dialer.links:
+        link.ready = frozenset({service.name})
+        proxy.changed(link)
+    proxy.run_once(0)
+    by_slot = {link.peer.id.slot: link for link in dialer.links}
+    for number in range(20):
+        node.servers[service.name].on_request(b"q", number)
+        for slot, payload in ((1, b"no"), (0, b"yes")):
+            proxy.answered(by_slot[slot], by_slot[slot].reply(payload))
+    assert [answer for _, answer in node.servers[service.name].responses] == [b"yes"] * 20
+    report = parse_report({"pid": 1, "written_at": NOW, **proxy.report()}, UID)
+    assert report is not None
+    world = replace(World(store.spec()).having(old, new), links=report.links)
+    tick(store, world)
+    assert run(store) == "good"
+    trial = store.trial()
+    assert trial.fault == "20 of 20 requests to the new version failed, 0 of 20 to the old one"
