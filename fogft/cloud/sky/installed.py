@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 ASK_LIMIT_S = 30.0
 REFRESH_LIMIT_S = 60.0
-CHECK_LIMIT_S = 180.0  # asks every cloud, and may start the API server
+CHECK_LIMIT_S = 300.0  # asks every cloud, and may start the API server: minutes on a busy machine
 JOB_LIMIT_S = 120.0  # starts a Python on the machine, over ssh
 LAUNCH_LIMIT_S = 120.0  # uploads `workdir` and `file_mounts`, and may start the API server
 DOWN_LIMIT_S = 300.0

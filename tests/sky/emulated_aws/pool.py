@@ -42,6 +42,14 @@ class Pool:
             "NO_COLOR": "1",
         }
 
+    def sky_api(self, word: str) -> None:
+        """Start or stop SkyPilot's API server. `up` starts it too, but within a limit."""
+        done = subprocess.run(
+            ["sky", "api", word], env=self.environ, text=True, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=UP_WITHIN_S, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout
+
     def fogft(self, *words: str, status: int = 0, limit_s: float = UP_WITHIN_S) -> str:
         """Run a command; return all that it said."""
         done = subprocess.run(

@@ -116,6 +116,7 @@ def kill(pool: Pool) -> None:
 def main() -> int:
     make_impatient()
     alone, hangs = Pool(ALONE), Pool(HANGS)
+    alone.sky_api("start")
     with step("`up` with ROS 2 in the image and a replica that dials out, until it answers"):
         print(alone.fogft("up", str(alone.file), "--yes"))
     client = Client(alone.environ, 3600.0, 5.0, 15.0)
@@ -137,7 +138,7 @@ def main() -> int:
     kill(alone)
     waiting.kill()
     waiting.wait()
-    subprocess.run(["sky", "api", "stop"], env=alone.environ, check=True, capture_output=True)
+    alone.sky_api("stop")
     with step("manager and API server are gone: until the VM that hangs has ended itself"):
         until("it is gone", lambda: not of_pool(hangs))
     with step("... until the orphan has ended itself, too"):
@@ -149,7 +150,7 @@ def main() -> int:
         with step(f"`down` of `{pool.name}`, which finds nothing"):
             print(pool.fogft("down", pool.name))
     assert not list((HOME / "pools").glob("*"))
-    subprocess.run(["sky", "api", "stop"], env=alone.environ, check=True, capture_output=True)
+    alone.sky_api("stop")
     until("nothing of it runs here", lambda: not processes(), 60)
     table = "".join(f"{end - begin:7.1f} s  {name}\n" for name, begin, end in step.done)
     Path(os.environ["RESULTS"], "alone.txt").write_text(table)

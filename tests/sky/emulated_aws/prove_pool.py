@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -91,7 +90,9 @@ class Proof:
         self.down()
 
     def nothing_without_a_yes(self) -> None:
-        with step("`up` asks, and nobody says yes (starts SkyPilot's server)"):
+        with step("SkyPilot's API server starts"):
+            self.pool.sky_api("start")
+        with step("`up` asks, and nobody says yes"):
             said = self.pool.fogft("up", str(self.pool.file), status=1)
         print(said)
         assert "`aws` can be used" in said
@@ -196,8 +197,7 @@ class Proof:
         assert not clusters()
         assert not list((HOME / "pools").glob("*"))
         self.skypilots = timetable.skypilots(self.machines)  # its server remembers, while it runs
-        subprocess.run(["sky", "api", "stop"], env=self.pool.environ, check=True, text=True,
-                       capture_output=True)  # fmt: skip
+        self.pool.sky_api("stop")
         until("nothing of it runs here", lambda: not processes(), 60)
 
 
