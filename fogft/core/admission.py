@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 @dataclass(order=True)
 class _Entry(Generic[T]):
-    deadline: float
+    rank: float
     order: int
     id: bytes = field(compare=False)
     robot: str = field(compare=False)
@@ -48,9 +48,15 @@ class _Robot(Generic[T]):
 
 
 class AdmissionQueue(Generic[T]):
-    """What waits for one service of a replica, by request id."""
+    """What waits for one service of a replica, by request id.
 
-    def __init__(self) -> None:
+    Args:
+        latest: The newest request of a robot goes first, and the oldest gives way: with one
+            time-out a service, the latest deadline is the newest request's.
+    """
+
+    def __init__(self, *, latest: bool = False) -> None:
+        self._sign = -1.0 if latest else 1.0
         self._robots: dict[str, _Robot[T]] = {}  # those that have something waiting
         self._entries: dict[bytes, _Entry[T]] = {}
         self._order = count()
@@ -61,7 +67,7 @@ class AdmissionQueue(Generic[T]):
 
     def put(self, id: bytes, robot: str, deadline: float, item: T) -> None:
         """Let an item wait. Its id must not be waiting already."""
-        entry = _Entry(deadline, next(self._order), id, robot, item)
+        entry = _Entry(self._sign * deadline, next(self._order), id, robot, item)
         queue = self._robots.get(robot)
         if queue is None:
             queue = self._robots[robot] = _Robot(self._turn)
@@ -117,7 +123,7 @@ class AdmissionQueue(Generic[T]):
         elif most.waiting <= (own.waiting if own is not None else 0) + 1:
             return None  # equal shares: nobody has too much
         last = max(entry for entry in most.heap if entry.item is not None)
-        if most is own and last.deadline <= deadline:
+        if most is own and last.rank <= self._sign * deadline:
             return None
         item = last.item
         self._discard(last)
@@ -126,9 +132,9 @@ class AdmissionQueue(Generic[T]):
     def ahead(self, robot: str, deadline: float) -> int:
         """Return about how many will be served before a request that comes now."""
         own = self._robots.get(robot)
-        before = 0
+        before, rank = 0, self._sign * deadline
         if own is not None:
-            before = sum(1 for e in own.heap if e.item is not None and e.deadline <= deadline)
+            before = sum(1 for e in own.heap if e.item is not None and e.rank <= rank)
         others = (queue.waiting for name, queue in self._robots.items() if name != robot)
         return before + sum(min(waiting, before + 1) for waiting in others)
 

@@ -16,12 +16,12 @@ from typing import Any
 
 from fogft.core import spec_state
 from fogft.core.spec import Advertise, HedgingMode, OnTimeout, Part, ServiceSpec
-from fogft.core.spec_choices import FallbackSpec
+from fogft.core.spec_choices import Compression, FallbackSpec, Freshness
 from fogft.core.uplinks import UplinkPolicy
 
 LONGEST_S = 1e7  # what a request's header can carry
 # What a replica must know; the rest is the robot's.
-REPLICA_KEYS = ("name", "type", "concurrency", "cancel", "state")
+REPLICA_KEYS = ("name", "type", "concurrency", "cancel", "freshness", "state")
 _NOT_THE_PROXIES = ("replicas", "traffic")
 _ALWAYS = ("name", "type", "timeout_s")
 
@@ -67,6 +67,8 @@ def from_plain(raw: Mapping[str, Any]) -> ServiceSpec:
         fallback=_fallback(raw.get("fallback")),
         trace=bool(raw.get("trace")),
         uplinks=UplinkPolicy(raw.get("uplinks") or ServiceSpec.uplinks),
+        freshness=Freshness(raw.get("freshness") or ServiceSpec.freshness),
+        compression=Compression(raw.get("compression") or ServiceSpec.compression),
         advertise=Advertise(raw["advertise"]) if raw.get("advertise") else None,
         part=Part(raw.get("part") or ""),
     )

@@ -13,7 +13,9 @@ from typing import Any
 from fogft.core.middleware import Middleware, Speaks
 from fogft.core.spec_choices import (
     AvailabilitySpec,
+    Compression,
     FallbackSpec,
+    Freshness,
     GroupSpec,
     MetricsSpec,
     MigrationSpec,
@@ -85,6 +87,8 @@ class ServiceSpec:
         tolerance: Path of a float field of the response -> how far apart still agrees.
         state: How its state is taken and given; None for a service that keeps none.
         uplinks: Which of the robot's uplinks its requests take.
+        freshness: Which goes first where several wait.
+        compression: Whether payloads are compressed on thin links.
         part: Which part of an action it is.
     """
 
@@ -105,6 +109,8 @@ class ServiceSpec:
     fallback: FallbackSpec | None = None
     trace: bool = False
     uplinks: UplinkPolicy = UplinkPolicy.PREFER
+    freshness: Freshness = Freshness.EVERY
+    compression: Compression = Compression.AUTO
     advertise: Advertise | None = None
     part: Part = Part.NONE
 

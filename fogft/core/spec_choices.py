@@ -8,10 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 from fogft.core.availability import Assumption
 from fogft.core.score import Weights
+
+
+class Freshness(str, Enum):
+    """Which of a service's requests goes first where several wait."""
+
+    EVERY = "every"  # the one that came first, or whose deadline is nearest
+    LATEST = "latest"  # the newest: of a camera's images the older ones are worth less
+
+
+class Compression(str, Enum):
+    """Whether a service's payloads are compressed on thin links."""
+
+    AUTO = "auto"  # where it pays, as measured
+    OFF = "off"
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ SERVICE_KEYS = (
     *("name", "type", "timeout_s", "on_timeout", "ok_field"),
     *("hedging", "hedging_budget", "concurrency", "cancel"),
     *("fallback", "trace", "advertise"),
-    "uplinks",
+    *("uplinks", "freshness", "compression"),
     *("replicas", "traffic", "quorum", "tolerance", "state"),
 )
 RMW_KEYS = ("robot", "replica")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fogft.core import ros_names
 from fogft.core.spec import MAX_REPLICAS, Advertise, HedgingMode, OnTimeout, ServiceSpec
-from fogft.core.spec_choices import FallbackSpec
+from fogft.core.spec_choices import FallbackSpec, Freshness
 from fogft.core.spec_keys import (
     CONCURRENCY_LIMIT,
     DAY_S,
@@ -79,8 +79,18 @@ def read_service(section: Section) -> ServiceSpec:
         fallback=_fallback(section, name),
         trace=_trace(section),
         uplinks=section.choice("uplinks", ServiceSpec.uplinks),
+        freshness=_freshness(section),
+        compression=section.choice("compression", ServiceSpec.compression),
         advertise=_advertise(section),
     )
+
+
+def _freshness(section: Section) -> Freshness:
+    wanted = section.choice("freshness", ServiceSpec.freshness)
+    if wanted is Freshness.LATEST and section.has("state"):
+        what = "cannot be `latest` for a service with `state`: its requests are kept in order"
+        raise section.error("freshness", what, "remove it")
+    return wanted
 
 
 def _advertise(section: Section) -> Advertise | None:

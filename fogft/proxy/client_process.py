@@ -171,7 +171,7 @@ def make_dialer(config: ClientProxyConfig, manager_age: Callable[[], float | Non
             tell_losers=config.tell_losers,
         )
     )
-    dialer.use(config.uplinks, {service.name: service.uplinks for service in config.services})
+    dialer.use(config.uplinks, config.services)
     return dialer
 
 
@@ -301,8 +301,7 @@ def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
         raise StateError(
             f"`{path}`: pool_uid, domain_id and rmw cannot change while the proxy runs"
         )
-    policies = {service.name: service.uplinks for service in new.services}
-    if parts.dialer.use(new.uplinks, policies):
+    if parts.dialer.use(new.uplinks, new.services):
         parts.proxy.redial()
     parts.proxy.serve(parts.seen.follow(new.services))
     parts.proxy.pass_topics(new.topics, cast(RosTopics, parts.node))

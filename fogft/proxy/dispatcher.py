@@ -29,6 +29,7 @@ from fogft.core.hedging import NEVER, All, Failover, Hedging
 from fogft.core.model import ReplicaId
 from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
+from fogft.core.spec_choices import Freshness
 from fogft.proxy.outcomes import Outcomes
 from fogft.proxy.request import Request
 from fogft.proxy.rescuer import Rescuer, Shared, note_end
@@ -38,13 +39,21 @@ from fogft.wire.port import Answer, Link, Refusal
 log = logging.getLogger(__name__)
 
 Respond = Callable[[Any, bytes], None]
+_Short = tuple[bytes, Pending[Request]]
 
 # A refusal after which the same replica is not asked again for the same request: asking
 # again would run it twice (FORGOTTEN) or cannot end otherwise.
 _FINAL_REFUSALS = frozenset({Refusal.FORGOTTEN, Refusal.MALFORMED, Refusal.EXPIRED})
 # The replica never began, or may never have seen it: no sign against the request itself.
 _BLAMELESS_REFUSALS = frozenset(
-    {Refusal.LOST, Refusal.NOT_READY, Refusal.OVERLOADED, Refusal.NOT_ADMITTED, Refusal.REVOKED}
+    {
+        Refusal.LOST,
+        Refusal.SUPERSEDED,
+        Refusal.NOT_READY,
+        Refusal.OVERLOADED,
+        Refusal.NOT_ADMITTED,
+        Refusal.REVOKED,
+    }
 )
 
 
@@ -388,7 +397,7 @@ class Dispatcher:
             full: set[int] = set()
             steps = [
                 (request, replica)
-                for request, pending in self._requests.short()
+                for request, pending in self._in_order(self._requests.short())
                 for replica in self._hedging.more(
                     pending.open, self._requests.candidates(pending, self._able, now), now
                 )
@@ -396,6 +405,9 @@ class Dispatcher:
             self._next_look = self._hedging.look_at
         for request, replica in steps:
             self._offer(request, replica, links[replica], full)
+
+    def _in_order(self, short: Iterable[_Short]) -> Iterable[_Short]:
+        return list(short)[::-1] if self.spec.freshness is Freshness.LATEST else short
 
     def _offer(self, request: bytes, replica: int, link: Link, full: set[int]) -> None:
         """Offer a request to a replica, unless that declined another one a moment ago."""

@@ -50,10 +50,11 @@ class Line:
     Args:
         most: What the service's own queue holds: never is more passed on, unless `given`.
         given: How many may be at work; None to learn it.
+        latest: The newest request goes first.
     """
 
-    def __init__(self, most: int, given: int | None = None) -> None:
-        self._queue: AdmissionQueue[Work] = AdmissionQueue()
+    def __init__(self, most: int, given: int | None = None, *, latest: bool = False) -> None:
+        self._queue: AdmissionQueue[Work] = AdmissionQueue(latest=latest)
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
         self._overdue: deque[tuple[float, Work]] = deque()  # passed on, and past their deadline

@@ -20,7 +20,7 @@ import logging
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 from fogft.core.errors import RosError, Unreadable
 from fogft.proxy.interruption import Interruptions
@@ -46,6 +46,7 @@ class Responder:
             do not bound them: a robot that has its answer from elsewhere frees its window.
         outstanding: Requests passed on to one service at once, where no limit is given.
         limits: How many may be at work, by service, where it is not to be learned.
+        latest: Services of which the newest request goes first.
         kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
         kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
         clock: Monotonic seconds.
@@ -69,6 +70,7 @@ class Responder:
         held_bytes: int = 64 << 20,
         outstanding: int = OUTSTANDING,
         limits: Mapping[str, int] | None = None,
+        latest: Collection[str] = (),
         kept_bytes: int = 16 << 20,
         kept_ids: int = 32768,
         clock: Callable[[], float] = time.monotonic,
@@ -78,6 +80,7 @@ class Responder:
         self._held_bytes_limit = held_bytes
         self._outstanding = outstanding
         self._limits = dict(limits or {})
+        self._latest = frozenset(latest)
         self._kept_bytes_limit = kept_bytes
         self._kept_ids = kept_ids
         self._clock = clock
@@ -170,7 +173,9 @@ class Responder:
     def _line(self, service: str) -> Line:
         line = self._lines.get(service)
         if line is None:
-            line = self._lines[service] = Line(self._outstanding, self._limits.get(service))
+            line = self._lines[service] = Line(
+                self._outstanding, self._limits.get(service), latest=service in self._latest
+            )
         return line
 
     def _reason_to_refuse(self, incoming: Incoming, now: float) -> tuple[str, Work | None]:

@@ -26,6 +26,7 @@ from fogft.core.definitions import Definition
 from fogft.core.errors import RosError
 from fogft.core.model import ReplicaId
 from fogft.core.spec import ServiceSpec
+from fogft.core.spec_choices import Freshness
 from fogft.core.spec_state import StateSpec
 from fogft.core.topics import TopicSpec
 from fogft.proxy.interruption import CANCEL_TYPE
@@ -99,6 +100,7 @@ class ServerProxy:
             lambda name: name in self._ready,
             max_in_flight=max_in_flight,
             limits=_limits(services),
+            latest=[s.name for s in services if s.freshness is Freshness.LATEST],
             clock=clock,
         )
 

@@ -32,6 +32,12 @@ class FlowWatch:
         """How fast it drains, once that was seen."""
         return self._drain.bytes_per_s
 
+    @property
+    def thin(self) -> bool:
+        """Whether it was seen to drain slowly."""
+        rate = self._drain.bytes_per_s
+        return rate is not None and rate < THIN_BYTES_PER_S
+
     def look(self, now: float) -> float:
         """Look once; return for how many of the last seconds large things moved."""
         connection = self._socket.borrow()
@@ -42,8 +48,7 @@ class FlowWatch:
             if flow is None:
                 return 0.0
             moved_s = self._drain.look(flow, now)
-            rate = self._drain.bytes_per_s
-            if not self._kept_short and rate is not None and rate < THIN_BYTES_PER_S:
+            if self.thin and not self._kept_short:
                 sockets.keep_short(connection)
                 self._kept_short = True
         return moved_s

@@ -22,6 +22,9 @@ from fogft.core.service_form import LONGEST_S
 from fogft.wire.port import Behind, Probe, ProbeAnswer
 
 VERSION = 1
+# Beside the version, only towards peers that have said that they know them.
+_PACKED = 0x80  # the payload is compressed
+_MAY_PACK = 0x40  # the answer may be
 TOKEN_BYTES = 8
 ROBOT_BYTES_LIMIT = 64
 REASON_LIMIT = 64
@@ -57,12 +60,16 @@ class RequestHeader:
         remaining_s: Time left when it was sent, in seconds.
         token: Names the robot's connection, so that replies queue apart.
         robot: Who asks.
+        packed: The payload is compressed.
+        may_pack: The answer may be.
     """
 
     request_id: bytes
     remaining_s: float
     token: bytes
     robot: str
+    packed: bool = False
+    may_pack: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,9 +101,17 @@ def origin(robot: str, token: bytes) -> bytes:
     return token + name
 
 
-def encode_request(request_id: bytes, remaining_s: float, origin: bytes) -> bytes:
+def encode_request(
+    request_id: bytes,
+    remaining_s: float,
+    origin: bytes,
+    *,
+    packed: bool = False,
+    may_pack: bool = False,
+) -> bytes:
     """Return a request's header; `origin` comes from the function of that name."""
-    return _REQUEST.pack(VERSION, request_id, remaining_s) + origin
+    first = VERSION | _PACKED * packed | _MAY_PACK * may_pack
+    return _REQUEST.pack(first, request_id, remaining_s) + origin
 
 
 def decode_request(frame: bytes) -> RequestHeader:
@@ -107,8 +122,8 @@ def decode_request(frame: bytes) -> RequestHeader:
     """
     if not _ROBOT_AT < len(frame) <= _ROBOT_AT + ROBOT_BYTES_LIMIT:
         raise FrameError(f"a request's header of {len(frame)} bytes")
-    version, request_id, remaining_s = _REQUEST.unpack_from(frame)
-    _check_version(version)
+    first, request_id, remaining_s = _REQUEST.unpack_from(frame)
+    _check_first(first, _PACKED | _MAY_PACK)
     if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
         raise FrameError(f"a remaining time of {remaining_s} s")
     try:
@@ -117,25 +132,32 @@ def decode_request(frame: bytes) -> RequestHeader:
         raise FrameError("a robot's name that is not UTF-8") from error
     if not robot.isprintable():
         raise FrameError("a robot's name that is not printable")
-    return RequestHeader(request_id, remaining_s, frame[_ORIGIN_AT:_ROBOT_AT], robot)
+    return RequestHeader(
+        request_id,
+        remaining_s,
+        frame[_ORIGIN_AT:_ROBOT_AT],
+        robot,
+        packed=bool(first & _PACKED),
+        may_pack=bool(first & _MAY_PACK),
+    )
 
 
-def encode_answer(request_id: bytes) -> bytes:
+def encode_answer(request_id: bytes, *, packed: bool = False) -> bytes:
     """Return an answer's header."""
-    return _ANSWER.pack(VERSION, request_id)
+    return _ANSWER.pack(VERSION | _PACKED * packed, request_id)
 
 
-def decode_answer(frame: bytes) -> bytes:
-    """Return the request id of an answer's header.
+def decode_answer(frame: bytes) -> tuple[bytes, bool]:
+    """Return the request id of an answer's header, and whether its payload is compressed.
 
     Raises:
         FrameError: It is not one.
     """
     if len(frame) != _ANSWER.size:
         raise FrameError(f"an answer's header of {len(frame)} bytes")
-    version, request_id = _ANSWER.unpack(frame)
-    _check_version(version)
-    return bytes(request_id)
+    first, request_id = _ANSWER.unpack(frame)
+    _check_first(first, _PACKED)
+    return bytes(request_id), bool(first & _PACKED)
 
 
 def encode_refusal(request_id: bytes, reason: str) -> bytes:
@@ -151,14 +173,15 @@ def decode_refusal(frame: bytes) -> tuple[bytes, str]:
     """
     if not _ANSWER.size < len(frame) <= _ANSWER.size + REASON_LIMIT:
         raise FrameError(f"a refusal of {len(frame)} bytes")
-    request_id = decode_answer(frame[: _ANSWER.size])
+    version, request_id = _ANSWER.unpack_from(frame)
+    _check_version(version)
     try:
         reason = frame[_ANSWER.size :].decode("ascii")
     except UnicodeDecodeError as error:
         raise FrameError("a reason that is not ASCII") from error
     if not reason.isprintable():
         raise FrameError("a reason that is not printable")
-    return request_id, reason
+    return bytes(request_id), reason
 
 
 def greeted_bytes(token: bytes, replica: str) -> bytes:
@@ -289,6 +312,8 @@ def _plain_answer(answer: ProbeAnswer) -> dict[str, Any]:
     }
     if answer.offered:
         written["offered"] = dict(answer.offered)
+    if answer.accepts:
+        written["accepts"] = sorted(answer.accepts)
     if answer.behind:
         written["behind"] = [_behind_plain(one) for one in answer.behind]
     return written
@@ -305,7 +330,7 @@ def decode_probe_answer(frame: bytes) -> ProbeAnswer:
         slot=_count(raw, "slot"),
         generation=_count(raw, "generation"),
         incarnation=_text(raw, "incarnation"),
-        ready=_ready(raw),
+        ready=_names(raw, "ready"),
         draining=_truth(raw, "draining"),
         at_risk=_truth(raw, "at_risk", False),
         restarts=_count(raw, "restarts"),
@@ -315,6 +340,7 @@ def decode_probe_answer(frame: bytes) -> ProbeAnswer:
         offered=_texts(raw, "offered"),
         types=_types(raw),
         behind=_behind(raw.get("behind", [])),
+        accepts=_names(raw, "accepts", []),
     )
 
 
@@ -347,7 +373,7 @@ def _one_behind(raw: Any) -> Behind:
         slot=_count(raw, "slot"),
         generation=_count(raw, "generation"),
         state=state,
-        ready=_ready(raw),
+        ready=_names(raw, "ready"),
         draining=_truth(raw, "draining"),
         at_risk=_truth(raw, "at_risk"),
         silent_for_s=_seconds(raw, "silent_for_s"),
@@ -358,11 +384,11 @@ def _one_behind(raw: Any) -> Behind:
     )
 
 
-def _ready(raw: dict[str, Any]) -> frozenset[str]:
-    ready = raw.get("ready")
-    if not isinstance(ready, list):
-        raise FrameError("`ready` is not a list of names")
-    return frozenset(_check_text(name, "ready") for name in ready)
+def _names(raw: dict[str, Any], key: str, default: Any = None) -> frozenset[str]:
+    names = raw.get(key, default)
+    if not isinstance(names, list):
+        raise FrameError(f"`{key}` is not a list of names")
+    return frozenset(_check_text(name, key) for name in names)
 
 
 def _truth(raw: dict[str, Any], key: str, default: Any = None) -> bool:
@@ -370,6 +396,11 @@ def _truth(raw: dict[str, Any], key: str, default: Any = None) -> bool:
     if not isinstance(value, bool):
         raise FrameError(f"`{key}` is neither true nor false")
     return value
+
+
+def _check_first(first: int, flags: int) -> None:
+    if first & ~flags != VERSION:
+        _check_version(first)
 
 
 def _check_version(version: Any) -> None:

@@ -19,6 +19,7 @@ from fogft.core.model import ReplicaId
 from fogft.core.records import SignedRecord
 from fogft.wire.memory_link import MemoryIncoming, MemoryLink, Session
 from fogft.wire.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnswer, Refusal
+from fogft.wire.ways import Ways
 
 _STEP_S = 0.05
 
@@ -138,6 +139,9 @@ class MemoryDialer:
         self._links.append(link)
         self.wire.links.append(link)
         return link
+
+    def adopt(self, ways: Ways) -> None:
+        """Do nothing: this wire has no queue."""
 
     def renew(self) -> None:
         """Do nothing: this wire has no certificates."""

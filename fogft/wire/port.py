@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from fogft.core.definitions import Definition
 from fogft.core.model import LinkState, ReplicaId
 from fogft.core.records import SignedRecord
+from fogft.wire.ways import Ways
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,7 @@ class ProbeAnswer:
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
         behind: The replicas behind a gateway.
+        accepts: Names of compressions that it reads.
     """
 
     slot: int
@@ -107,6 +109,7 @@ class ProbeAnswer:
     offered: Mapping[str, str] = field(default_factory=dict)
     types: Mapping[str, Definition] = field(default_factory=dict)
     behind: tuple[Behind, ...] = ()
+    accepts: frozenset[str] = frozenset()
 
 
 class Refusal:
@@ -123,6 +126,7 @@ class Refusal:
     EXPIRED_CERTIFICATE = "expired-certificate"  # by the replica's clock
     CANCELLED = "cancelled"  # dropped, because the robot had its answer from elsewhere
     LATE = "late"  # it was run, but the robot had its answer from elsewhere
+    SUPERSEDED = "superseded"  # made locally: a newer request took its place before it was sent
     LOST = "lost"  # made locally: the link died before an answer came
 
 
@@ -242,6 +246,9 @@ class Dialer(Protocol):
             services: Service name -> key (from `names.service_key`).
             events: Whom to tell.
         """
+
+    def adopt(self, ways: Ways) -> None:
+        """Set what services want of their links, from the next connection on."""
 
     def renew(self) -> None:
         """Take the credentials that now stand in their files into use. No request is lost."""

@@ -17,6 +17,8 @@ from queue import Empty, SimpleQueue
 import zenoh
 
 from fogft.wire import frame
+from fogft.wire.compression import Compression
+from fogft.wire.flow_watch import THIN_BYTES_PER_S
 from fogft.wire.port import Refusal
 
 log = logging.getLogger(__name__)
@@ -48,9 +50,18 @@ class Counters:
 class Reply:
     """What one query gets: a payload, or a refusal where that is not empty."""
 
-    __slots__ = ("payload", "query", "refusal", "request_id")
+    __slots__ = ("may_pack", "payload", "query", "refusal", "request_id")
 
-    def __init__(self, query: zenoh.Query, request_id: bytes, payload: bytes, refusal: str) -> None:
+    def __init__(
+        self,
+        query: zenoh.Query,
+        request_id: bytes,
+        payload: bytes,
+        refusal: str,
+        *,
+        may_pack: bool = False,
+    ) -> None:
+        self.may_pack = may_pack
         self.query: zenoh.Query | None = query
         self.request_id = request_id
         self.payload = payload
@@ -69,8 +80,12 @@ class Reply:
             if self.refusal:
                 query.reply_err(frame.encode_refusal(self.request_id, self.refusal))
             else:
-                header = frame.encode_answer(self.request_id)
-                query.reply(query.key_expr, self.payload, attachment=header)
+                # To a robot that has seen its link to be thin, and said so.
+                rate = THIN_BYTES_PER_S if self.may_pack else None
+                packed = Compression().pack(self.payload, rate)
+                header = frame.encode_answer(self.request_id, packed=packed is not None)
+                payload = self.payload if packed is None else packed
+                query.reply(query.key_expr, payload, attachment=header)
         finally:
             query.drop()  # type: ignore[no-untyped-call]  # or the robot waits for more
 

@@ -20,8 +20,10 @@ from typing import Any
 
 from fogft.core.model import LinkState
 from fogft.core.records import SignedRecord
+from fogft.core.spec import ServiceSpec
 from fogft.core.uplinks import UplinkPolicy, choose
 from fogft.wire.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer, Refusal
+from fogft.wire.ways import PLAIN_WAYS, Ways
 
 _ANSWERED_KEPT = 1024
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
@@ -260,12 +262,20 @@ class UplinkDialer:
         self.inner = inner
         self.interfaces: tuple[str, ...] = ()
         self._policies: Mapping[str, UplinkPolicy] = {}
+        self._ways = PLAIN_WAYS
 
-    def use(self, interfaces: Sequence[str], policies: Mapping[str, UplinkPolicy]) -> bool:
-        """Set the uplinks and each service's policy; whether links have to be dialled anew."""
-        changed = tuple(interfaces) != self.interfaces
-        self.interfaces, self._policies = tuple(interfaces), dict(policies)
+    def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
+        """Set the uplinks and what services want; whether links have to be dialled anew."""
+        ways = Ways.of(services)
+        changed = (tuple(interfaces), ways) != (self.interfaces, self._ways)
+        self.interfaces, self._ways = tuple(interfaces), ways
+        self._policies = {service.name: service.uplinks for service in services}
+        self.adopt(ways)
         return changed
+
+    def adopt(self, ways: Ways) -> None:
+        """Set what services want of their links, from the next connection on."""
+        self.inner.adopt(ways)
 
     def policy(self, service: str) -> UplinkPolicy:
         """Return a service's policy."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import zenoh
 
 from fogft.wire import frame
+from fogft.wire.compression import unpack
 from fogft.wire.port import Refusal
 
 
@@ -59,8 +60,10 @@ def read_reply(reply: zenoh.Reply, request_id: bytes) -> tuple[bytes | None, str
     if reply.ok is not None:
         if reply.ok.attachment is None:
             raise frame.FrameError("an answer without a header")
-        answered_id = frame.decode_answer(reply.ok.attachment.to_bytes())
+        answered_id, packed = frame.decode_answer(reply.ok.attachment.to_bytes())
         payload = reply.ok.payload.to_bytes()
+        if packed:
+            payload = _unpacked(payload)
     elif reply.err is not None:
         content = reply.err.payload.to_bytes()
         if content == b"Timeout":  # Zenoh's own, in place of an answer
@@ -71,3 +74,10 @@ def read_reply(reply: zenoh.Reply, request_id: bytes) -> tuple[bytes | None, str
     if answered_id != request_id:
         raise frame.FrameError("an answer to another request")
     return payload, refusal
+
+
+def _unpacked(payload: bytes) -> bytes:
+    try:
+        return unpack(payload)
+    except ValueError as error:
+        raise frame.FrameError(str(error)) from error

@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from queue import SimpleQueue
 from typing import Any
 
 import zenoh
@@ -26,6 +25,7 @@ from fogft.core import names
 from fogft.core.errors import WireError
 from fogft.core.records import Sign
 from fogft.wire import frame
+from fogft.wire.compression import Compression
 from fogft.wire.credit import Credit
 from fogft.wire.diagnosis import wrong_name
 from fogft.wire.flow_watch import FlowWatch
@@ -33,9 +33,11 @@ from fogft.wire.leaving import see_off
 from fogft.wire.link_window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.wire.port import Answer, Peer, Refusal
 from fogft.wire.recalls import WORTH_S, Recalls
+from fogft.wire.send_queue import SendQueue
 from fogft.wire.sockets import address
 from fogft.wire.timer_budget import TimerBudget
 from fogft.wire.turns import LARGE_BYTES, Turns
+from fogft.wire.ways import PLAIN_WAYS, Ways
 from fogft.wire.zenoh_attempt import OpenAttempt, ran_in_vain, read_reply
 
 log = logging.getLogger(__name__)
@@ -79,6 +81,7 @@ class Connection:
         robot: Who we are.
         keys: Service name -> key.
         sign: Signs our greeting.
+        ways: How the services' payloads are sent.
         turns: Shared with the robot's other connections.
         recalls: Of whom the replica is told that it may stop; None to tell of nobody.
         answered: Called with each attempt's end, once. Must not block.
@@ -101,6 +104,7 @@ class Connection:
         keys: Mapping[str, str],
         *,
         sign: Sign,
+        ways: Ways = PLAIN_WAYS,
         turns: Turns,
         recalls: Recalls | None = None,
         answered: Callable[[Answer], None],
@@ -124,7 +128,9 @@ class Connection:
         self.certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
         greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
-        self._queue: SimpleQueue[OpenAttempt | None] = SimpleQueue()
+        self._queue = SendQueue(ways.latest)
+        self._compressions = {name: Compression() for name in keys.keys() - ways.plain}
+        self.packs = False  # whether the replica reads what is compressed
         self._credit = Credit()
         self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
         self._recalls = recalls
@@ -166,7 +172,7 @@ class Connection:
         attempt = OpenAttempt(
             service, key, request_id, payload, offered=now, remaining_s=remaining_s
         )
-        if not self.window.admit(attempt):
+        if not self.window.admit(attempt) and not self._displace(attempt):
             return False
         mark = self._credit.take(attempt.size)
         if mark is None:
@@ -176,6 +182,14 @@ class Connection:
             attempt.mark = mark
             self._send_or_lose(attempt)
         return True
+
+    def _displace(self, attempt: OpenAttempt) -> bool:
+        """Let a newer attempt in for the stalest unsent one, where its service wants that."""
+        stale = self._queue.stalest(attempt)
+        if stale is None:
+            return False
+        self._end(stale, None, Refusal.SUPERSEDED)
+        return self.window.admit(attempt)
 
     def forget(self, request_id: bytes) -> None:
         """Free the room and the bytes of a request, also where its sender is stuck."""
@@ -270,14 +284,24 @@ class Connection:
             self._on_large()
 
     def _get(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
+        compression = self._compressions.get(attempt.service)
+        packed = None
+        if self.packs and compression is not None:
+            packed = compression.pack(payload, self.flow.bytes_per_s)
         self._session.get(
             attempt.key,
             # No callback at the end of the query: it would cost every answer a second turn with
             # the interpreter lock (20 us). Each query gets a reply: the listener refuses what
             # its owner forgets, Zenoh tells of a time-out, and `sweep` finds the rest.
             handlers.Callback(partial(self._replied, attempt), indirect=False),
-            payload=payload,
-            attachment=frame.encode_request(attempt.request_id, remaining_s, self._origin),
+            payload=payload if packed is None else packed,
+            attachment=frame.encode_request(
+                attempt.request_id,
+                remaining_s,
+                self._origin,
+                packed=packed is not None,
+                may_pack=self.packs and self.flow.thin and compression is not None,
+            ),
             timeout=self._timers[attempt.service].timeout_s(remaining_s, time.monotonic()),
             target=_ALL,
             consolidation=_AT_ONCE,

@@ -17,6 +17,7 @@ from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.port import LinkEvents, Peer
 from fogft.wire.signing import Signer
 from fogft.wire.turns import Turns
+from fogft.wire.ways import PLAIN_WAYS, Ways
 from fogft.wire.zenoh_link import ZenohLink
 
 _CLOSE_WAIT_S = 3.0
@@ -54,11 +55,16 @@ class ZenohDialer:
         self.manager_age = manager_age
         self.settings = settings or LinkSettings()
         self.turns = Turns()
+        self.ways = PLAIN_WAYS
         self._signer: Signer | None = None
         self.records = b""
         self._pool_uid = pool_uid
         self._lock = threading.Lock()
         self._links: list[ZenohLink] = []
+
+    def adopt(self, ways: Ways) -> None:
+        """Set what services want of their links, from the next connection on."""
+        self.ways = ways
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
         """Start a link; return at once, in state CONNECTING.

@@ -25,6 +25,7 @@ from fogft.core import names
 from fogft.core.errors import CredentialError, WireError
 from fogft.core.model import LinkState
 from fogft.wire import config, diagnosis, frame
+from fogft.wire.compression import ZLIB
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.wire.recalls import Recalls
@@ -244,6 +245,7 @@ class ZenohLink:
                 self._dialer.robot,
                 self._services,
                 sign=self._dialer.sign,
+                ways=self._dialer.ways,
                 turns=self._dialer.turns,
                 recalls=Recalls() if self._dialer.tell_losers else None,
                 answered=self._answered,
@@ -399,6 +401,7 @@ class ZenohLink:
         news = self._live is not connection or answer != self._probe_answer
         self._probe_answer = answer
         self._ready = answer.ready
+        connection.packs = ZLIB in answer.accepts
         if self._live is not connection:
             self._state = LinkState.UP
             self._detail = ""

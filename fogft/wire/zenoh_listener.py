@@ -14,6 +14,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from queue import SimpleQueue
 
@@ -26,6 +27,7 @@ from fogft.core.model import ReplicaId
 from fogft.core.record_set import RecordSet, Verdict
 from fogft.core.records import RecordError, SignedRecord
 from fogft.wire import config, frame, record_frames
+from fogft.wire.compression import ACCEPTED, unpack
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.doorkeeper import Doorkeeper
 from fogft.wire.guests import Guests, NotAdmittedError
@@ -103,8 +105,9 @@ class ZenohIncoming:
         except IndexError:
             return  # answered before
         self._payload = b""
-        reply = Reply(query, self._header.request_id, payload, refusal)
-        self._queues.put(self._header.token, self._header.robot, reply)
+        header = self._header
+        reply = Reply(query, header.request_id, payload, refusal, may_pack=header.may_pack)
+        self._queues.put(header.token, header.robot, reply)
 
     def __del__(self) -> None:
         """Refuse what its owner forgot: the robot must not wait for it until its deadline.
@@ -254,6 +257,12 @@ class ZenohListener:
             self._turn_away(query, header.request_id, Refusal.NOT_ADMITTED, "it did not greet")
             return
         payload = query.payload.to_bytes() if query.payload is not None else b""
+        if header.packed:
+            try:
+                payload = unpack(payload)
+            except ValueError as error:
+                self._malformed(error, query)
+                return
         on_request(
             ZenohIncoming(
                 service, header, payload, query=query, queues=self._queues, chores=self._chores
@@ -339,7 +348,8 @@ class ZenohListener:
             self._turn_away(query, _NO_REQUEST, error.refusal, str(error))
             return
         try:
-            content = frame.encode_probe_answer(on_probe(probe))
+            answer = replace(on_probe(probe), accepts=ACCEPTED)
+            content = frame.encode_probe_answer(answer)
             query.reply(query.key_expr, content, express=True)
         finally:
             query.drop()  # type: ignore[no-untyped-call]

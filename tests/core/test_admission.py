@@ -104,3 +104,26 @@ def test_each_comes_out_once_and_nobody_starves(operations):
         assert all(count <= 3 for count in since.values())
         assert len(queue) == len(waiting)
     assert queue.ahead("a", 5.0) <= len(waiting)
+
+
+@given(st.lists(st.tuples(robots, st.floats(0, 100)), min_size=1, max_size=20))
+def test_where_the_latest_is_wanted_the_newest_of_each_robot_goes_first(entries):
+    """Everybody still gets a turn; what gives way when there is no room is the stalest."""
+    queue: AdmissionQueue[tuple[str, float]] = AdmissionQueue(latest=True)
+    for n, entry in enumerate(entries):
+        queue.put(bytes([n]), *entry, entry)
+    served = list(iter(queue.take, None))
+    assert sorted(served) == sorted(entries)
+    for robot in "abc":
+        deadlines = [deadline for name, deadline in served if name == robot]
+        assert deadlines == sorted(deadlines, reverse=True)
+
+
+def test_the_stalest_gives_way_to_a_newer_one_of_its_own_robot():
+    queue: AdmissionQueue[str] = AdmissionQueue(latest=True)
+    queue.put(b"old", "a", 1.0, "old")
+    queue.put(b"new", "a", 7.0, "new")
+    assert queue.give_way("a", 0.5) is None
+    assert queue.give_way("a", 9.0) == "old"
+    assert queue.ahead("a", 8.0) == 0
+    assert queue.ahead("a", 5.0) == 1

@@ -15,6 +15,7 @@ from fogft.core.middleware import Middleware, Speaks
 from fogft.core.names import POOL_NAME_PATTERN
 from fogft.core.service_form import to_plain
 from fogft.core.spec import HealthSpec, HedgingMode, OnTimeout, PoolSpec, ServiceSpec
+from fogft.core.spec_choices import Compression, Freshness
 from fogft.core.spec_keys import LATER_KEYS, TASK_KEYS
 from fogft.core.spec_reader import pool_spec
 from fogft.core.spec_tree import Node, plain, shown
@@ -66,6 +67,8 @@ services = st.lists(
         ok_field=st.sampled_from(["", "success", "ok_2"]),
         hedging=st.sampled_from(HedgingMode),
         concurrency=st.integers(0, 512),
+        freshness=st.sampled_from(Freshness),
+        compression=st.sampled_from(Compression),
     ),
     min_size=1,
     max_size=4,

@@ -102,6 +102,8 @@ def test_defaults_are_the_codes():
         "`hedging`": f"`{ServiceSpec.hedging.value}`",
         "`hedging_budget`": f"{ServiceSpec.hedging_budget:g}",
         "`trace`": f"`{str(ServiceSpec.trace).lower()}`",
+        "`freshness`": f"`{ServiceSpec.freshness.value}`",
+        "`compression`": f"`{ServiceSpec.compression.value}`",
         "`suspect_after_s`": f"{HealthSpec.suspect_after_s:g}",
         "`replace_after_s`": f"{HealthSpec.replace_after_s:g}",
         "`start_limit_s`": f"{HealthSpec.start_limit_s:g}",

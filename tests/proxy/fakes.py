@@ -82,6 +82,9 @@ class FakeDialer:
         self.links.append(link)
         return link
 
+    def adopt(self, ways) -> None:
+        self.ways = ways
+
     def renew(self) -> None:
         self.renewals += 1
 

@@ -66,7 +66,9 @@ def test_a_request_header_comes_back(
 @given(request_id=ids)
 def test_an_answer_header_comes_back(request_id: bytes) -> None:
     """Decoding undoes encoding."""
-    assert frame.decode_answer(frame.encode_answer(request_id)) == request_id
+    for packed in (False, True):
+        header = frame.encode_answer(request_id, packed=packed)
+        assert frame.decode_answer(header) == (request_id, packed)
 
 
 @given(request_id=ids, reason=reasons)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from fogft.core.model import LinkState
+from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_link import ZenohLink
 from tests.wire.namespaces import Namespaces, inside, why_not
@@ -125,6 +126,54 @@ def test_a_large_request_through_a_slow_relay_leaves_links_alone(
         dialer.close()
         for relay in relays:
             relay.close()
+
+
+def test_what_shrinks_is_compressed_once_the_uplink_was_seen_to_be_thin(
+    start_replica: Callable[..., ReplicaProcess], authority: Authority, owner: Owner
+) -> None:
+    """Both ways, and what comes back is what was sent; noise leaves as it is."""
+    relay = ThinRelay(start_replica().endpoint, 250_000)
+    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+    text = b"the quick brown fox jumps over the lazy dog " * 20_000
+    try:
+        link = dialer.dial(peer(relay.endpoint), keys(0), owner)
+        wait_for(lambda: link.usable)
+        for number, payload in enumerate((MEGABYTE, text, MEGABYTE)):
+            before = relay.passed_bytes
+            assert link.offer(SERVICE, request_id(number), payload, LONG_S)
+            wait_for(answered(owner, number), LONG_S)
+            assert owner.of(number)[0].payload == payload
+            passed = relay.passed_bytes - before
+            if payload is text:
+                assert passed < len(text) / 5, passed
+            else:
+                assert passed > 2 * len(MEGABYTE), passed
+        never_given_up(owner, [link], 3)
+    finally:
+        dialer.close()
+        relay.close()
+
+
+def test_the_newest_request_overtakes_stale_ones_where_the_service_says_so(
+    start_replica: Callable[..., ReplicaProcess], authority: Authority, owner: Owner
+) -> None:
+    """While one large request leaves, others wait; the last to come is the next to leave."""
+    relay = ThinRelay(start_replica(reply_bytes=16).endpoint, 500_000)
+    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+    dialer.adopt(Ways(latest=frozenset({SERVICE})))
+    try:
+        link = dialer.dial(peer(relay.endpoint), keys(0), owner)
+        wait_for(lambda: link.usable)
+        for number in range(6):
+            assert link.offer(SERVICE, request_id(number), MEGABYTE[:400_000], LONG_S)
+        wait_for(lambda: len(owner.answers) == 6, LONG_S)
+        order = [int.from_bytes(a.request_id, "big") for _, a in owner.answers]
+        late = order[order.index(5) :]  # the first few left before the last one came
+        assert late == sorted(late, reverse=True)
+        assert len(late) >= 3
+    finally:
+        dialer.close()
+        relay.close()
 
 
 def test_a_replica_that_freezes_under_a_large_request_is_found_out(

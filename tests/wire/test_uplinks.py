@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.core.model import ReplicaId
+from fogft.core.spec import ServiceSpec
 from fogft.core.uplinks import UplinkPolicy, choose, is_interface
 from fogft.wire.port import Answer, Peer, Refusal
 from fogft.wire.uplinks import UplinkDialer
@@ -38,7 +39,10 @@ class Scene:
     def __init__(self, policy: str, uplinks: int = 2) -> None:
         self.owner, inner = Owner(), FakeDialer()
         dialer = UplinkDialer(inner)
-        dialer.use([f"if{i}" for i in range(uplinks)], {"/s": UplinkPolicy(policy)})
+        dialer.use(
+            [f"if{i}" for i in range(uplinks)],
+            [ServiceSpec("/s", "t/srv/T", uplinks=UplinkPolicy(policy))],
+        )
         self.link = dialer.dial(PEER, {"/s": "k"}, self.owner)
         self.uplinks = inner.links
         for one in self.uplinks:
@@ -144,7 +148,7 @@ def test_a_full_uplink_is_passed_over():
 def test_what_is_on_this_machine_takes_no_uplink():
     """The door through which replicas dial in."""
     dialer = UplinkDialer(FakeDialer())
-    dialer.use(["if0"], {})
+    dialer.use(["if0"], [])
     link = dialer.dial(Peer(PEER.id, "127.0.0.1:9", "n"), {}, Owner())
     assert link.peer.interface == ""
 

@@ -21,6 +21,7 @@ class ThinRelay:
     Attributes:
         endpoint: ``host:port`` where it listens.
         open: Clear it, and nothing passes until it is set again.
+        passed_bytes: What has passed, both ways together.
     """
 
     def __init__(self, target: str, bytes_per_s: float) -> None:
@@ -36,6 +37,7 @@ class ThinRelay:
         self.endpoint = f"127.0.0.1:{self._server.getsockname()[1]}"
         self.open = threading.Event()
         self.open.set()
+        self.passed_bytes = 0
         self._next = {"up": 0.0, "down": 0.0}
         self._lock = threading.Lock()
         threading.Thread(target=self._accept, daemon=True).start()
@@ -61,6 +63,7 @@ class ThinRelay:
                 with self._lock:  # a turn on the line
                     begin = max(self._next[way], time.monotonic())
                     self._next[way] = begin + len(data) / self._bytes_per_s
+                    self.passed_bytes += len(data)
                 time.sleep(max(0.0, self._next[way] - time.monotonic()))
                 self.open.wait()
                 sink.sendall(data)

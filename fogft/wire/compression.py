@@ -1,0 +1,106 @@
+"""Compress what a thin uplink carries, where it pays. No clock of its own, no Zenoh.
+
+zlib at its lowest level: it is in every Python, and on the links where compression can pay at
+all it is not what limits. What pays is measured for each service: how far its bytes shrink and
+how long that takes, against how long they would take to leave at the rate that was seen. What
+does not shrink is left alone, and tried again rarely.
+
+Compressed payloads go only to peers that have said that they read them (`ACCEPTED`).
+
+Owns: when and how. Not here: rates (`drain`), headers (`frame`).
+"""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable
+
+ZLIB = "zlib"
+ACCEPTED = frozenset({ZLIB})  # what this version reads
+LEAST_BYTES = 2048  # smaller ones leave in one packet or two
+LIMIT_BYTES = 64 << 20  # more than a window holds: a frame that claims more is refused
+FASTEST_BYTES_PER_S = 30e6  # a link that drains faster gains nothing by zlib
+_SAMPLE_BYTES = 32 << 10
+_GAIN = 0.9  # of the time to leave, at most so much may remain
+_LEVEL = 1
+_FIRST_PAUSE, _LONGEST_PAUSE = 16, 1024
+_SHARE_OF_NEW = 0.3
+
+
+class Compression:
+    """Of one service on one connection. Used by one thread.
+
+    Args:
+        clock: Seconds, for how long compressing takes.
+
+    Attributes:
+        ratio: Compressed against plain size, as last seen; None before the first trial.
+        saved_bytes: What was not sent.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+        self.ratio: float | None = None
+        self.saved_bytes = 0
+        self._s_per_byte = 0.0
+        self._rest = 0  # so many are left alone before the next trial
+        self._pause = _FIRST_PAUSE
+
+    def pack(self, payload: bytes, bytes_per_s: float | None) -> bytes | None:
+        """Return the payload compressed, or None where it is to be sent as it is.
+
+        Args:
+            payload: What shall be sent.
+            bytes_per_s: What the link was seen to drain; None for not known, which is fast.
+        """
+        if bytes_per_s is None or bytes_per_s > FASTEST_BYTES_PER_S:
+            return None
+        if not LEAST_BYTES <= len(payload) <= LIMIT_BYTES:
+            return None
+        if self._rest:
+            self._rest -= 1
+            return None
+        if self.ratio is None or not self._pays(bytes_per_s):
+            self._compress(payload[:_SAMPLE_BYTES])
+            if not self._pays(bytes_per_s):
+                self._rest, self._pause = self._pause, min(2 * self._pause, _LONGEST_PAUSE)
+                return None
+        packed = self._compress(payload)
+        self._pause = _FIRST_PAUSE
+        if len(packed) >= len(payload) * _GAIN:
+            return None
+        self.saved_bytes += len(payload) - len(packed)
+        return packed
+
+    def _compress(self, payload: bytes) -> bytes:
+        began = self._clock()
+        packed = zlib.compress(payload, _LEVEL)
+        took_s = self._clock() - began
+        ratio, s_per_byte = len(packed) / len(payload), took_s / len(payload)
+        if self.ratio is None:
+            self.ratio, self._s_per_byte = ratio, s_per_byte
+        else:
+            self.ratio += _SHARE_OF_NEW * (ratio - self.ratio)
+            self._s_per_byte += _SHARE_OF_NEW * (s_per_byte - self._s_per_byte)
+        return packed
+
+    def _pays(self, bytes_per_s: float) -> bool:
+        assert self.ratio is not None
+        return self._s_per_byte + self.ratio / bytes_per_s < _GAIN / bytes_per_s
+
+
+def unpack(packed: bytes, limit: int = LIMIT_BYTES) -> bytes:
+    """Return what was compressed.
+
+    Raises:
+        ValueError: It is not whole, or would be larger than `limit` bytes.
+    """
+    reader = zlib.decompressobj()
+    try:
+        payload = reader.decompress(packed, limit)
+    except zlib.error as error:
+        raise ValueError(f"a payload that cannot be decompressed: {error}") from error
+    if not reader.eof or reader.unused_data or reader.unconsumed_tail:
+        raise ValueError(f"a compressed payload that is cut short, or above {limit} bytes")
+    return payload

@@ -1,0 +1,34 @@
+"""How a robot's payloads are sent: which services want what on the way. Values only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from fogft.core.spec import ServiceSpec
+from fogft.core.spec_choices import Compression, Freshness
+
+
+@dataclass(frozen=True)
+class Ways:
+    """What services want of their links.
+
+    Attributes:
+        latest: Those of which the newest request goes first.
+        plain: Those whose payloads are never compressed.
+    """
+
+    latest: frozenset[str] = frozenset()
+    plain: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, services: Iterable[ServiceSpec]) -> Ways:
+        """Return what these services want."""
+        known = tuple(services)
+        return cls(
+            frozenset(s.name for s in known if s.freshness is Freshness.LATEST),
+            frozenset(s.name for s in known if s.compression is Compression.OFF),
+        )
+
+
+PLAIN_WAYS = Ways()
