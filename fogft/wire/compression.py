@@ -87,7 +87,8 @@ class Compression:
 
     def _pays(self, bytes_per_s: float) -> bool:
         assert self.ratio is not None
-        return self._s_per_byte + self.ratio / bytes_per_s < _GAIN / bytes_per_s
+        s_per_byte = 1 / max(bytes_per_s, 1.0)  # it may have stood still when it was seen
+        return self._s_per_byte + self.ratio * s_per_byte < _GAIN * s_per_byte
 
 
 def unpack(packed: bytes, limit: int = LIMIT_BYTES) -> bytes:

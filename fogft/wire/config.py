@@ -58,8 +58,8 @@ class LinkSettings:
         stuck_after_s: A replica gives up a connection that delivers nothing for so long.
     """
 
-    lease_s: float = 600.0
-    wait_before_close_s: float = 500.0
+    lease_s: float = 150.0
+    wait_before_close_s: float = 120.0
     open_timeout_s: float = 1.5
     stall_after_s: float = 1.0
     stuck_after_s: float = 15.0

@@ -3,6 +3,11 @@
 A reply to a frozen robot blocks until Zenoh gives that robot's session up. So each
 connection has its own thread; it ends when it has had nothing to do for a while.
 
+Ending a query sends something too, so it is done by the same thread. And it must not be done
+while Zenoh's own thread still holds that query: then the last to let go would be Zenoh's thread,
+which would wait for room that only it can make, and with it every link of this process would
+stand still. So a query is ended when that thread has come to the next one (`turns`).
+
 Owns: the order and the bounds of replies. Not here: what is replied.
 """
 
@@ -10,8 +15,10 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from queue import Empty, SimpleQueue
 
 import zenoh
@@ -26,6 +33,8 @@ log = logging.getLogger(__name__)
 REPLIES_LIMIT = 1024
 BYTES_LIMIT = 64 << 20
 _IDLE_S = 5.0
+_END_LOOK_S = 0.02
+_END_ANYWAY_S = 1.0  # Zenoh's thread has long let go, though nothing came after
 
 
 class Counters:
@@ -47,10 +56,31 @@ class Counters:
             return dict(self._counts)
 
 
-class Reply:
-    """What one query gets: a payload, or a refusal where that is not empty."""
+class QueryTurns:
+    """Which query Zenoh's one thread has in its hands: the last that came."""
 
-    __slots__ = ("may_pack", "payload", "query", "refusal", "request_id")
+    def __init__(self) -> None:
+        self._last = 0
+
+    def came(self) -> int:
+        """Count a query. Called by Zenoh's thread, first of all."""
+        self._last += 1
+        return self._last
+
+    def over(self, turn: int) -> bool:
+        """Whether Zenoh's thread has let go of a query."""
+        return turn < self._last
+
+
+class Reply:
+    """What one query gets: a payload, or a refusal where that is not empty.
+
+    Attributes:
+        turn: When its query came, by `QueryTurns`.
+        ends_only: It was replied to elsewhere, and is only to be ended.
+    """
+
+    __slots__ = ("ends_only", "may_pack", "payload", "query", "refusal", "request_id", "turn")
 
     def __init__(
         self,
@@ -59,35 +89,70 @@ class Reply:
         payload: bytes,
         refusal: str,
         *,
+        turn: int = 0,
         may_pack: bool = False,
+        ends_only: bool = False,
     ) -> None:
+        self.turn = turn
         self.may_pack = may_pack
+        self.ends_only = ends_only
         self.query: zenoh.Query | None = query
         self.request_id = request_id
         self.payload = payload
         self.refusal = refusal
 
     def send(self) -> None:
-        """Send it. May block for as long as `wait_before_close`.
+        """Send it; the query is not ended yet. May block for as long as its robot takes nothing.
 
         Raises:
             zenoh.ZError: The session is closed.
         """
-        query, self.query = self.query, None
-        if query is None:
+        query = self.query
+        if query is None or self.ends_only:
             return
-        try:
-            if self.refusal:
-                query.reply_err(frame.encode_refusal(self.request_id, self.refusal))
+        if self.refusal:
+            query.reply_err(frame.encode_refusal(self.request_id, self.refusal))
+            return
+        # To a robot that has seen its link to be thin, and said so.
+        rate = THIN_BYTES_PER_S if self.may_pack else None
+        packed = Compression().pack(self.payload, rate)
+        header = frame.encode_answer(self.request_id, packed=packed is not None)
+        payload = self.payload if packed is None else packed
+        self.payload = b""
+        query.reply(query.key_expr, payload, attachment=header)
+
+    def end(self) -> None:
+        """End the query, or the robot waits for more. May block as `send` does."""
+        query, self.query = self.query, None
+        if query is not None:
+            query.drop()  # type: ignore[no-untyped-call]
+
+
+class _Unended:
+    """What one thread has sent and not ended."""
+
+    def __init__(self, turns: QueryTurns) -> None:
+        self._turns = turns
+        self._replies: list[tuple[float, Reply]] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._replies)
+
+    def add(self, reply: Reply) -> None:
+        """End a query now, or as soon as it may be."""
+        if self._turns.over(reply.turn):
+            reply.end()
+        else:
+            self._replies.append((time.monotonic(), reply))
+
+    def look(self) -> None:
+        """End what may be ended by now."""
+        waiting, self._replies = self._replies, []
+        for since, reply in waiting:
+            if self._turns.over(reply.turn) or time.monotonic() - since > _END_ANYWAY_S:
+                reply.end()
             else:
-                # To a robot that has seen its link to be thin, and said so.
-                rate = THIN_BYTES_PER_S if self.may_pack else None
-                packed = Compression().pack(self.payload, rate)
-                header = frame.encode_answer(self.request_id, packed=packed is not None)
-                payload = self.payload if packed is None else packed
-                query.reply(query.key_expr, payload, attachment=header)
-        finally:
-            query.drop()  # type: ignore[no-untyped-call]  # or the robot waits for more
+                self._replies.append((since, reply))
 
 
 class _Queue:
@@ -105,11 +170,15 @@ class ReplyQueues:
 
     Args:
         counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
+        turns: Tells when a query may be ended.
         idle_s: A thread that had nothing to send for so long ends.
     """
 
-    def __init__(self, counters: Counters, *, idle_s: float = _IDLE_S) -> None:
+    def __init__(
+        self, counters: Counters, turns: QueryTurns | None = None, *, idle_s: float = _IDLE_S
+    ) -> None:
         self._counters = counters
+        self._turns = turns or QueryTurns()
         self._idle_s = idle_s
         self._lock = threading.Lock()
         self._queues: dict[bytes, _Queue] = {}
@@ -142,7 +211,7 @@ class ReplyQueues:
             queue.replies.put(reply)
         if dropped:
             self._counters.add("reply_dropped")
-        else:
+        elif not reply.ends_only:
             self._counters.add("refused" if reply.refusal else "replies")
 
     def _begin(self, token: bytes, robot: str) -> _Queue:
@@ -154,10 +223,14 @@ class ReplyQueues:
         return queue
 
     def _run(self, token: bytes, queue: _Queue) -> None:
+        unended = _Unended(self._turns)
         while True:
             try:
-                reply = queue.replies.get(timeout=self._idle_s)
+                reply = queue.replies.get(timeout=_END_LOOK_S if unended else self._idle_s)
             except Empty:
+                if unended:
+                    self._guarded(unended.look)
+                    continue
                 with self._lock:
                     if queue.waiting:
                         continue  # one came between the time-out and the lock
@@ -166,16 +239,22 @@ class ReplyQueues:
             if reply is None:
                 return
             size = len(reply.payload)
-            try:
-                reply.send()
-            except Exception as error:
-                count = self._counters.add("failed")
-                if count & (count - 1) == 0:
-                    log.warning("reply_failed reason=%r count=%d", str(error), count)
+            self._guarded(reply.send)
+            self._guarded(partial(unended.add, reply))
+            if unended:
+                self._guarded(unended.look)
             with self._lock:
                 queue.waiting -= 1
                 queue.waiting_bytes -= size
             del reply  # its payload, while this thread waits
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except Exception as error:
+            count = self._counters.add("failed")
+            if count & (count - 1) == 0:
+                log.warning("reply_failed reason=%r count=%d", str(error), count)
 
     def close(self, timeout_s: float) -> None:
         """Take nothing more; wait a moment for what is queued."""

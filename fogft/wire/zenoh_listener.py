@@ -34,7 +34,7 @@ from fogft.wire.guests import Guests, NotAdmittedError
 from fogft.wire.handshakes import HandshakeLog
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
-from fogft.wire.reply_queue import Counters, Reply, ReplyQueues
+from fogft.wire.reply_queue import Counters, QueryTurns, Reply, ReplyQueues
 from fogft.wire.signing import LazyVerifier
 from fogft.wire.sockets import Address, address
 
@@ -42,12 +42,13 @@ log = logging.getLogger(__name__)
 
 _CLOSE_WAIT_S = 1.0
 _NO_REQUEST = bytes(names.REQUEST_ID_BYTES)
+_STRANGERS = b""  # in place of a token: replies to whose connection is not known
 
 
 class ZenohIncoming:
     """A request that came over Zenoh; see `port.Incoming`."""
 
-    __slots__ = ("_chores", "_header", "_payload", "_queries", "_queues", "_service")
+    __slots__ = ("_chores", "_header", "_payload", "_queries", "_queues", "_service", "_turn")
 
     def __init__(
         self,
@@ -58,8 +59,10 @@ class ZenohIncoming:
         query: zenoh.Query,
         queues: ReplyQueues,
         chores: SimpleQueue[Callable[[], None] | None],
+        turn: int,
     ) -> None:
         self._service = service
+        self._turn = turn
         self._header = header
         self._payload = payload
         self._queries = [query]  # taken by the first answer; list.pop is atomic
@@ -106,7 +109,9 @@ class ZenohIncoming:
             return  # answered before
         self._payload = b""
         header = self._header
-        reply = Reply(query, header.request_id, payload, refusal, may_pack=header.may_pack)
+        reply = Reply(
+            query, header.request_id, payload, refusal, turn=self._turn, may_pack=header.may_pack
+        )
         self._queues.put(header.token, header.robot, reply)
 
     def __del__(self) -> None:
@@ -116,7 +121,8 @@ class ZenohIncoming:
         `SimpleQueue` may be put into from here.
         """
         if self._queries:
-            forgotten = Reply(self._queries.pop(), self._header.request_id, b"", Refusal.LOST)
+            query, id = self._queries.pop(), self._header.request_id
+            forgotten = Reply(query, id, b"", Refusal.LOST, turn=self._turn)
             self._chores.put(
                 partial(self._queues.put, self._header.token, self._header.robot, forgotten)
             )
@@ -160,7 +166,8 @@ class ZenohListener:
         )
         self._records = RecordSet(id.pool_uid, LazyVerifier(credentials.ca))
         self._counters = Counters()
-        self._queues = ReplyQueues(self._counters)
+        self._turns = QueryTurns()
+        self._queues = ReplyQueues(self._counters, self._turns)
         self._chores: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._session: zenoh.Session | None = None
         self._queryables: list[object] = []
@@ -229,11 +236,12 @@ class ZenohListener:
                 log.warning("handshake_refused reason=%r count=%d", reason, count)
 
     def _declare(
-        self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query], None]
+        self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query, int], None]
     ) -> None:
         def guarded(query: zenoh.Query) -> None:
+            turn = self._turns.came()
             try:
-                heard(query)
+                heard(query, turn)
             except Exception:  # in Zenoh's thread nobody else would tell of it
                 self._counters.add("failed")
                 log.exception("query_not_taken key=%s", key)
@@ -244,85 +252,93 @@ class ZenohListener:
     # -- Zenoh's threads ------------------------------------------------------------------
 
     def _request(
-        self, service: str, on_request: Callable[[Incoming], None], query: zenoh.Query
+        self, service: str, on_request: Callable[[Incoming], None], query: zenoh.Query, turn: int
     ) -> None:
         self._counters.add("requests")
         attachment = query.attachment
         try:
             header = frame.decode_request(attachment.to_bytes() if attachment else b"")
         except frame.FrameError as error:
-            self._malformed(error, query)
+            self._malformed(error, query, turn)
             return
         if not self._guests.admits(header.token):
-            self._turn_away(query, header.request_id, Refusal.NOT_ADMITTED, "it did not greet")
+            refused = Reply(query, header.request_id, b"", Refusal.NOT_ADMITTED, turn=turn)
+            self._turn_away(refused, "it did not greet")
             return
         payload = query.payload.to_bytes() if query.payload is not None else b""
         if header.packed:
             try:
                 payload = unpack(payload)
             except ValueError as error:
-                self._malformed(error, query)
+                self._malformed(error, query, turn)
                 return
-        on_request(
-            ZenohIncoming(
-                service, header, payload, query=query, queues=self._queues, chores=self._chores
-            )
-        )
+        incoming = ZenohIncoming(
+            service, header, payload,
+            query=query, queues=self._queues, chores=self._chores, turn=turn,
+        )  # fmt: skip
+        on_request(incoming)
 
-    def _probe(self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query) -> None:
+    def _probe(
+        self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query, turn: int
+    ) -> None:
         self._counters.add("probes")
         attachment = query.attachment
         try:
             probe = frame.decode_probe(query.payload.to_bytes() if query.payload else b"")
             greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
         except frame.FrameError as error:
-            self._malformed(error, query)
+            self._malformed(error, query, turn)
             return
-        self._chores.put(partial(self._answer_probe, on_probe, probe, greeting, query))
+        self._chores.put(partial(self._answer_probe, on_probe, probe, greeting, query, turn))
 
-    def _turn_away(self, query: zenoh.Query, request_id: bytes, refusal: str, why: str) -> None:
+    def _turn_away(self, refused: Reply, why: str) -> None:
         count = self._counters.add("not_admitted")
         if count & (count - 1) == 0:
             log.warning("robot_not_admitted reason=%r count=%d", why, count)
-        self._chores.put(Reply(query, request_id, b"", refusal).send)
+        self._queues.put(_STRANGERS, "strangers", refused)
 
-    def _cancel(self, on_cancel: Callable[[Sequence[bytes]], None], query: zenoh.Query) -> None:
+    def _cancel(
+        self, on_cancel: Callable[[Sequence[bytes]], None], query: zenoh.Query, turn: int
+    ) -> None:
         self._counters.add("cancellations")
         try:
             ids = frame.decode_cancel(query.payload.to_bytes() if query.payload else b"")
         except frame.FrameError as error:
-            self._malformed(error, query)
+            self._malformed(error, query, turn)
             return
-        self._chores.put(partial(_end_query, query))  # nobody awaits an answer
+        # Nobody awaits an answer.
+        ended = Reply(query, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
+        self._queues.put(_STRANGERS, "strangers", ended)
         self._chores.put(partial(on_cancel, ids))
 
-    def _heard_records(self, query: zenoh.Query) -> None:
+    def _heard_records(self, query: zenoh.Query, turn: int) -> None:
         self._counters.add("records")
         attachment = query.attachment
         try:
             greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
             offered = record_frames.unpack(query.payload.to_bytes() if query.payload else b"")
         except (frame.FrameError, RecordError) as error:
-            self._malformed(error, query)
+            self._malformed(error, query, turn)
             return
-        self._chores.put(partial(self._take_records, greeting, offered, query))
+        self._chores.put(partial(self._take_records, greeting, offered, query, turn))
 
-    def _malformed(self, error: ValueError, query: zenoh.Query) -> None:
+    def _malformed(self, error: ValueError, query: zenoh.Query, turn: int) -> None:
         count = self._counters.add("malformed")
         if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
             log.warning("request_malformed reason=%r count=%d", str(error), count)
-        self._chores.put(Reply(query, _NO_REQUEST, b"", Refusal.MALFORMED).send)
+        refused = Reply(query, _NO_REQUEST, b"", Refusal.MALFORMED, turn=turn)
+        self._queues.put(_STRANGERS, "strangers", refused)
 
     # -- the probe thread -----------------------------------------------------------------
 
     def _take_records(
-        self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query
+        self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query, turn: int
     ) -> None:
         """Judge records by their own signatures: whoever brings them has no say in them."""
         try:
             self._guests.greet(greeting)
         except NotAdmittedError as error:
-            self._turn_away(query, _NO_REQUEST, error.refusal, str(error))
+            self._turn_away(Reply(query, _NO_REQUEST, b"", error.refusal, turn=turn), str(error))
             return
         try:
             for one in offered:
@@ -332,7 +348,7 @@ class ZenohListener:
                     log.warning("record_refused reason=%r", self._records.last_refusal)
             query.reply(query.key_expr, b"")
         finally:
-            query.drop()  # type: ignore[no-untyped-call]
+            self._end_aside(greeting, query, turn)
         self.revoke(self._records.revoked)
 
     def _answer_probe(
@@ -341,18 +357,24 @@ class ZenohListener:
         probe: Probe,
         greeting: frame.Greeting,
         query: zenoh.Query,
+        turn: int,
     ) -> None:
         try:
             self._guests.greet(greeting)
         except NotAdmittedError as error:
-            self._turn_away(query, _NO_REQUEST, error.refusal, str(error))
+            self._turn_away(Reply(query, _NO_REQUEST, b"", error.refusal, turn=turn), str(error))
             return
         try:
             answer = replace(on_probe(probe), accepts=ACCEPTED)
             content = frame.encode_probe_answer(answer)
             query.reply(query.key_expr, content, express=True)
         finally:
-            query.drop()  # type: ignore[no-untyped-call]
+            self._end_aside(greeting, query, turn)
+
+    def _end_aside(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> None:
+        """End a query in its robot's own thread: unlike the answer, that queues behind replies."""
+        ended = Reply(query, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
+        self._queues.put(greeting.token, "probe", ended)
 
     def _do_chores(self) -> None:
         while (chore := self._chores.get()) is not None:
@@ -392,10 +414,6 @@ class ZenohListener:
         closer.start()
         see_off(closer)
         closer.join(_CLOSE_WAIT_S / 2)
-
-
-def _end_query(query: zenoh.Query) -> None:
-    query.drop()  # type: ignore[no-untyped-call]
 
 
 def _close(session: zenoh.Session) -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fogft.child import tied
 from fogft.core import membership, names
 from fogft.core.holders import Role
 from fogft.core.model import Member, Membership, ReplicaId
@@ -65,16 +66,19 @@ class GatewayPool:
         del self._members[slot]
 
     def gateway(
-        self, name: str, *, listen: str = "", where: str = "", generation: int = 1
+        self, name: str, *, listen: str = "", where: str = "", generation: int = 1, extra: str = ""
     ) -> Process:
         common_name = names.gateway_certificate_name(POOL_UID, name, generation)
         return Process(
             self, name, "gateway", self.authority.issue(common_name, Role.GATEWAY),
-            extra=f"listen: {listen or f'127.0.0.1:{free_port()}'}\n", where=where,
+            extra=f"listen: {listen or f'127.0.0.1:{free_port()}'}\n{extra}", where=where,
         )  # fmt: skip
 
-    def robot(self, name: str, *, where: str = "", extra: str = "") -> Robot:
-        return Robot(self, name, "robot", self.authority.robot(name), extra=extra, where=where)
+    def robot(self, name: str, *, where: str = "", extra: str = "", first: int = 1) -> Robot:
+        """Start a robot; `first` is the number of its first request."""
+        return Robot(
+            self, name, "robot", self.authority.robot(name), extra=extra, where=where, first=first
+        )
 
     def lay_out(
         self,
@@ -132,8 +136,10 @@ class Process:
     """A gateway's process."""
 
     def __init__(
-        self, pool: GatewayPool, name: str, role: str, files: Files, *, extra: str, where: str
+        self, pool: GatewayPool, name: str, role: str, files: Files, *, extra: str, where: str,
+        first: int = 1,
     ) -> None:  # fmt: skip
+        self._first = first
         self.name = name
         self.files = files
         self._where = where
@@ -149,7 +155,7 @@ class Process:
     def start(self) -> None:
         with _inside(self._where), self._log.open("ab") as log:
             self.process = subprocess.Popen(
-                self.command(), cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                tied(self.command()), cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 stderr=log, text=True,
             )  # fmt: skip
 
@@ -177,7 +183,8 @@ class Robot(Process):
     """A client proxy without ROS; see `plain_robot`."""
 
     def command(self) -> list[str]:
-        return [sys.executable, "-m", "tests.proxy.plain_robot", str(self._config)]
+        return [sys.executable, "-m", "tests.proxy.plain_robot", str(self._config),
+                str(self._first)]  # fmt: skip
 
     def tell(self, **command: Any) -> dict[str, Any]:
         assert self.process.stdin is not None

@@ -2,7 +2,9 @@
 
 Each command is a JSON line and is answered by one:
 ``{"ask": N, "bytes": B, "service": NAME}`` asks N requests of B bytes at once;
-``{}`` tells how many were asked and rightly answered, what was wrong, and the proxy's report.
+``{}`` tells how many were asked and rightly answered, what was wrong, how long each took that was
+answered since the last command, and the proxy's report.
+Arguments: its configuration, and the number of its first request.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from fogft.proxy.client_process import make_dialer
 from fogft.proxy.config import read_client
 from fogft.proxy.dispatcher import Dispatcher
 from fogft.proxy.following import Following
+from fogft.proxy.process import Watched
 
 
 class Callers:
@@ -28,7 +31,9 @@ class Callers:
 
     alive = True
 
-    def __init__(self) -> None:
+    def __init__(self, first: int = 1) -> None:
+        self._next = first
+        self._took: list[tuple[int, float]] = []
         self._ask: dict[str, Callable[[bytes, Any], None]] = {}
         self._lock = threading.Lock()
         self._open: dict[int, bytes] = {}
@@ -53,7 +58,7 @@ class Callers:
             time.sleep(0.01)
         for _ in range(count):
             self.asked += 1
-            number = self.asked
+            number, self._next = self._next, self._next + 1
             payload = number.to_bytes(8, "big") * max(size // 8, 1)
             self._open[number] = payload
             self._began[number] = time.monotonic()
@@ -64,13 +69,18 @@ class Callers:
             expected = self._open.pop(handle, None)
             took_s = time.monotonic() - self._began.pop(handle, 0.0)
             self.slowest_s = max(self.slowest_s, took_s)
+            self._took.append((handle, round(took_s, 6)))
             if expected == payload:
                 self.right += 1
             else:
                 self.wrong.append(handle)
 
     def report(self) -> dict[str, Any]:
+        with self._lock:
+            took, self._took = self._took, []
         return {
+            "took": took,
+            "next": self._next,
             "services": sorted(self._ask),
             "asked": self.asked,
             "right": self.right,
@@ -81,7 +91,7 @@ class Callers:
 
 def main() -> None:
     config = read_client(Path(sys.argv[1]))
-    callers = Callers()
+    callers = Callers(int(sys.argv[2]) if len(sys.argv) > 2 else 1)
     dialer = make_dialer(config, lambda: None)
     proxy = ClientProxy(
         config.pool_uid,
@@ -91,6 +101,8 @@ def main() -> None:
     )
     proxy.serve(config.services)
     following = Following(config)
+    certificate = Watched(config.credentials.certificate)
+    certificate.changed()
 
     def keep() -> None:
         while True:
@@ -98,6 +110,9 @@ def main() -> None:
             membership = following.look()
             if membership is not None:
                 proxy.follow(membership)
+            if certificate.changed():
+                proxy.renew()
+                following.renew()
 
     threading.Thread(target=keep, daemon=True).start()
     for line in sys.stdin:

@@ -16,25 +16,31 @@ class ThinRelay:
 
     Args:
         target: ``host:port``.
-        bytes_per_s: Each way, for all connections together.
+        bytes_per_s: Each way, for all connections together; may be changed.
+        host: Where it listens.
 
     Attributes:
+        bytes_per_s: As given.
+        delay_s: What passes is held up by so long.
         endpoint: ``host:port`` where it listens.
         open: Clear it, and nothing passes until it is set again.
         passed_bytes: What has passed, both ways together.
     """
 
-    def __init__(self, target: str, bytes_per_s: float) -> None:
-        host, _, port = target.rpartition(":")
-        self._target = (host, int(port))
-        self._bytes_per_s = bytes_per_s
+    def __init__(
+        self, target: str, bytes_per_s: float = float("inf"), *, host: str = "127.0.0.1"
+    ) -> None:
+        far, _, port = target.rpartition(":")
+        self._target = (far, int(port))
+        self.bytes_per_s = bytes_per_s
+        self.delay_s = 0.0
         self._server = socket.socket()
         # Small buffers, set before listening: what waits shall wait at the sender.
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-        self._server.bind(("127.0.0.1", 0))
+        self._server.bind((host, 0))
         self._server.listen()
         self._ends: list[socket.socket] = [self._server]
-        self.endpoint = f"127.0.0.1:{self._server.getsockname()[1]}"
+        self.endpoint = f"{host}:{self._server.getsockname()[1]}"
         self.open = threading.Event()
         self.open.set()
         self.passed_bytes = 0
@@ -43,28 +49,33 @@ class ThinRelay:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
+        while True:
+            try:
                 near, _ = self._server.accept()
-                far = socket.socket()
-                far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+            except OSError:
+                return  # closed
+            far = socket.socket()
+            far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+            try:
                 far.connect(self._target)
-                for end in (near, far):
-                    end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
-                self._ends += [near, far]
-                for source, sink, way in ((near, far, "up"), (far, near, "down")):
-                    threading.Thread(
-                        target=self._pass, args=(source, sink, way), daemon=True
-                    ).start()
+            except OSError:  # nobody listens there, now
+                near.close()
+                far.close()
+                continue
+            for end in (near, far):
+                end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+            self._ends += [near, far]
+            for source, sink, way in ((near, far, "up"), (far, near, "down")):
+                threading.Thread(target=self._pass, args=(source, sink, way), daemon=True).start()
 
     def _pass(self, source: socket.socket, sink: socket.socket, way: str) -> None:
         with contextlib.suppress(OSError):
             while data := source.recv(_CHUNK_BYTES):
                 with self._lock:  # a turn on the line
                     begin = max(self._next[way], time.monotonic())
-                    self._next[way] = begin + len(data) / self._bytes_per_s
+                    self._next[way] = begin + len(data) / self.bytes_per_s
                     self.passed_bytes += len(data)
-                time.sleep(max(0.0, self._next[way] - time.monotonic()))
+                time.sleep(max(0.0, self._next[way] - time.monotonic()) + self.delay_s)
                 self.open.wait()
                 sink.sendall(data)
         for end in (source, sink):

@@ -1,0 +1,105 @@
+"""``python -m tests.soak --minutes N``: damage a pool without end, and see that nobody notices.
+
+Ends with status 0 where no request failed, none was answered wrongly, and no server proxy ran a
+request twice; else with 1, and says what went wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.soak import schedule
+from tests.soak.damage import do
+from tests.soak.load import CALM, Load
+from tests.soak.world import LIMIT_S, World, made
+from tests.wire.namespaces import why_not
+from tests.wire.wire_pool import wait_for
+
+UPLINKS = ("failover", "prefer", "all")
+
+
+def main() -> int:
+    """Run; return the exit status."""
+    parser = argparse.ArgumentParser(prog="scripts/soak", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0, help="how long (default 10)")
+    parser.add_argument("--seed", type=int, default=1, help="of the schedule (default 1)")
+    parser.add_argument("--keep", type=Path, help="folder for what the processes write")
+    given = parser.parse_args()
+    kinds, reason = list(schedule.KINDS), why_not()
+    if reason:
+        kinds.remove("uplink loss")
+        print(f"SKIPPED: uplink loss: {reason}", file=sys.stderr)
+    with tempfile.TemporaryDirectory(prefix="fogft-soak-") as folder:
+        where = given.keep or Path(folder)
+        where.mkdir(parents=True, exist_ok=True)
+        uplinks = UPLINKS[given.seed % len(UPLINKS)]
+        with made(where, namespaces=not reason, uplinks=uplinks) as world:
+            loads, done = run(world, kinds, given.seed, 60.0 * given.minutes)
+            return judge(world, loads, done, given.seed)
+
+
+def run(
+    world: World, kinds: Sequence[str], seed: int, lasts_s: float
+) -> tuple[Mapping[str, Load], Counter[str]]:
+    """Damage the pool under load, every kind at least once; return the load and what was done."""
+    world.wait_whole(lambda name: world.robots[name].tell()["report"])
+    loads = {name: Load(name, robot, seed) for name, robot in world.robots.items()}
+    wait_for(lambda: all(load.told for load in loads.values()), LIMIT_S)
+    done: Counter[str] = Counter()
+    end = time.monotonic() + lasts_s
+    for fault in schedule.faults(seed, kinds):
+        if time.monotonic() >= end and len(done) == len(kinds):
+            break
+        print(f"{fault.kind}, {fault.lasts_s} s", file=sys.stderr, flush=True)
+        for load in loads.values():
+            load.during = fault.kind
+        do(world, fault)
+        world.wait_whole(lambda name: _report(loads[name]))
+        done[fault.kind] += 1
+        for load in loads.values():
+            load.during = CALM
+        time.sleep(0.5)
+    return loads, done
+
+
+def _report(load: Load) -> Mapping[str, Any]:
+    return dict(load.told["report"])
+
+
+def judge(world: World, loads: Mapping[str, Load], done: Counter[str], seed: int) -> int:
+    """Say what came of it; return the exit status."""
+    for load in loads.values():
+        wait_for(load.ended, LIMIT_S)
+    asked = sum(load.told["asked"] for load in loads.values())
+    right = sum(load.told["right"] for load in loads.values())
+    wrong = [number for load in loads.values() for number in load.told["wrong"]]
+    silent = sum(load.count("silent") + load.count("turned_away") for load in loads.values())
+    twice = world.ran_twice()
+    print(f"seed {seed}: {asked} requests of {len(loads)} robots under {sum(done.values())} faults")
+    print(f"{'fault':<22}{'times':>6}{'requests':>10}{'p50':>10}{'p99':>10}{'longest':>10}")
+    for kind in (CALM, *done):
+        took = sorted(t for load in loads.values() for t in load.took.get(kind, ()))
+        if took:
+            p99 = took[min(len(took) - 1, int(0.99 * len(took)))]
+            cells = (statistics.median(took), p99, took[-1])
+            times = "".join(f"{1e3 * s:>7.0f} ms" for s in cells)
+            print(f"{kind:<22}{done[kind] or '':>6}{len(took):>10}{times}")
+    failed = asked - right - len(wrong)
+    print(
+        f"failed {failed}, wrong {len(wrong)}, unanswered in time {silent}, run twice {len(twice)}"
+    )
+    for line in twice[:10]:
+        print(f"run twice: {line}")
+    return 1 if failed or wrong or silent or twice else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

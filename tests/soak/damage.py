@@ -1,0 +1,117 @@
+"""How each kind of fault is done to a `World`, and undone. One function a kind."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+from tests.soak.schedule import Fault
+from tests.soak.world import REPLICAS, World
+
+SLOW_S = 0.3
+STARVED_BYTES_PER_S = 20_000.0
+
+Damage = Callable[[World, Fault], contextlib.AbstractContextManager[None]]
+
+
+@contextlib.contextmanager
+def _kill(world: World, fault: Fault) -> Iterator[None]:
+    slot = fault.victim % REPLICAS
+    world.machines[slot].end()
+    yield
+    world.relaunch(slot)
+
+
+@contextlib.contextmanager
+def _freeze(world: World, fault: Fault) -> Iterator[None]:
+    process = world.machines[fault.victim % REPLICAS].process
+    process.send_signal(signal.SIGSTOP)
+    yield
+    process.send_signal(signal.SIGCONT)
+
+
+@contextlib.contextmanager
+def _blackhole(world: World, fault: Fault) -> Iterator[None]:
+    relay = world.machines[fault.victim % REPLICAS].relay
+    relay.open.clear()
+    yield
+    relay.open.set()
+
+
+@contextlib.contextmanager
+def _slow(world: World, fault: Fault) -> Iterator[None]:
+    relay = world.machines[fault.victim % REPLICAS].relay
+    relay.delay_s = SLOW_S
+    yield
+    relay.delay_s = 0.0
+
+
+@contextlib.contextmanager
+def _starve(world: World, fault: Fault) -> Iterator[None]:
+    relay = world.machines[fault.victim % REPLICAS].relay
+    relay.bytes_per_s = STARVED_BYTES_PER_S
+    yield
+    relay.bytes_per_s = float("inf")
+
+
+@contextlib.contextmanager
+def _address_change(world: World, fault: Fault) -> Iterator[None]:
+    slot = fault.victim % REPLICAS
+    old = world.machines[slot]
+    world.relaunch(slot)
+    yield
+    old.end(signal.SIGTERM)
+
+
+@contextlib.contextmanager
+def _rendezvous_death(world: World, fault: Fault) -> Iterator[None]:
+    world.rendezvous.kill()
+    if fault.victim % 2:
+        world.rendezvous.forget()
+    yield
+    world.rendezvous.start()
+
+
+@contextlib.contextmanager
+def _gateway_death(world: World, fault: Fault) -> Iterator[None]:
+    gateway = sorted(world.gateways.items())[fault.victim % len(world.gateways)][1]
+    gateway.kill()
+    yield
+    gateway.start()
+
+
+@contextlib.contextmanager
+def _uplink_loss(world: World, fault: Fault) -> Iterator[None]:
+    assert world.cables is not None
+    number = fault.victim % 2
+    world.cables.stall(number)
+    yield
+    world.cables.heal(number)
+
+
+@contextlib.contextmanager
+def _certificate_rotation(world: World, fault: Fault) -> Iterator[None]:
+    world.rotate(sorted(world.robots)[fault.victim % 2])
+    yield
+
+
+DAMAGES: dict[str, Damage] = {
+    "kill": _kill,
+    "freeze": _freeze,
+    "blackhole": _blackhole,
+    "slow": _slow,
+    "starve": _starve,
+    "address change": _address_change,
+    "rendezvous death": _rendezvous_death,
+    "gateway death": _gateway_death,
+    "uplink loss": _uplink_loss,
+    "certificate rotation": _certificate_rotation,
+}
+
+
+def do(world: World, fault: Fault) -> None:
+    """Do a fault, let it last, and undo it."""
+    with DAMAGES[fault.kind](world, fault):
+        time.sleep(fault.lasts_s)

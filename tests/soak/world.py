@@ -1,0 +1,197 @@
+"""A pool to be damaged: replicas behind relays, two gateways, a rendezvous, two robots.
+
+```
+ ada ══ two uplinks (in namespaces) ══► relay 0..2 ─► replica 0..2     rendezvous
+ bob ──► gateway one, two ────────────► (the same)                     (tells where replicas are)
+```
+
+Replicas are admitted by the membership file and found by their own records, as on clouds where
+nobody knows an address beforehand. No ROS: robots' callers and the service are stand-ins; all
+else is the real thing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fogft.child import tied
+from fogft.core import names
+from fogft.core.model import Member, ReplicaId
+from tests.proxy.gateway_pool import ROOT, GatewayPool, Robot
+from tests.wire.namespaces import Namespaces, inside
+from tests.wire.rendezvous_pool import Rendezvous, free_port
+from tests.wire.thin_relay import ThinRelay
+from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE
+
+ADDRESS = "10.82.9.9"
+REPLICAS = 3
+LIMIT_S = 120.0  # for whatever has to come about on a machine that is busy
+SECOND_ROBOT = 1 << 40  # its first request's number
+
+
+class Cables:
+    """A robot with two ways to everybody else, in namespaces of the run's own."""
+
+    def __init__(self) -> None:
+        self.made = Namespaces()
+        self.robot, self.rest = self.made.add("robot"), self.made.add("rest")
+        self.interfaces = []
+        for number in (1, 2):
+            near, _ = self.made.join(
+                self.robot, f"10.82.{number}.1", self.rest, f"10.82.{number}.2"
+            )
+            self.made.route(self.robot, ADDRESS, f"10.82.{number}.2", near, metric=number)
+            self.interfaces.append(near)
+        self.made.address(self.rest, ADDRESS)
+
+    def stall(self, number: int) -> None:
+        """Let nothing come back on a cable; nobody is told."""
+        self.made.blackhole(self.rest, f"10.82.{number + 1}.1")
+
+    def heal(self, number: int) -> None:
+        self.made.restore(self.rest, f"10.82.{number + 1}.1")
+
+
+class Replica:
+    """A server proxy and the relay before it."""
+
+    def __init__(self, world: World, slot: int, generation: int) -> None:
+        self.id = ReplicaId(POOL_UID, slot, generation)
+        files = world.authority.replica(slot, generation)
+        listen = f"127.0.0.1:{free_port()}"
+        self.relay = ThinRelay(listen, host=world.host)
+        stem = f"replica{slot}.{generation}"
+        config = world.folder / f"{stem}.yaml"
+        config.write_text(
+            f'pool: p\npool_uid: "{POOL_UID}"\nslot: {slot}\ngeneration: {generation}\n'
+            f"listen: {listen}\nadvertise: {self.relay.endpoint}\nnotice: none\n"
+            f"services: [{{name: {SERVICE}, type: {TYPE}}}]\n"
+            f"run: {world.delays_s[slot]} {world.folder / 'ran'}.{stem}\n{world.meeting(stem)}"
+            f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
+        )
+        with (world.folder / f"{stem}.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                tied([sys.executable, "-m", "tests.proxy.plain_replica", str(config)]),
+                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+
+    def end(self, number: int = signal.SIGKILL) -> None:
+        self.process.send_signal(number)
+        self.process.wait(LIMIT_S)
+        self.relay.close()
+
+
+class World(GatewayPool):
+    """The whole pool. To be made, changed and closed by the main thread.
+
+    Args:
+        folder: For everything that is written.
+        cables: Between ada and the rest; None for loopback, without uplinks.
+        uplinks: The policy of ada's uplinks.
+    """
+
+    def __init__(self, folder: Path, cables: Cables | None, uplinks: str) -> None:
+        super().__init__(folder, timeout_s=60.0, services=f", uplinks: {uplinks}")
+        self.host = ADDRESS if cables is not None else "127.0.0.1"
+        self.delays_s = (0.002, 0.01, 0.02)
+        self.cables = cables
+        at = f"{self.host}:{free_port(self.host)}"
+        self.rendezvous = Rendezvous(self.authority, "a", endpoint=at, prefix=tied([]))
+        self.machines = [Replica(self, slot, 1) for slot in range(REPLICAS)]
+        self._admit()
+        self.gateways = {name: self.gateway(name, extra=self.meeting(name)) for name in "xy"}
+        at_gateways = {name: (g.endpoint(), ()) for name, g in self.gateways.items()}
+        self.lay_out(at_gateways, {"bob": tuple(self.gateways)})
+        where, extra = "", self.meeting("ada")
+        if cables is not None:
+            where, extra = cables.robot, f"{extra}uplinks: [{', '.join(cables.interfaces)}]\n"
+        self.robots: dict[str, Robot] = {
+            "ada": self.robot("ada", where=where, extra=extra),
+            "bob": self.robot("bob", extra=self.meeting("bob"), first=SECOND_ROBOT),
+        }
+        self.generations = {"ada": 1, "bob": 1}
+
+    def meeting(self, stem: str) -> str:
+        return f"rendezvous: ['{self.rendezvous.endpoint}']\nrecords: {stem}-records.json\n"
+
+    def _admit(self) -> None:
+        for machine in self.machines:
+            self._members[machine.id.slot] = Member(machine.id, "")
+        self.publish()
+
+    # -- what can be done to it ---------------------------------------------------------------
+
+    def relaunch(self, slot: int) -> None:
+        """Start a replica anew, as the next generation at another address."""
+        self.machines[slot] = Replica(self, slot, self.machines[slot].id.generation + 1)
+        self._admit()
+
+    def rotate(self, name: str) -> None:
+        """Give a robot new credentials: the certificate comes last, as the real commands do it."""
+        self.generations[name] += 1
+        old, new = self.robots[name].files, self.authority.robot(name, self.generations[name])
+        os.replace(new.key, old.key)
+        os.replace(new.certificate, old.certificate)
+
+    # -- what people would see ------------------------------------------------------------------
+
+    def whole(self, name: str, report: Mapping[str, Any]) -> bool:
+        """Whether a robot reports every replica ready, every way to them, and its present name."""
+        wanted = {(m.id.slot, m.id.generation) for m in self.machines}
+        seen = {(li["slot"], li["generation"]) for li in report["links"] if li["ready"]}
+        own = names.robot_certificate_name(POOL_UID, name, self.generations[name])
+        if seen != wanted or report["certificate"] != own:
+            return False
+        if name == "bob":
+            return sum(bool(one["ready"]) for one in report["gateways"]) == len(self.gateways)
+        return all(u["state"] == "up" for li in report["links"] for u in li.get("uplinks", ()))
+
+    def wait_whole(self, report_of: Callable[[str], Mapping[str, Any]]) -> None:
+        """Wait until both robots are whole, by what a function returns of each."""
+        end = time.monotonic() + LIMIT_S
+        for name in self.robots:
+            while not self.whole(name, report := report_of(name)):
+                if time.monotonic() > end:
+                    raise AssertionError(f"{name} is not whole again: {json.dumps(report)}")
+                time.sleep(0.02)
+
+    def ran_twice(self) -> list[str]:
+        """Return the requests that one server proxy ran more than once."""
+        found = []
+        for path in sorted(self.folder.glob("ran.*")):
+            whole = path.read_bytes()
+            counts = Counter(n for (n,) in struct.iter_unpack(">Q", whole[: len(whole) // 8 * 8]))
+            found += [f"{path.name}: {n} {c} times" for n, c in counts.items() if c > 1]
+        return found
+
+    def close(self) -> None:
+        super().close()
+        for machine in self.machines:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                machine.end()
+        self.rendezvous.kill()
+
+
+@contextlib.contextmanager
+def made(folder: Path, *, namespaces: bool, uplinks: str) -> Iterator[World]:
+    """Make a world; end it, whatever happens."""
+    with contextlib.ExitStack() as stack:
+        cables = None
+        if namespaces:
+            cables = Cables()
+            stack.callback(cables.made.close)
+            stack.enter_context(inside(cables.rest))
+        world = World(folder, cables, uplinks)
+        stack.callback(world.close)
+        yield world
