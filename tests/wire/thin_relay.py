@@ -8,7 +8,9 @@ import threading
 import time
 
 _CHUNK_BYTES = 4096
-_BUFFER_BYTES = 16 << 10
+# Small, so that what waits does so at the sender; above half of loopback's segments, or TCP
+# itself would pause.
+_BUFFER_BYTES = 64 << 10
 
 
 class ThinRelay:
