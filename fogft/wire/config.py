@@ -52,7 +52,9 @@ class LinkSettings:
             than `wait_before_close_s`, or healthy links stall for seconds.
         wait_before_close_s: How long the sending of one message may take before Zenoh gives
             the session up.
-        open_timeout_s: The most that opening a session takes.
+        open_timeout_s: The most that opening a session takes; see `long_open_timeout_s`.
+        long_open_timeout_s: The same for every third try in a row that takes so long: through a
+            full uplink, or on a busy machine, a handshake needs more.
         stall_after_s: A robot gives up a connection in which a queue stands still for so long,
             or for four round trips where that is longer.
         stuck_after_s: A replica gives up a connection that delivers nothing for so long.
@@ -61,6 +63,7 @@ class LinkSettings:
     lease_s: float = 150.0
     wait_before_close_s: float = 120.0
     open_timeout_s: float = 1.5
+    long_open_timeout_s: float = 4.0
     stall_after_s: float = 1.0
     stuck_after_s: float = 15.0
 
@@ -138,6 +141,11 @@ def replica_settings(
     }
 
 
+def open_within(timeout_s: float) -> dict[str, Any]:
+    """Return the settings of a session that is given so long to open."""
+    return {"transport/unicast/open_timeout": round(timeout_s * 1e3)}
+
+
 def to_zenoh(settings: dict[str, Any]) -> zenoh.Config:
     """Return settings as Zenoh takes them; call it before the process's first session."""
     import zenoh
@@ -166,7 +174,7 @@ def _common(settings: LinkSettings) -> dict[str, Any]:
         ),
         "transport/link/rx/max_message_size": MESSAGE_BYTES_LIMIT,
         "transport/unicast/open_timeout": round(settings.open_timeout_s * 1e3),
-        "transport/unicast/accept_timeout": round(settings.open_timeout_s * 1e3),
+        "transport/unicast/accept_timeout": round(settings.long_open_timeout_s * 1e3),
         "connect/retry": {
             "period_init_ms": 100,
             "period_max_ms": 500,

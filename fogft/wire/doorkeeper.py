@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.25
 # Longer than Zenoh takes to accept or give up a peer that talks.
-PATIENCE_S = 3.0
+PATIENCE_S = 5.0
 STRANGERS_LIMIT = 16
 # In a flood even the young have to go, but not one that may be in the middle of its handshake.
 LEAST_AGE_S = 0.5

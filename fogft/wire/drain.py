@@ -50,10 +50,15 @@ class Drain:
         """Measured while more waited than the kernel could send at once; None before that."""
         return self._rate
 
-    def look(self, flow: Flow, now: float) -> float:
+    def look(self, flow: Flow, now: float, sending_for_s: float = 0.0) -> float:
         """Take a new count; return for how many of the seconds since the last one bulk moved.
 
         These are not to be held against the peer: whatever it says queues behind that.
+
+        Args:
+            flow: The count.
+            now: The clock.
+            sending_for_s: For how long something large has been on its way into the kernel.
         """
         last, since_s = self._last, now - self._last_at
         if last is not None and since_s < _SHORTEST_LOOK_S:
@@ -66,8 +71,9 @@ class Drain:
         if last is None:
             return 0.0
         moved = flow.acknowledged - last.acknowledged
-        queued = last.outstanding >= BULK_BYTES
-        if queued and flow.outstanding >= BULK_BYTES:
+        sending = sending_for_s >= since_s
+        queued = sending or last.outstanding >= BULK_BYTES
+        if sending or (queued and flow.outstanding >= BULK_BYTES):
             self._measured(moved / since_s)
         flows = (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES
         return since_s if flows else 0.0

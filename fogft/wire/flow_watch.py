@@ -38,7 +38,7 @@ class FlowWatch:
         rate = self._drain.bytes_per_s
         return rate is not None and rate < THIN_BYTES_PER_S
 
-    def look(self, now: float) -> float:
+    def look(self, now: float, sending_for_s: float = 0.0) -> float:
         """Look once; return for how many of the last seconds large things moved."""
         connection = self._socket.borrow()
         if connection is None:
@@ -47,7 +47,7 @@ class FlowWatch:
             flow = sockets.flow(connection)
             if flow is None:
                 return 0.0
-            moved_s = self._drain.look(flow, now)
+            moved_s = self._drain.look(flow, now, sending_for_s)
             if self.thin and not self._kept_short:
                 sockets.keep_short(connection)
                 self._kept_short = True

@@ -116,6 +116,7 @@ class Connection:
         self._turns = turns
         self._on_large = large
         self._large_since = float("-inf")
+        self._sending_since: float | None = None
         self.watched = False
         self._answered = answered
         self._late = late
@@ -268,11 +269,12 @@ class Connection:
         turn = self._turns.take() if large else None
         began = time.monotonic()
         if large:
-            self._large_since = began
+            self._large_since = self._sending_since = began
             self._sends_large()
         try:
             self._get(attempt, payload, remaining_s)
         finally:
+            self._sending_since = None
             self._turns.give(turn)
         if time.monotonic() - began > _STUCK_S and not self.alive():
             self._lose("it took nothing more, and Zenoh gave the session up")
@@ -339,7 +341,8 @@ class Connection:
         """Look what flows; return for how many of the last seconds something large moved."""
         if self.watched and now - self._large_since > _WATCH_S and not self._queue.qsize():
             self.watched = False
-        return self.flow.look(now)
+        since = self._sending_since
+        return self.flow.look(now, 0.0 if since is None else now - since)
 
     def alive(self) -> bool:
         """Whether Zenoh still has a link beneath this session."""
@@ -372,6 +375,8 @@ class Connection:
             payload=payload,
             attachment=self._greeting,
             timeout=timeout_s,
+            # The keeper must not wait behind what is stuck: a lost probe is an unanswered one.
+            congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
             target=_ALL,
@@ -403,6 +408,7 @@ class Connection:
             payload=records,
             attachment=frame.encode_greeting(frame.Greeting(self._token)),
             timeout=_TELL_RECORDS_TIMEOUT_S,
+            congestion_control=zenoh.CongestionControl.DROP,
             target=_ALL,
             consolidation=_AT_ONCE,
         )

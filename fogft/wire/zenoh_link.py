@@ -87,6 +87,7 @@ class ZenohLink:
         self._rtt_s: float | None = None
         self._detail = "not reached yet"
         self._opened = 0
+        self._timed_out = 0  # tries in a row
         self._renew = threading.Event()
         self._renew_at: float | None = None
         self._retiring: list[Connection] = []  # succeeded, with requests under way
@@ -240,7 +241,7 @@ class ZenohLink:
         began = time.monotonic()
         try:
             connection = Connection(
-                config.to_zenoh(self._config),
+                config.to_zenoh({**self._config, **config.open_within(self._open_timeout_s())}),
                 self._peer,
                 self._dialer.robot,
                 self._services,
@@ -258,10 +259,19 @@ class ZenohLink:
             self._say(error.message)
             return None
         except zenoh.ZError as error:
-            self._say(self._explain(time.monotonic() - began) or self._detail or str(error))
+            took_s = time.monotonic() - began
+            self._timed_out = self._timed_out + 1 if took_s >= self._open_timeout_s() * 0.9 else 0
+            self._say(self._explain(took_s) or self._detail or str(error))
             return None
         self._opened += 1
+        self._timed_out = 0
         return connection
+
+    def _open_timeout_s(self) -> float:
+        """Every third time-out in a row is a long one: the replica may be there, and slow."""
+        settings = self._dialer.settings
+        patient = self._timed_out % 3 == 2
+        return settings.long_open_timeout_s if patient else settings.open_timeout_s
 
     def _explain(self, took_s: float) -> str:
         """Find words for a failed opening; empty when that was done lately."""

@@ -62,6 +62,19 @@ def test_a_frozen_peer_is_not_excused_for_what_its_kernel_takes(sizes):
     assert drain.bytes_per_s is None
 
 
+@given(rates, intervals)
+def test_what_a_relay_takes_in_is_a_queue_too_while_the_sender_is_at_it(rate, steps):
+    """Little is outstanding where something on the way has room of its own."""
+    drain, now, acknowledged, excused = Drain(), 100.0, 0, 0.0
+    drain.look(Flow(0, 0, 100), now)
+    for step in steps:
+        now += step
+        acknowledged += int(rate * step)
+        excused += drain.look(Flow(acknowledged, 0, 100), now, now - 100.0)
+    assert abs(excused - sum(steps)) < 1e-6
+    assert drain.look(Flow(acknowledged + 1, 0, 100), now + 1.0, 0.5) == 0.0  # another one
+
+
 def test_a_large_response_on_its_way_is_a_sign_of_life():
     """What the replica says of itself waits behind it."""
     drain = Drain()

@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
 from fogft.core.model import LinkState
+from fogft.wire.config import LinkSettings
 from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_link import ZenohLink
@@ -33,7 +35,8 @@ from tests.wire.wire_pool import (
 MEGABYTE = os.urandom(1_000_000)
 ROBOT, REPLICA = "10.81.1.1", "10.81.1.2"
 LONG_S = 90.0
-PATIENT = {"suspect_after_s": 3.0}  # a busy machine is no silence, and a megabyte takes longer
+# A busy machine is no silence, and a megabyte takes longer than that.
+PATIENT: dict[str, Any] = {"suspect_after_s": 4.0, "settings": LinkSettings(stall_after_s=4.0)}
 needs_namespaces = pytest.mark.skipif(bool(why_not()), reason=why_not() or "they can be made")
 
 
@@ -91,7 +94,7 @@ def test_a_blackhole_on_a_thin_uplink_is_told_from_a_slow_one(authority, net, ow
     with inside(replica_at):
         replica = ReplicaProcess(authority.replica(), endpoint=f"{REPLICA}:7447", reply_bytes=16)
     with inside(robot_at):
-        dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+        dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
         try:
             link = dialer.dial(peer(replica.endpoint), keys(0), owner)
             wait_for(lambda: link.usable)
@@ -134,7 +137,7 @@ def test_what_shrinks_is_compressed_once_the_uplink_was_seen_to_be_thin(
 ) -> None:
     """Both ways, and what comes back is what was sent; noise leaves as it is."""
     relay = ThinRelay(start_replica().endpoint, 250_000)
-    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
     text = b"the quick brown fox jumps over the lazy dog " * 20_000
     try:
         link = dialer.dial(peer(relay.endpoint), keys(0), owner)
@@ -160,7 +163,7 @@ def test_the_newest_request_overtakes_stale_ones_where_the_service_says_so(
 ) -> None:
     """While one large request leaves, others wait; the last to come is the next to leave."""
     relay = ThinRelay(start_replica(reply_bytes=16).endpoint, 500_000)
-    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
     dialer.adopt(Ways(latest=frozenset({SERVICE})))
     try:
         link = dialer.dial(peer(relay.endpoint), keys(0), owner)

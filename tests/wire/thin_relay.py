@@ -10,7 +10,7 @@ import time
 _CHUNK_BYTES = 4096
 # Small, so that what waits does so at the sender; above half of loopback's segments, or TCP
 # itself would pause.
-_BUFFER_BYTES = 64 << 10
+_BUFFER_BYTES = 32 << 10
 
 
 class ThinRelay:
