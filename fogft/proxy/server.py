@@ -312,7 +312,7 @@ class ServerProxy:
     def _detail(self) -> str:
         services = self._offering.services
         if services and len(self._ready) == len(services):
-            return self._state_detail()
+            return self._state_detail() or self._topics.trouble
         for why in self._not_usable.values():
             return why
         if self._topics.trouble:

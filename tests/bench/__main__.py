@@ -23,7 +23,17 @@ Rows = list[dict[str, Any]]
 
 def measurements() -> dict[str, Callable[..., Rows]]:
     """Return what can be measured, by name, in the order of running."""
-    from tests.bench import commands, faults, ordering, planning, simulation, speed, tail, uplink
+    from tests.bench import (
+        commands,
+        faults,
+        graph,
+        ordering,
+        planning,
+        simulation,
+        speed,
+        tail,
+        uplink,
+    )
 
     found: dict[str, Callable[..., Rows]] = {
         "commands": commands.commands,
@@ -40,6 +50,8 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["cancellation"] = tail.cancellation
     found["simulation"] = simulation.simulation
     found["ordering"] = ordering.ordering
+    found["graph"] = graph.graph
+    found["bursts"] = graph.bursts
     found["uplink"] = uplink.uplink
     return found
 

@@ -24,13 +24,14 @@ from typing import Any
 
 from fogft import disk
 from fogft.core import membership as memberships
-from fogft.core import names
+from fogft.core import names, topics
 from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.service_form import to_plain
 from fogft.core.spec_state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
 from fogft.pool import credentials
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
-from tests.bench.service import FLAG, MAP, SPEAKS, STATEFUL
+from tests.bench.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
 
 ROOT = Path(__file__).resolve().parents[2]
 _READY_LIMIT_S = 60.0
@@ -103,6 +104,7 @@ class Rig:
         tell_losers: Whether the client proxy tells replicas what is no longer wanted.
         rmw: How proxies, services and callers speak ROS.
         environ: More of the environment for every process.
+        graph: Whether topics and an action pass as well.
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class Rig:
         tell_losers: bool = True,
         rmw: str = "rclpy",
         environ: Mapping[str, str] = MappingProxyType({}),
+        graph: bool = False,
     ) -> None:
         self._folder = folder
         self._uid = secrets.token_hex(8)
@@ -129,6 +132,8 @@ class Rig:
         self._tell_losers = tell_losers
         self._rmw = rmw
         self._environ = environ
+        self._action = ACTION_SERVICES if graph else ()
+        self._topics = [topics.to_plain(topic) for topic in TOPICS] if graph else []
         self._stateful = stateful
         self._policy: dict[str, Any] = policy or {}
         self.robot_domain, *domains = free_domains(replicas + 1)
@@ -178,7 +183,10 @@ class Rig:
 
         def ready() -> bool:
             links = self.links()
-            return set(links) == set(slots) and all(len(k["ready"]) == 2 for k in links.values())
+            every = 2 + len(self._action) + len(self._topics)
+            return set(links) == set(slots) and all(
+                len(k["ready"]) == every for k in links.values()
+            )
 
         self._wait(ready, f"replicas {list(slots)} to be ready")
 
@@ -211,8 +219,13 @@ class Rig:
             "listen": f"127.0.0.1:{port}",
             "services": self._services(self._of_replica),
             "run": f"exec {sys.executable} -m tests.bench.service {self._arguments[slot]}",
-            "envs": {SPEAKS: self._rmw, **({STATEFUL: "1"} if self._stateful else {})},
+            "envs": {
+                SPEAKS: self._rmw,
+                **({STATEFUL: "1"} if self._stateful else {}),
+                **({GRAPH: "1"} if self._topics else {}),
+            },
             "rmw": self._rmw,
+            "topics": self._topics,
             "workdir": str(ROOT),
             "credentials": _pair(name, "replica"),
             "domain_id": self.domains[slot],
@@ -253,6 +266,7 @@ class Rig:
             "lock": "proxy.lock",
             "credentials": _pair("robot", "robot"),
             "services": self._services(self._policy),
+            "topics": self._topics,
             "domain_id": self.robot_domain,
             "tell_losers": self._tell_losers,
             "rmw": self._rmw,
@@ -285,7 +299,7 @@ class Rig:
 
     def _services(self, of_flag: dict[str, Any]) -> list[dict[str, Any]]:
         flag, other = ({"name": n, "type": t, "timeout_s": 10.0} for n, t in (FLAG, MAP))
-        services = [{**flag, **of_flag}, other]
+        services = [{**flag, **of_flag}, other, *map(to_plain, self._action)]
         if self._stateful:
             return [{**s, "state": _state(str(s["name"])).to_plain()} for s in services]
         return services

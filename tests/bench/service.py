@@ -18,12 +18,22 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from fogft.core.middleware import Speaks
+from fogft.core.spec_topics import action_services
+from fogft.core.topics import Origin, TopicSpec
 from fogft.proxy import middleware
 
 FLAG = ("/bench_flag", "std_srvs/srv/SetBool")
 MAP = ("/bench_map", "nav_msgs/srv/SetMap")
 STATEFUL = "FOGFT_BENCH_STATEFUL"  # set: both services can be given a state, which is empty
 SPEAKS = "FOGFT_BENCH_RMW"  # how the service speaks ROS, as `rmw` in a pool file
+GRAPH = "FOGFT_BENCH_GRAPH"  # set: it says again what it hears on a topic, and takes goals
+STRING = "std_msgs/msg/String"
+FIBONACCI = "test_msgs/action/Fibonacci"
+TOPICS = (
+    TopicSpec("/bench_in", STRING, Origin.ROBOT, depth=100),
+    TopicSpec("/bench_out", STRING, Origin.REPLICAS, depth=100),
+)
+ACTION_SERVICES = action_services("/bench_act", FIBONACCI, 10.0, 60.0)
 CANCEL = ("/bench_cancel", "std_srvs/srv/Trigger")
 _DEFAULTS = ("0", "0", "0", "0", "16")
 
@@ -56,6 +66,8 @@ def main() -> None:
         ends.append(node.serve(name, type_name, answer_later if sleep_s else answer_now))
     if os.environ.get(STATEFUL):
         _offer_states(node, SetMap.Response(success=True))
+    if os.environ.get(GRAPH):
+        _offer_graph(node)
     stopped = bytes(serialize_message(Trigger.Response(success=True)))
 
     def stop(_: bytes, handle: Any) -> None:
@@ -81,6 +93,32 @@ def _offer_states(node: Any, restored: Any) -> None:
 
             name = f"{service}/{verb}_state"
             ends.append(node.serve(name, f"nav_msgs/srv/{prefix}Map", respond))
+
+
+def _offer_graph(node: Any) -> None:
+    """Say again what is heard; take every goal, which succeeds at once."""
+    from rclpy.serialization import serialize_message
+    from test_msgs.action import Fibonacci
+
+    from fogft.ros.port import Quality
+
+    heard, said = TOPICS
+    again = node.publisher(said.name, said.type, Quality(said.depth))
+    node.subscribe(heard.name, heard.type, Quality(heard.depth), again.publish)
+    parts = Fibonacci.Impl
+    answers = {
+        "send_goal": parts.SendGoalService.Response(accepted=True),
+        "cancel_goal": parts.CancelGoalService.Response(),
+        "get_result": parts.GetResultService.Response(status=4),
+    }
+    for service in ACTION_SERVICES:
+        ends: list[Any] = []
+        answer = bytes(serialize_message(answers[service.name.rpartition("/")[2]]))
+
+        def respond(_: bytes, handle: Any, ends: list[Any] = ends, it: bytes = answer) -> None:
+            ends[0].respond(handle, it)
+
+        ends.append(node.serve(service.name, service.type, respond))
 
 
 class Sleeps:
