@@ -1,4 +1,4 @@
-"""What ``/diagnostics`` says of a pool: a status for it, for each service, for each replica. Pure.
+"""What ``/diagnostics`` says of a pool, of each service, topic and replica. Pure.
 
 Made of the client proxy's report. Requests that got no answer are worth a warning for a while,
 so the counters of the last half minute are remembered.
@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from fogft.core.topics import PREFIX
 from fogft.ros.port import Level, Status
 
 WINDOW_S = 30.0
@@ -53,7 +54,8 @@ class Diagnosis:
         lately = self._lately(services, now)
         of_services = [self._service(n, s, links, lately[n]) for n, s in services.items()]
         of_replicas = [self._replica(link, len(services)) for link in links]
-        return [self._overall(report, of_services), *of_services, *of_replicas]
+        of_topics = [self._topic(n, t, links) for n, t in report.get("topics", {}).items()]
+        return [self._overall(report, of_services), *of_services, *of_topics, *of_replicas]
 
     def _lately(
         self, services: Mapping[str, Mapping[str, Any]], now: float
@@ -111,6 +113,17 @@ class Diagnosis:
         values |= {f"won by {replica}": n for replica, n in report.get("won", {}).items()}
         values |= {f"refused: {reason}": n for reason, n in report.get("refused", {}).items()}
         return self._status(level, f"service {name}", message, values, self._robot)
+
+    def _topic(
+        self, name: str, report: Mapping[str, Any], links: list[Mapping[str, Any]]
+    ) -> Status:
+        passing = sum(PREFIX + name in link["ready"] for link in links)
+        message = str(report.get("trouble") or f"{passing} of {len(links)} replicas pass it")
+        level = Level.ERROR if "trouble" in report or not passing else Level.OK
+        if level is Level.OK and passing < len(links):
+            level = Level.WARN
+        values = {key: value for key, value in report.items() if key != "trouble"}
+        return self._status(level, f"topic {name}", message, values, self._robot)
 
     def _replica(self, link: Mapping[str, Any], services: int) -> Status:
         state, ready = link["state"], len(link["ready"])

@@ -59,6 +59,11 @@ def of_client(report: Mapping[str, Any]) -> list[Family]:
            (Sample(link["state"] == "up", {"replica": _who(link)}) for link in links)),
         of("fogft_link_ready_services", GAUGE, "Services that a replica can answer.",
            (Sample(len(link["ready"]), {"replica": _who(link)}) for link in links)),
+        of("fogft_topic_messages_total", COUNTER, "Messages of topics, and what became of them.", (
+            Sample(count, {"topic": topic, "event": event})
+            for topic, counts in report.get("topics", {}).items()
+            for event, count in counts.items() if event != "trouble"
+        )),
         of("fogft_uplink_suspected", GAUGE, "Whether all links have fallen silent together.",
            [Sample(report["uplink_suspected"])]),
     ]  # fmt: skip

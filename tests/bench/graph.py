@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import importlib.util
 import os
 import random
 import threading
@@ -87,6 +88,8 @@ class Graph:
 
 def graph(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     """Compare topics and goals directly and through two replicas, in turns, in one run."""
+    if importlib.util.find_spec("test_msgs") is None:
+        raise RuntimeError("the package test_msgs is not here: install `fogft[ros-test]`")
     rounds = 100 if quick else 600
     kinds: dict[str, tuple[Callable[[Graph], float], str, bytes]] = {
         "topic there and back, 100 B": (lambda g: g.say(100), "flag", bytes(100)),

@@ -81,6 +81,17 @@ def test_a_request_without_a_replicas_answer_is_a_warning_for_a_while(outcome):
         assert ("2 " in said.message) is (level is Level.WARN)
 
 
+def test_a_topic_is_as_good_as_the_replicas_that_pass_it():
+    passing = link(0, ready=["/plan", "topic /map"])
+    told = {**report(passing, link(1)), "topics": {"/map": {"messages": 7, "passed": 0}}}
+    said = look(Diagnosis("arm", "r"), told)["topic /map"]
+    assert (said.level, said.values["messages"]) == (Level.WARN, "7")
+    told["links"] = [link(0)]
+    assert levels(told)["topic /map"] is Level.ERROR
+    broken = {**told, "topics": {"/map": {"trouble": "no such type"}}}
+    assert look(Diagnosis("arm", "r"), broken)["topic /map"].message == "no such type"
+
+
 def test_what_was_before_the_first_look_is_no_news():
     """A proxy that is diagnosed from its start has seen it all; one that began later has not."""
     assert levels(report(link(0), silent=7))["service /plan"] is Level.OK
