@@ -49,5 +49,7 @@ def test_there_is_a_measurement_for_each_promise():
         "cancellation",
         "simulation",
         "ordering",
+        "graph",
+        "bursts",
         "uplink",
     ]
