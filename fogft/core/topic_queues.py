@@ -68,9 +68,11 @@ class Outbox:
     Args:
         depth: Messages that wait at most; the oldest go first.
         window: Messages under way at once.
+        kept_bytes: Bytes of those that wait, at most; the newest is kept in any case.
     """
 
-    def __init__(self, depth: int, *, window: int = 16) -> None:
+    def __init__(self, depth: int, *, window: int = 16, kept_bytes: int = 64 << 20) -> None:
+        self._limit = kept_bytes
         self._waiting: deque[Numbered] = deque()
         self._depth = depth
         self._window = window
@@ -87,9 +89,10 @@ class Outbox:
     def put(self, number: int, message: bytes) -> int:
         """Add a message; return how many older ones had to go."""
         self._waiting.append((number, message))
+        size = sum(len(one) for _, one in self._waiting)
         gone = 0
-        while len(self._waiting) > self._depth:
-            self._waiting.popleft()
+        while len(self._waiting) > self._depth or (size > self._limit and len(self._waiting) > 1):
+            size -= len(self._waiting.popleft()[1])
             gone += 1
         return gone
 

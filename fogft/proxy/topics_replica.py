@@ -21,7 +21,7 @@ from queue import SimpleQueue
 from fogft.core.errors import RosError, Unreadable
 from fogft.core.topic_queues import Ring, Seen
 from fogft.core.topics import Origin, TopicSpec
-from fogft.ros.port import Quality, RosPublisher, RosTopics
+from fogft.ros.port import Quality, RosPublisher, RosSubscription, RosTopics
 from fogft.wire import topic_frames
 from fogft.wire.frame import FrameError
 from fogft.wire.port import Incoming, Refusal
@@ -29,6 +29,7 @@ from fogft.wire.port import Incoming, Refusal
 log = logging.getLogger(__name__)
 
 HOLD_S = 2.0
+LOOK_EVERY_S = 2.0  # whether publishers are heard
 _HELD_LIMIT = 64  # pulls of one topic; beyond it the oldest is answered with nothing
 _BATCH_BYTES = 8 << 20
 
@@ -115,8 +116,9 @@ class TopicsOnReplica:
             if topic.origin is Origin.REPLICAS
         }
         self._publishers: dict[str, RosPublisher] = {}
+        self._subscriptions: dict[str, RosSubscription] = {}
+        self._looked_at = clock()
         self._seen = {name: Seen() for name in self._topics}
-        self._subscribed: frozenset[str] = frozenset()
         self._trouble: dict[str, str] = {}
         # Publishing may block for a moment, and the wire's threads must not.
         self._queue: SimpleQueue[Incoming | None] = SimpleQueue()
@@ -140,7 +142,7 @@ class TopicsOnReplica:
 
     def use(self, node: RosTopics | None) -> None:
         """Publish and subscribe with this node from now on; the one before is gone."""
-        self._publishers, self._subscribed = {}, frozenset()
+        self._publishers, self._subscriptions = {}, {}
         if node is None:
             return
         if self._thread is None:
@@ -152,19 +154,26 @@ class TopicsOnReplica:
                     self._publishers[name] = node.publisher(topic.name, topic.type, quality(topic))
                 else:
                     heard = self._outgoing[name].heard
-                    node.subscribe(topic.name, topic.type, quality(topic), heard)
-                    self._subscribed |= {name}
+                    self._subscriptions[name] = node.subscribe(
+                        topic.name, topic.type, quality(topic), heard
+                    )
             except RosError as error:
-                if self._trouble.get(name) != error.message:
-                    log.error("topic_not_usable topic=%s reason=%r", topic.name, error.message)
-                self._trouble[name] = error.message
+                self._note(name, error.message)
             else:
-                self._trouble.pop(name, None)
+                self._note(name, "")
+
+    def _note(self, name: str, trouble: str) -> None:
+        if trouble and self._trouble.get(name) != trouble:
+            log.error("topic_not_usable topic=%s reason=%r", self._topics[name].name, trouble)
+        if trouble:
+            self._trouble[name] = trouble
+        else:
+            self._trouble.pop(name, None)
 
     def ready(self) -> frozenset[str]:
         """Return the names of those that pass now: somebody here listens, or may speak."""
         heard = {name for name, one in self._publishers.items() if one.subscribers()}
-        return self._subscribed | heard
+        return frozenset(self._subscriptions) | heard
 
     def request(self, incoming: Incoming) -> None:
         """Take a message or a pull from the wire. Never blocks."""
@@ -182,6 +191,10 @@ class TopicsOnReplica:
         now = self._clock()
         for outgoing in self._outgoing.values():
             outgoing.tick(now)
+        if now - self._looked_at > LOOK_EVERY_S:
+            self._looked_at = now
+            for name, subscription in self._subscriptions.items():
+                self._note(name, subscription.mismatch())
 
     def _publish(self) -> None:
         while (incoming := self._queue.get()) is not None:

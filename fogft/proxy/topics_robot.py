@@ -20,7 +20,7 @@ from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.topic_queues import Numbered, Outbox
 from fogft.core.topic_select import Selection
 from fogft.core.topics import Origin, Select, TopicSpec
-from fogft.proxy.topics_replica import quality
+from fogft.proxy.topics_replica import LOOK_EVERY_S, quality
 from fogft.ros.port import RosPublisher, RosSubscription, RosTopics
 from fogft.wire import topic_frames
 from fogft.wire.frame import FrameError
@@ -71,6 +71,8 @@ class RobotTopic:
         self._told: bytes | None = None
         self._publisher: RosPublisher | None = None
         self._subscription: RosSubscription | None = None
+        self._looked_at = clock()
+        self.trouble = ""
         self.count = dict.fromkeys(("messages", "passed", "dropped", "refused"), 0)
 
     def open(self, node: RosTopics) -> None:
@@ -119,6 +121,12 @@ class RobotTopic:
         """Send what is due: messages, and pulls. Not from a link's thread."""
         with self._lock:
             self._send()
+        now = self._clock()
+        if self._subscription is not None and now - self._looked_at > LOOK_EVERY_S:
+            self._looked_at = now
+            before, self.trouble = self.trouble, self._subscription.mismatch()
+            if self.trouble not in ("", before):
+                log.error("topic_not_heard topic=%s reason=%r", self.topic.name, self.trouble)
 
     def _send(self) -> None:
         now = self._clock()
@@ -282,7 +290,10 @@ class TopicsOnRobot:
 
     def report(self) -> dict[str, Any]:
         """Return counters by topic, and why some cannot pass."""
-        counts = {one.topic.name: dict(one.count) for one in self._topics.values()}
+        counts: dict[str, Any] = {
+            one.topic.name: {**one.count, **({"trouble": one.trouble} if one.trouble else {})}
+            for one in self._topics.values()
+        }
         return {**counts, **{name: {"trouble": why} for name, why in self._trouble.items()}}
 
     def close(self) -> None:

@@ -187,7 +187,8 @@ class SerialisedNode:
             made: Any = self._node.create_subscription(
                 message_type, name, lambda _: None, topic_ends.profile(quality), raw=True
             )
-            return Subscription(made, on_message, self._withdraw)
+            publishers = self._node.get_publishers_info_by_topic
+            return Subscription(made, quality, on_message, self._withdraw, publishers)
 
         subscription: Subscription = self._add(name, create)
         return subscription

@@ -89,6 +89,9 @@ class RosPublisher(Protocol):
 class RosSubscription(Protocol):
     """A subscription of this node's."""
 
+    def mismatch(self) -> str:
+        """Say why a publisher that is there is not heard; empty if all are. Cheap."""
+
     def close(self) -> None:
         """Withdraw the subscription."""
 

@@ -104,14 +104,35 @@ class Subscription:
     def __init__(
         self,
         subscription: Any,
+        quality: Quality,
         on_message: Callable[[bytes], None],
         withdraw: Callable[[Subscription], None],
+        publishers: Callable[[str], Any],
     ) -> None:
+        self._quality = quality
+        self._publishers = publishers
         self.handle = subscription.handle
         self._subscription = subscription
+        self._name: str = subscription.topic_name
         self._on_message = on_message
         self._withdraw = withdraw
         self._open = True
+
+    def mismatch(self) -> str:
+        """Say why a publisher that is there is not heard; empty if all are."""
+        from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+        name = self._name
+        try:
+            found = [one.qos_profile for one in self._publishers(name)] if self._open else []
+        except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
+            return ""
+        for offered in found:
+            if self._quality.reliable and offered.reliability == ReliabilityPolicy.BEST_EFFORT:
+                return f"a publisher of `{name}` offers best effort: write `reliable: false`"
+            if self._quality.latched and offered.durability == DurabilityPolicy.VOLATILE:
+                return f"a publisher of `{name}` is not latched: write `latched: false`"
+        return ""
 
     def close(self) -> None:
         """Withdraw it; repeatable. On return it is gone, unless the take loop called."""
@@ -121,14 +142,18 @@ class Subscription:
     def drain(self) -> None:
         """Deliver what has arrived. Take loop only."""
         for _ in range(_BURST):
-            taken = self.handle.take_message(self._subscription.msg_type, True)
+            try:
+                taken = self.handle.take_message(self._subscription.msg_type, True)
+            except Exception as error:  # of one message; the take loop goes on
+                log.warning("message_not_taken topic=%s reason=%r", self._name, str(error))
+                return
             if taken is None:
                 return
             try:
                 if self._open:
                     self._on_message(bytes(taken[0]))
             except Exception:
-                log.exception("%s: a message was lost", self._subscription.topic_name)
+                log.exception("%s: a message was lost", self._name)
 
     def destroy(self, node: Any) -> None:
         """Free everything. Take loop only, once, when no wait set holds the handle."""

@@ -93,6 +93,12 @@ def test_a_replica_gets_each_message_once_and_in_order(depth, window, steps):
     assert len(got) == put - gone or gone
 
 
+def test_what_waits_for_a_replica_is_bounded_in_bytes_but_the_newest_stays():
+    outbox = Outbox(10, kept_bytes=100)
+    assert [outbox.put(n, b"x" * size) for n, size in enumerate((60, 60, 300), 1)] == [0, 1, 1]
+    assert outbox.next()[0] == 3
+
+
 def test_a_robot_that_starts_anew_is_another_publisher():
     seen = Seen(robots=2)
     assert [seen.is_new(b"a", 5), seen.is_new(b"a", 5), seen.is_new(b"a", 4)] == [

@@ -19,6 +19,7 @@ class FakeTopics:
     def __init__(self) -> None:
         self.published: dict[str, list[bytes]] = {}
         self.heard: dict[str, object] = {}
+        self.mismatch = ""
 
     def publisher(self, name, type_name, quality):
         node, said = self, self.published.setdefault(name, [])
@@ -29,6 +30,9 @@ class FakeTopics:
 
             def subscribers(self):
                 return 1
+
+            def mismatch(self):
+                return node.mismatch
 
             def close(self):
                 node.published.pop(name, None)
@@ -229,3 +233,18 @@ def test_noise_from_a_peer_harms_nobody():
     back.clock.now += 1
     back.robot.tick()
     assert len(back.links[0].offered) == 2
+
+
+def test_a_publisher_that_is_not_heard_is_told_of(caplog):
+    """Otherwise nothing would pass, and nobody would know why."""
+    for topic, side in ((TO, "robot_node"), (BACK, "nodes")):
+        world = World(topic)
+        node = getattr(world, side)
+        (node[0] if side == "nodes" else node).mismatch = "offers best effort"
+        for _ in range(3):
+            world.clock.now += 3
+            world.robot.tick()
+            world.replicas[0].tick()
+        told = world.replicas[0].trouble or world.robot.report()["/to"].get("trouble")
+        assert told == "offers best effort"
+    assert len([r for r in caplog.records if "best effort" in r.getMessage()]) == 2

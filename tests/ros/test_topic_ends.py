@@ -1,0 +1,70 @@
+"""Publishers and subscriptions of our node, with serialised messages."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.core.errors import RosError
+from fogft.ros.port import Quality, Unreadable
+
+from .conftest import wait_for
+
+pytestmark = pytest.mark.ros
+STRING = "std_msgs/msg/String"
+HELLO = b"\0\1\0\0\6\0\0\0hello\0"
+
+
+def test_bytes_go_out_and_come_in(make_node, ros_domain):
+    """Also to who subscribes later, where the topic is latched."""
+    heard: list[bytes] = []
+    latched = Quality(1, latched=True)
+    publisher = make_node(ros_domain).publisher("/said", STRING, latched)
+    publisher.publish(HELLO)
+    make_node(ros_domain).subscribe("/said", STRING, latched, heard.append)
+    wait_for(lambda: heard, "the message")
+    assert heard[0][: len(HELLO)] == HELLO
+    assert publisher.subscribers() == 1
+
+
+def test_what_is_no_message_is_published_nowhere(make_node, ros_domain):
+    publisher = make_node(ros_domain).publisher("/said", STRING, Quality())
+    for noise in (b"", b"\0\1", b"\0\1\0\0\xff\xff\xff\xffx"):
+        with pytest.raises(Unreadable):
+            publisher.publish(noise)
+
+
+def test_a_publisher_that_offers_less_is_told_of_with_the_remedy(make_node, ros_domain):
+    make_node(ros_domain).publisher("/said", STRING, Quality(reliable=False))
+    other = make_node(ros_domain)
+    heard = other.subscribe("/said", STRING, Quality(), lambda _: None)
+    wait_for(heard.mismatch, "the publisher")
+    assert "`reliable: false`" in heard.mismatch()
+    latched = other.subscribe("/said", STRING, Quality(reliable=False, latched=True), print)
+    wait_for(latched.mismatch, "the publisher")
+    assert "`latched: false`" in latched.mismatch()
+    fine = other.subscribe("/said", STRING, Quality(reliable=False), lambda _: None)
+    assert fine.mismatch() == ""
+
+
+def test_withdrawn_ends_do_nothing_more(make_node, ros_domain):
+    heard: list[bytes] = []
+    node = make_node(ros_domain)
+    publisher = node.publisher("/said", STRING, Quality())
+    subscription = make_node(ros_domain).subscribe("/said", STRING, Quality(), heard.append)
+    wait_for(publisher.subscribers, "discovery")
+    subscription.close()
+    wait_for(lambda: not publisher.subscribers(), "its end")
+    publisher.publish(HELLO)
+    publisher.close()
+    publisher.publish(HELLO)
+    publisher.close()
+    assert (publisher.subscribers(), subscription.mismatch(), heard) == (0, "", [])
+
+
+def test_an_unknown_type_is_a_clear_error_and_the_node_lives_on(make_node, ros_domain):
+    node = make_node(ros_domain)
+    with pytest.raises(RosError, match="no package `nope_msgs` with messages"):
+        node.publisher("/said", "nope_msgs/msg/T", Quality())
+    with pytest.raises(RosError, match="not the name of a message type"):
+        node.subscribe("/said", "std_srvs/srv/SetBool", Quality(), print)
+    assert node.alive
