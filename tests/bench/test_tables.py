@@ -41,6 +41,7 @@ def test_there_is_a_measurement_for_each_promise():
         "overhead-1",
         "overhead-2",
         "overhead-3",
+        "rmw_zenoh",
         "throughput",
         "stalls",
         "killed",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.core.errors import RosError
-from fogft.ros.port import Quality, Unreadable
+from fogft.core.errors import RosError, Unreadable
+from fogft.ros.port import Quality
 
 from .conftest import wait_for
 
