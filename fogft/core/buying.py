@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from fogft.core.endings import Census, Standing
 from fogft.core.groups import Group
@@ -68,14 +69,30 @@ class Buyer:
 
     def __post_init__(self) -> None:
         self._catalogue = catalogue(self.observed.offers)
-        self._spent = sum(self._price(s) for s in self.census.everyone())
-        self._resting = resting(self.history, self.observed.now)
-        self._avoided = avoided(self.history, self.observed.now)
         self._markets: dict[tuple[str, bool | None, bool], Market] = {}
         self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
         wrong = self._catalogue.impossible
         if wrong:
             self.notes.append(f"offers with impossible prices are ignored, such as `{wrong}`")
+
+    @cached_property
+    def _spent_before(self) -> float:
+        return sum(self._price(s) for s in self.census.everyone())
+
+    @property
+    def _spent(self) -> float:
+        spent = self._spent_before
+        for launch in self.launches:
+            spent += launch.offer.usd_per_hour
+        return spent
+
+    @cached_property
+    def _resting(self) -> Mapping[str, Backoff]:
+        return resting(self.history, self.observed.now)
+
+    @cached_property
+    def _avoided(self) -> Mapping[str, float]:
+        return avoided(self.history, self.observed.now)
 
     @property
     def budget(self) -> float | None:
@@ -98,7 +115,6 @@ class Buyer:
             return False
         generation = self._next_generation(need.slot)
         self.launches.append(PlannedLaunch(need.slot, generation, choice.offer, reason))
-        self._spent += choice.offer.usd_per_hour
         return True
 
     def market(self, group: Group, spot: bool | None, *, at_leisure: bool = False) -> Market:

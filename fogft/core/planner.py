@@ -54,6 +54,7 @@ class Plan:
         notes: Why the pool is not yet as wanted, in sentences.
         wanted: How many replicas should be ready.
         health: What the plan was based on; None when the cloud could not tell.
+        closed: It is known without trying that planning again while it is under way adds nothing.
     """
 
     wanted: int
@@ -62,6 +63,7 @@ class Plan:
     draining: tuple[ReplicaId, ...] = ()
     notes: tuple[str, ...] = ()
     health: Health | None = None
+    closed: bool = False
 
 
 def plan(
@@ -93,7 +95,7 @@ def plan(
     if observed.machines is None:
         return decided
     for _ in range(MOST_PASSES):
-        if not _changes(latest, history):
+        if latest.closed or not _changes(latest, history):
             break
         world, memory = under_way(
             pool_uid,
@@ -193,6 +195,8 @@ def _plan_once(
         draining=tuple(s.id for s in endings.draining),
         notes=tuple(dict.fromkeys(notes)),
         health=health,
+        # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
+        closed=not (ends or endings.draining or census.replaced or census.ending or excess),
     )
 
 
