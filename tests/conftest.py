@@ -22,6 +22,9 @@ hypothesis.settings.load_profile("fogft")
 # Set before any test imports rclpy; child processes inherit it.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
+# `pyzeros` makes a folder for what it compiles where it is imported, else in the working folder.
+os.environ.setdefault("CYDR_CACHE_DIR", f"{tempfile.gettempdir()}/fogft-test-cydr-{os.getuid()}")
+
 # A shell's background job ignores Ctrl-C, and so would every process that a test interrupts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
