@@ -99,7 +99,7 @@ def what_the_machine_has(pool: Pool) -> None:
     """No port but ssh's is open, and the ROS 2 that serves is the image's."""
     (name,) = pool.replicas()
     machine = machine_of(name)
-    assert open_ports(machine) == {22}
+    assert open_ports(machine["region"], "sky-sg-") == {22}
     assert reaches(machine["ip"], 22)
     assert not reaches(machine["ip"], 7447)
     disk = disk_of(machine)

@@ -128,7 +128,8 @@ class Proof:
             (made,) = (HOME / "sky/wheels").glob("*/fogft-*.whl")
             assert carried.read_bytes() == made.read_bytes()
             # To the world: ssh, which is SkyPilot's, and the link.
-            assert open_ports(instance) == {22, 7447}
+            cluster = f"fogft-{status['uid']}-{name.replace('.', '-')}"
+            assert open_ports(instance["region"], f"sky-sg-{cluster}") == {22, 7447}
 
     def preempted_without_notice_and_a_region_is_full(self) -> None:
         lost = next(n for n, r in self.pool.replicas().items() if region_of(r) == "us-east-1")
