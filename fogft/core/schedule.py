@@ -108,6 +108,6 @@ def next_change(schedule: ScheduleSpec, now: float) -> float:
     local = datetime.datetime.fromtimestamp(now, zone(schedule.time_zone))
     second = local.hour * 3600 + local.minute * 60 + local.second + local.microsecond / 1e6
     times = {float(t) for w in schedule.windows for t in (w.begins_s, w.ends_s)}
-    times |= {w.begins_s - schedule.prelaunch_s for w in schedule.windows}
+    times |= {t - schedule.prelaunch_s for t in times}  # a window may want fewer than its end
     shifted = {t + shift for t in times for shift in (-3600.0, 0.0, 3600.0)}
     return now + min((t - second) % DAY_S or DAY_S for t in shifted)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.core.schedule import Wish, window_at, wish, zone
+from fogft.core.schedule import Wish, next_change, window_at, wish, zone
 from fogft.core.spec_choices import ScheduleSpec, WindowSpec
 
 HOUR = 3600
@@ -81,6 +81,24 @@ def test_a_pool_is_asked_for_before_its_window_opens(found, now, prelaunch_s):
     later = window_at(schedule, now + prelaunch_s)
     wanted = USUAL.replicas if later is None or later.replicas is None else later.replicas
     assert wish(schedule, now, USUAL).replicas >= wanted
+
+
+@given(
+    st.sampled_from([0, 1, 5]),
+    st.sampled_from(["UTC", PACIFIC]),
+    st.integers(0, 6 * 24 * 60),
+    st.sampled_from([0.0, 600.0, 3600.0]),
+)
+def test_nothing_changes_before_the_next_change(replicas, tz, minute, prelaunch_s):
+    """Nor where a window wants fewer than what follows it, which is then launched ahead."""
+    window = WindowSpec(frozenset(range(7)), 20 * HOUR, 6 * HOUR, replicas, None)
+    schedule = ScheduleSpec(tz, (window,), prelaunch_s)
+    now = at("2024-06-03", "00:00:00", tz) + 60 * minute
+    told = wish(schedule, now, USUAL)
+    moment = now
+    while moment + 60 < next_change(schedule, now):
+        moment += 60
+        assert wish(schedule, moment, USUAL) == told
 
 
 def test_an_unknown_zone_is_an_error():
