@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.evaluation import plotting
+from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Finding, Table
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
@@ -63,8 +64,10 @@ def pool_file(pools: Pools, name: str, count: int, workspace: Path, run: str, se
 
 def replica_in(pools: Pools, pool: str, region: str) -> dict[str, Any]:
     """Return what the status says of a pool's replica in a region."""
-    (found,) = (r for r in pools.ready(pool) if region in r["location"])
-    return found
+    found = [r for r in pools.ready(pool) if region in r["location"]]
+    if len(found) != 1:
+        raise EvaluationError(f"{pool} has {len(found)} ready replicas in {region}, not one")
+    return found[0]
 
 
 def findings(
