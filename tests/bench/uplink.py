@@ -11,6 +11,7 @@ from tests.wire.wire_pool import wait_for
 
 REPLICAS = (1, 2, 4)
 PAYLOAD_BYTES = 100_000
+_START_S = 300.0  # many processes on a machine that may be busy
 
 
 def uplink(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
@@ -38,13 +39,13 @@ def of_pool(folder: Path, replicas: int, requests: int) -> dict[str, Any]:
         relays.append(relay)
         pool.lay_out({"edge": (relay.endpoint, ())}, {"behind": ["edge"]})
         behind = pool.robot("behind")
-        wait_for(behind.ready)
-        wait_for(lambda: len(_ready(behind)) == replicas)
+        wait_for(behind.ready, _START_S)
+        wait_for(lambda: len(_ready(behind)) == replicas, _START_S)
         through = _sent([relay], behind, requests)
         for slot, to_replica in enumerate(relays[:replicas]):
             pool.reach(slot, to_replica.endpoint)
         direct = pool.robot("direct")
-        wait_for(lambda: direct.ready(replicas))
+        wait_for(lambda: direct.ready(replicas), _START_S)
         return {
             "payload_bytes": PAYLOAD_BYTES,
             "requests": requests,

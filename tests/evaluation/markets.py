@@ -45,7 +45,7 @@ class Markets(Defaults):
 
     def trials(self, scale: Scale) -> Mapping[str, int]:
         """A trial is a seed."""
-        seeds = scale.choose(quick=2, normal=10, full=30)
+        seeds = scale.choose(quick=2, normal=5, full=30)
         return {f"any-of-{n}": seeds for n in REPLICAS}
 
     @contextlib.contextmanager

@@ -133,7 +133,8 @@ class Pools:
     def service_pids(self, pool: str, slot: int, program: str) -> list[int]:
         """Return the processes on a replica's machine whose command line has `program` in it."""
         status = self.status(pool)
-        (generation,) = (r["generation"] for r in status["replicas"] if r["slot"] == slot)
+        # Beside a new one its predecessor may still be ending.
+        generation = max(r["generation"] for r in status["replicas"] if r["slot"] == slot)
         found = []
         for pid in processes.find(machine=f"{status['uid']}-{slot}.{generation}"):
             with contextlib.suppress(OSError):

@@ -43,9 +43,10 @@ class Recovery(Defaults):
     method = (
         "A pool of two replicas on the local cloud, asked 20 times a second by an ordinary "
         "client; one replica's machine is killed (SIGKILL) or frozen (SIGSTOP), and the next "
-        "trial waits until the pool is whole. 'Noticed': the robot's proxy no longer counts on "
-        "it; 'ordered': its replacement is launched; 'whole': that one answers. A machine boots "
-        "in half a second here; on a cloud its minutes are added to 'whole' and to nothing else. "
+        "trial waits until the pool is whole. 'Noticed': the pool's status no longer shows it in "
+        "good health; 'ordered': its replacement is launched; 'whole': that one answers. A "
+        "machine boots in half a second here; on a cloud its minutes are added to 'whole' and to "
+        "nothing else. "
         "A frozen replica is replaced after 15 s of silence, the default of `replace_after_s`."
     )
     fields = ("fault", *MOMENTS, "asked", "failed", "longest_gap_s")
@@ -179,7 +180,7 @@ def _pool_file(pools: Pools) -> Path:
 
 def _break(pools: Pools, asking: _Asking, fault: str, number: int) -> Row:
     """Bring one fault; wait until the pool is whole again; say how long everything took."""
-    pools.wait_whole(POOL)
+    pools.wait(lambda: _settled(pools), "the pool to be whole, and nothing else left of it")
     slot = number % 2
     (before,) = (r["generation"] for r in pools.ready(POOL) if r["slot"] == slot)
     (pid,) = pools.service_pids(POOL, slot, "echo_service.py")
@@ -204,6 +205,10 @@ def _break(pools: Pools, asking: _Asking, fault: str, number: int) -> Row:
         "failed": failed,
         "longest_gap_s": gap_s,
     }
+
+
+def _settled(pools: Pools) -> bool:
+    return len(pools.status(POOL)["replicas"]) == len(pools.ready(POOL)) == 2
 
 
 def _watch(

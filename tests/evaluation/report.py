@@ -9,6 +9,7 @@ import base64
 import html
 import io
 import json
+import re
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -44,7 +45,11 @@ def write(
 
 def page_head(machine: Mapping[str, Any]) -> str:
     """Return the page's beginning: where this was run, and how to read it."""
-    described = ", ".join(f"{key} {value}" for key, value in machine.items())
+    described = (
+        f"{machine['processor']}, {machine['cores']} cores, "
+        f"{machine['memory_bytes'] / 2**30:.0f} GiB, {machine['system']}, "
+        f"Linux {machine['kernel']}, Python {machine['python']}"
+    )
     return (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         f"<title>FogROS2-FT's evaluation, reproduced with fogft</title><style>{_STYLE}</style>"
@@ -143,11 +148,13 @@ def picture(folder: Path, name: str, figure: Any) -> str:
 
     folder.mkdir(parents=True, exist_ok=True)
     with matplotlib.rc_context(_SVG):
-        figure.savefig(folder / f"{name}.png", dpi=100)
+        figure.savefig(folder / f"{name}.png", dpi=80)
         svg = io.BytesIO()
         figure.savefig(svg, format="svg", metadata={"Date": None})
-    (folder / f"{name}.svg").write_bytes(svg.getvalue())
-    shown, kind = (folder / f"{name}.svg").read_bytes(), "svg+xml"
+    # Coordinates are points, 1/72 inch: two digits are plenty, and make half the file.
+    small = re.sub(rb"(\d+\.\d\d)\d+", rb"\1", svg.getvalue())
+    (folder / f"{name}.svg").write_bytes(small)
+    shown, kind = small, "svg+xml"
     if (folder / f"{name}.png").stat().st_size < len(shown):
         shown, kind = (folder / f"{name}.png").read_bytes(), "png"
     data = base64.b64encode(shown).decode()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 Sample = Sequence[float]
 Statistic = Callable[[Sample], float]
-RESAMPLES = 2000
+RESAMPLES = 1000
 
 
 @dataclass(frozen=True)
