@@ -93,13 +93,16 @@ def proxy_config(
             "certificate": f"{paths.credentials.name}/{stem}.crt",
             "key": f"{paths.credentials.name}/{stem}.key",
             "services": [to_plain(service) for service in spec.proxied],
-            "topics": [topics.to_plain(topic) for topic in spec.topics],
             "suspect_after_s": spec.health.suspect_after_s,
             "rendezvous": list(spec.rendezvous),
             "records": paths.records.name,
             # A gateway's replicas hear of revocations from a rendezvous.
             **(
-                {"revocations": paths.revocations.name, "rmw": spec.rmw.robot.value}
+                {
+                    "revocations": paths.revocations.name,
+                    "rmw": spec.rmw.robot.value,
+                    "topics": [topics.to_plain(topic) for topic in spec.topics],
+                }
                 if file == "proxy.yaml"
                 else {}
             ),
