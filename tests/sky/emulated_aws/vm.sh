@@ -37,5 +37,6 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
     echo "$key" >"home/$user/.ssh/authorized_keys"
     chown -R --reference="home/$user" "home/$user/.ssh"
     exec env -i PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
-      chroot . /usr/sbin/sshd -D -e -o UsePAM=no -o PidFile=/run/sshd.pid
+      chroot . /usr/sbin/sshd -D -e -o UsePAM=no -o PidFile=/run/sshd.pid \
+      -o SetEnv=AWS_ENDPOINT_URL=http://10.66.0.1:5566  # where a VM that ends itself finds AWS
   ' vm "$disk" "$image" "$host_root" "$user" "$key" "$address" "$@"
