@@ -102,13 +102,13 @@ class Overhead(Defaults):
 
 def _why(samples: Samples) -> str:
     load = p50([float(row["load"]) for condition in samples for row in samples[condition]])
+    why = "A call that takes no time itself: the worst case for a proxy."
     if load > _BUSY:
-        return (
-            f"At a load average of {load:.0f} every call waited for a core most of its time, "
-            "direct ones too, so the factor is too small. docs/measurements.md has it for a less "
-            "busy machine."
+        why += (
+            f" At a load average of {load:.0f} a P99, of direct calls too, is mostly waiting for "
+            "a core."
         )
-    return "A call that takes no time itself: the worst case for a proxy."
+    return why
 
 
 def _pool_file(pools: Pools, replicas: int) -> Path:
