@@ -67,7 +67,7 @@ def test_an_unknown_option_is_wrong_usage(tree):
 
 @pytest.mark.parametrize(("status", "whole"), [(0, 0), (77, 0), (1, 1), (124, 1)])
 def test_ci_goes_on_after_a_skip_and_fails_after_a_failure(tree, status, whole):
-    for name in ("check", "test", "quickstart"):
+    for name in ("check", "test", "quickstart", "soak", "reproduce"):
         program(tree / "scripts" / name, "#!/bin/sh\nexit 0\n")
     program(tree / "scripts/test-sky", f"#!/bin/sh\nexit {status}\n")
     done = run(tree, ".ci/run")
