@@ -43,6 +43,7 @@ class Drain:
         self._last: Flow | None = None
         self._last_at = 0.0
         self._progress_at: float | None = None  # None: nothing is outstanding
+        self._waited_s = 0.0  # with a queue, since the last look that found it moved
         self._rate: float | None = None
 
     @property
@@ -75,8 +76,12 @@ class Drain:
         queued = sending or last.outstanding >= BULK_BYTES
         if sending or (queued and flow.outstanding >= BULK_BYTES):
             self._measured(moved / since_s)
-        flows = (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES
-        return since_s if flows else 0.0
+        if (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES:
+            waited_s, self._waited_s = self._waited_s, 0.0
+            return waited_s + since_s
+        # Acknowledgements come in steps: what was waited for one counts when it has come.
+        self._waited_s = self._waited_s + since_s if queued else 0.0
+        return 0.0
 
     def _measured(self, rate: float) -> None:
         old = self._rate

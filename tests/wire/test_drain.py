@@ -62,6 +62,20 @@ def test_a_frozen_peer_is_not_excused_for_what_its_kernel_takes(sizes):
     assert drain.bytes_per_s is None
 
 
+@given(st.lists(st.tuples(st.floats(0.06, 0.5), st.booleans()), min_size=1, max_size=40))
+def test_a_queue_that_moves_in_steps_is_excused_in_full_at_each(steps):
+    """Up to the last step that was seen; nothing after it."""
+    drain, now, acknowledged, excused, moved_at = Drain(), 100.0, 0, 0.0, 100.0
+    drain.look(Flow(0, 0, 10**6), now)
+    for step, moves in steps:
+        now += step
+        if moves:
+            acknowledged += 30_000
+            moved_at = now
+        excused += drain.look(Flow(acknowledged, 0, 10**6), now)
+    assert abs(excused - (moved_at - 100.0)) < 1e-6
+
+
 @given(rates, intervals)
 def test_what_a_relay_takes_in_is_a_queue_too_while_the_sender_is_at_it(rate, steps):
     """Little is outstanding where something on the way has room of its own."""
