@@ -73,8 +73,13 @@ def section(into: Path, experiment: Experiment, samples: Samples) -> Iterator[st
     findings = experiment.findings(samples)
     if findings:
         yield from findings_table(findings)
-    for name, figure in experiment.figures(samples).items():
-        yield picture(into / experiment.name, name, figure)
+    try:
+        figures = experiment.figures(samples)
+    except ImportError:  # what draws them is not installed for another experiment's run
+        yield from drawn_before(into / experiment.name)
+    else:
+        for name, figure in figures.items():
+            yield picture(into / experiment.name, name, figure)
     if experiment.measures:
         yield from table(measured(experiment, samples))
     for one in experiment.tables(samples):
@@ -154,10 +159,20 @@ def picture(folder: Path, name: str, figure: Any) -> str:
     # Coordinates are points, 1/72 inch: two digits are plenty, and make half the file.
     small = re.sub(rb"(\d+\.\d\d)\d+", rb"\1", svg.getvalue())
     (folder / f"{name}.svg").write_bytes(small)
-    shown, kind = small, "svg+xml"
-    if (folder / f"{name}.png").stat().st_size < len(shown):
-        shown, kind = (folder / f"{name}.png").read_bytes(), "png"
-    data = base64.b64encode(shown).decode()
+    return shown(folder, name)
+
+
+def drawn_before(folder: Path) -> Iterator[str]:
+    """Yield the pictures that an earlier run left, as parts of the page."""
+    for path in sorted(folder.glob("*.svg")):
+        yield shown(folder, path.stem)
+
+
+def shown(folder: Path, name: str) -> str:
+    """Return a picture as part of the page: the smaller of its two files."""
+    files = {"svg+xml": folder / f"{name}.svg", "png": folder / f"{name}.png"}
+    kind = min(files, key=lambda kind: files[kind].stat().st_size)
+    data = base64.b64encode(files[kind].read_bytes()).decode()
     return f"<p><img alt='{html.escape(name)}' src='data:image/{kind};base64,{data}'></p>"
 
 

@@ -7,7 +7,16 @@ import random
 
 import pytest
 
-from tests.evaluation import costs, failures, markets, overhead, planning, recovery, uplink
+from tests.evaluation import (
+    costs,
+    failures,
+    markets,
+    overhead,
+    planning,
+    recovery,
+    report,
+    uplink,
+)
 from tests.evaluation.samples import Store
 
 pytest.importorskip("matplotlib", reason="plots need matplotlib: scripts/setup plot")
@@ -187,3 +196,18 @@ def test_recovery(folder):
         shown = steps(axis)
         for field in recovery.MOMENTS:
             is_distribution_of(shown[field.removesuffix("_s")], column(folder, condition, field))
+
+
+def test_a_picture_that_cannot_be_drawn_here_is_kept(folder):
+    """A report written without some extra shows what an earlier run drew."""
+    samples = fill(folder / "uplink", uplink.EXPERIMENT, {"replicas-1": 1}, lambda *_: {
+        "replicas": 1, "requests": 9, "directly": 1.0, "gateway": 1.0
+    })  # fmt: skip
+    before = "".join(report.section(folder, uplink.EXPERIMENT, samples))
+
+    class Bare(uplink.Uplink):
+        def figures(self, samples):
+            raise ModuleNotFoundError("No module named 'renderer'")
+
+    assert "".join(report.section(folder, Bare(), samples)) == before
+    assert before.count("<img ") == 1
