@@ -313,7 +313,15 @@ def test_init_writes_an_example_and_says_how_to_go_on(tmp_path, capsys):
     assert main.run(["init", "planner", "--into", str(into), "--force"]) == 0
 
 
-@pytest.mark.parametrize("name", [name for name in app.examples() if name != "words"])
+OWN_TYPES = {
+    "words": "word_interfaces",
+    "detect": "detect_interfaces",
+    "pick": "pick_interfaces",
+    "segment": "segment_interfaces",
+}
+
+
+@pytest.mark.parametrize("name", [name for name in app.examples() if name not in OWN_TYPES])
 def test_every_example_is_a_good_pool_file(tmp_path, name):
     files = app.init(name, tmp_path / name)
     preview = app.order(files[0]).preview
@@ -321,9 +329,10 @@ def test_every_example_is_a_good_pool_file(tmp_path, name):
     assert preview.notes == ()
 
 
-def test_an_example_with_a_type_of_its_own_asks_for_its_workspace(tmp_path):
-    files = app.init("words", tmp_path / "words")
-    with pytest.raises(SpecError, match="no package `word_interfaces`") as caught:
+@pytest.mark.parametrize(("name", "package"), OWN_TYPES.items())
+def test_an_example_with_a_type_of_its_own_asks_for_its_workspace(tmp_path, name, package):
+    files = app.init(name, tmp_path / name)
+    with pytest.raises(SpecError, match=f"no package `{package}`") as caught:
         app.order(files[0])
     assert "workspace sourced?" in caught.value.hint
 
