@@ -146,6 +146,7 @@ def main() -> int:
     assert not running()
     told = [e for e in control("/log", post=False) if e["event"] in ("preempt", "refused")]
     assert not told, told
+    alone.sky_api("start")
     for pool in (alone, hangs):
         with step(f"`down` of `{pool.name}`, which finds nothing"):
             print(pool.fogft("down", pool.name))
