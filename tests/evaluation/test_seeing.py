@@ -83,6 +83,7 @@ class TestFindings:
 
     def test_the_pictures_hold_the_samples_and_nothing_else(self):
         samples = made_up(detection.EXPERIMENT, FAULTED)
+        pytest.importorskip("matplotlib", reason="plots need matplotlib: scripts/setup plot")
         figure = detection.EXPERIMENT.figures(samples)["latency"]
         healthy, faulted = figure.axes[2], figure.axes[5]
         drawn = {line.get_label(): line for axis in (healthy, faulted) for line in axis.lines}
@@ -221,6 +222,7 @@ class TestStory:
             {"at_s": float(i), "latency_s": 0.01 + i / 1000, "phase": "ABCDE"[i // 4], "winner": w}
             for i, w in enumerate([0, 1] * 10)
         ]
+        pytest.importorskip("matplotlib", reason="plots need matplotlib: scripts/setup plot")
         figure = picking_figures.timeline(rows, picking.PHASES)
         points = {}
         for line in figure.axes[0].lines:

@@ -5,6 +5,7 @@ Each has its counterpart over loopback (`test_gateway`), which runs without root
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterator
 
 import pytest
@@ -36,7 +37,10 @@ def pool(tmp_path, net) -> Iterator[GatewayPool]:
 
 @pytest.mark.parametrize("replicas", [1, 2, 4])
 def test_a_thin_uplink_carries_each_request_once(net, pool, replicas, record_property):
-    """Packets of 1500 bytes, their headers and probes included, against the payload."""
+    """Packets of 1500 bytes, their headers and probes included, against the payload.
+
+    The median of five rounds: on a busy machine TCP sends a packet twice that was only late.
+    """
     robot_at, cloud = net.add("r"), net.add("c")
     near, _ = net.join(robot_at, "10.78.1.1", cloud, "10.78.1.2")
     net.by_packets(robot_at, near)
@@ -47,14 +51,16 @@ def test_a_thin_uplink_carries_each_request_once(net, pool, replicas, record_pro
     robot = pool.robot("ada", where=robot_at)
     wait_for(robot.ready)
     wait_for(lambda: sum(bool(li["ready"]) for li in robot.tell()["report"]["links"]) == replicas)
-    before = net.sent_bytes(robot_at, near)
+    ratios = []
     for _ in range(5):
+        before = net.sent_bytes(robot_at, near)
         robot.ask(4, PAYLOAD_BYTES)
         robot.all_right()
-    ratio = (net.sent_bytes(robot_at, near) - before) / (20 * PAYLOAD_BYTES)
+        ratios.append((net.sent_bytes(robot_at, near) - before) / (4 * PAYLOAD_BYTES))
+    ratio = statistics.median(ratios)
     record_property("packets_per_payload", ratio)
     assert robot.sent() == 20
-    assert ratio <= 1.05, ratio
+    assert ratio <= 1.05, ratios
 
 
 def test_a_blackholed_gateway_costs_no_request(net, pool):
