@@ -115,7 +115,7 @@ def test_every_accepted_offer_is_answered_exactly_once(
     offering.start()
     try:
         for _ in range(4):
-            wait_for(lambda: link.usable)
+            wait_for(lambda: link.usable, 60)
             goal = len(accepted) + 40
             wait_for(lambda goal=goal: len(accepted) >= goal)
             if chance.random() < 0.5:
