@@ -201,8 +201,12 @@ def test_nothing_is_sent_to_an_impostor_after_a_reconnect(
     session = zenoh.open(config.to_zenoh(settings))
     try:
         probe_key = names.probe_key(POOL_UID, 0)
-        list(session.get(probe_key, payload=b"{}", timeout=5.0))
-        assert replica.count("malformed") == 1
+
+        def heard() -> bool:
+            list(session.get(probe_key, payload=b"{}", timeout=5.0))
+            return replica.count("malformed") >= 1
+
+        wait_for(heard)
         replica.kill()
         wait_for(lambda: not session.info.links())
         impostor = start_replica(endpoint=replica.endpoint, files=authority.replica(1))
