@@ -88,6 +88,7 @@ def test_a_change_of_readiness_arrives(
     wait_for(lambda: link.draining)
 
 
+@pytest.mark.timeout(400)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_every_accepted_offer_is_answered_exactly_once(
     start_replica: Callable[..., ReplicaProcess],
@@ -115,7 +116,7 @@ def test_every_accepted_offer_is_answered_exactly_once(
     offering.start()
     try:
         for _ in range(4):
-            wait_for(lambda: link.usable, 60)
+            wait_for(lambda: link.usable, 150)
             goal = len(accepted) + 40
             wait_for(lambda goal=goal: len(accepted) >= goal)
             if chance.random() < 0.5:
