@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import struct
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,6 +54,16 @@ class GatewayPool:
             )
         self.replicas[slot] = made
         self._members[slot] = Member(ReplicaId(POOL_UID, slot, 1), endpoint)
+
+    def server_proxy(
+        self, slot: int, *, where: str = "", host: str = "127.0.0.1", delay_s: float = 0.0
+    ) -> subprocess.Popen[bytes]:
+        """Start a whole server proxy, which runs a request once, and let it in; to be killed."""
+        id = ReplicaId(POOL_UID, slot, 1)
+        endpoint = f"{host}:{free_port() if not where else 7447 + slot}"
+        self._members[slot] = Member(id, endpoint)
+        with _inside(where):
+            return start_server(self.folder, self.authority, id, endpoint, delay_s)
 
     def endpoint(self, slot: int) -> str:
         return self._members[slot].endpoint
@@ -217,6 +229,34 @@ class Robot(Process):
     def sent(self) -> int:
         """Return how many copies of requests it has sent."""
         return int(self.tell()["report"]["services"][SERVICE]["sent"])
+
+
+def start_server(
+    folder: Path, authority: Authority, id: ReplicaId, listen: str, delay_s: float, extra: str = ""
+) -> subprocess.Popen[bytes]:
+    """Start a server proxy without ROS; see `plain_replica` for what it answers and notes."""
+    files, stem = authority.replica(id.slot, id.generation), f"replica{id.slot}.{id.generation}"
+    config = folder / f"{stem}.yaml"
+    config.write_text(
+        f'pool: p\npool_uid: "{POOL_UID}"\nslot: {id.slot}\ngeneration: {id.generation}\n'
+        f"listen: {listen}\nnotice: none\nservices: [{{name: {SERVICE}, type: {TYPE}}}]\n"
+        f"run: {delay_s} {folder / 'ran'}.{stem}\n{extra}"
+        f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
+    )
+    with (folder / f"{stem}.log").open("ab") as log:
+        return subprocess.Popen(
+            tied([sys.executable, "-m", "tests.proxy.plain_replica", str(config)]),
+            cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+        )  # fmt: skip
+
+
+def ran(folder: Path) -> dict[str, Counter[int]]:
+    """Return how often each server proxy ran which request, by the name of what it noted."""
+    noted = {path.name: path.read_bytes() for path in sorted(folder.glob("ran.*"))}
+    return {
+        name: Counter(n for (n,) in struct.iter_unpack(">Q", whole[: len(whole) // 8 * 8]))
+        for name, whole in noted.items()
+    }
 
 
 def _inside(where: str) -> contextlib.AbstractContextManager[None]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.proxy.gateway_pool import GatewayPool
+from tests.proxy.gateway_pool import GatewayPool, ran
 from tests.wire.namespaces import Namespaces, why_not
 from tests.wire.wire_pool import wait_for
 
@@ -16,6 +16,7 @@ pytestmark = [
 ]
 # One address of the replica, reached through either cable.
 REPLICA = "10.79.9.9"
+LIMIT_S = 90.0
 
 
 class Net:
@@ -85,6 +86,38 @@ def test_an_uplink_that_goes_costs_no_request(tmp_path, net, policy, fault):
             robot.all_right()
     finally:
         pool.close()
+
+
+def test_copies_through_both_cables_are_run_once(tmp_path, net):
+    """With `uplinks: all`, one cable held up, and one taken away: each request ran once."""
+    pool = GatewayPool(tmp_path, timeout_s=60.0, services=", uplinks: all")
+    server = pool.server_proxy(0, where=net.replica, host=REPLICA, delay_s=0.05)
+    try:
+        interfaces = ", ".join(near for near, _ in net.cables)
+        robot = pool.robot("ada", where=net.robot, extra=f"uplinks: [{interfaces}]\n")
+        wait_for(lambda: ups(robot) == ["up", "up"], LIMIT_S)
+        sent = [net.made.sent_bytes(net.robot, near) for near, _ in net.cables]
+        robot.ask(40, 1000)
+        robot.all_right()
+        carried = [
+            net.made.sent_bytes(net.robot, near) - before
+            for (near, _), before in zip(net.cables, sent, strict=True)
+        ]
+        assert min(carried) > 20 * 1000, carried  # copies on either cable
+        net.stall(0)
+        robot.ask(40, 1000)
+        net.heal(0)  # what waited on that cable arrives now
+        robot.all_right()
+        wait_for(lambda: ups(robot) == ["up", "up"], LIMIT_S)
+        robot.ask(40, 1000)
+        net.remove(1)
+        robot.all_right()
+        (counts,) = ran(tmp_path).values()
+        assert sorted(counts.values()) == [1] * 120
+    finally:
+        pool.close()
+        server.kill()
+        server.wait()
 
 
 def ups(robot) -> list[str]:

@@ -16,11 +16,8 @@ import contextlib
 import json
 import os
 import signal
-import struct
 import subprocess
-import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,11 +25,11 @@ from typing import Any
 from fogft.child import tied
 from fogft.core import names
 from fogft.core.model import Member, ReplicaId
-from tests.proxy.gateway_pool import ROOT, GatewayPool, Robot
+from tests.proxy.gateway_pool import GatewayPool, Robot, ran, start_server
 from tests.wire.namespaces import Namespaces, inside
 from tests.wire.rendezvous_pool import Rendezvous, free_port
 from tests.wire.thin_relay import ThinRelay
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE
+from tests.wire.wire_pool import POOL_UID
 
 ADDRESS = "10.82.9.9"
 REPLICAS = 3
@@ -68,23 +65,12 @@ class Replica:
 
     def __init__(self, world: World, slot: int, generation: int) -> None:
         self.id = ReplicaId(POOL_UID, slot, generation)
-        files = world.authority.replica(slot, generation)
         listen = f"127.0.0.1:{free_port()}"
         self.relay = ThinRelay(listen, host=world.host)
-        stem = f"replica{slot}.{generation}"
-        config = world.folder / f"{stem}.yaml"
-        config.write_text(
-            f'pool: p\npool_uid: "{POOL_UID}"\nslot: {slot}\ngeneration: {generation}\n'
-            f"listen: {listen}\nadvertise: {self.relay.endpoint}\nnotice: none\n"
-            f"services: [{{name: {SERVICE}, type: {TYPE}}}]\n"
-            f"run: {world.delays_s[slot]} {world.folder / 'ran'}.{stem}\n{world.meeting(stem)}"
-            f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
+        extra = f"advertise: {self.relay.endpoint}\n{world.meeting(f'replica{slot}.{generation}')}"
+        self.process = start_server(
+            world.folder, world.authority, self.id, listen, world.delays_s[slot], extra
         )
-        with (world.folder / f"{stem}.log").open("ab") as log:
-            self.process = subprocess.Popen(
-                tied([sys.executable, "-m", "tests.proxy.plain_replica", str(config)]),
-                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-            )  # fmt: skip
 
     def end(self, number: int = signal.SIGKILL) -> None:
         self.process.send_signal(number)
@@ -168,12 +154,12 @@ class World(GatewayPool):
 
     def ran_twice(self) -> list[str]:
         """Return the requests that one server proxy ran more than once."""
-        found = []
-        for path in sorted(self.folder.glob("ran.*")):
-            whole = path.read_bytes()
-            counts = Counter(n for (n,) in struct.iter_unpack(">Q", whole[: len(whole) // 8 * 8]))
-            found += [f"{path.name}: {n} {c} times" for n, c in counts.items() if c > 1]
-        return found
+        return [
+            f"{name}: {number} {times} times"
+            for name, counts in ran(self.folder).items()
+            for number, times in counts.items()
+            if times > 1
+        ]
 
     def close(self) -> None:
         super().close()
