@@ -72,6 +72,9 @@ class _Gateway:
     """The parts of a gateway, and its loop."""
 
     def __init__(self, config: GatewayConfig) -> None:
+        from fogft.wire.handshakes import HandshakeLog
+
+        self._handshakes = HandshakeLog()
         self._config = config
         client = config.client
         self._incarnation = secrets.token_hex(8)
@@ -117,6 +120,7 @@ class _Gateway:
             self._config.listen,
             self._config.client.credentials,
             ReplicaId(uid, slot, self._holder.generation),
+            handshakes=self._handshakes,
             certificate_name=self._holder.common_name,
         )
         keys = {s.name: names.service_key(uid, slot, s.name, s.type) for s in self._services}

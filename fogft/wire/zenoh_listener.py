@@ -346,6 +346,8 @@ class ZenohListener:
                 if verdict is Verdict.REFUSED:
                     self._counters.add("records_refused")
                     log.warning("record_refused reason=%r", self._records.last_refusal)
+                elif verdict is Verdict.OLDER:
+                    self._counters.add("records_older")
             query.reply(query.key_expr, b"")
         finally:
             self._end_aside(greeting, query, turn)
@@ -392,9 +394,9 @@ class ZenohListener:
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
-        ``malformed``, ``records``, ``records_refused``, ``not_admitted``, ``handshakes_refused``,
-        ``unauthenticated``, ``revoked_links``, ``stuck_links``, ``reply_dropped``, ``failed``,
-        ``cancellations``.
+        ``malformed``, ``records``, ``records_refused``, ``records_older``, ``not_admitted``,
+        ``handshakes_refused``, ``unauthenticated``, ``revoked_links``, ``stuck_links``,
+        ``reply_dropped``, ``failed``, ``cancellations``.
         """
         return self._counters.snapshot()
 

@@ -120,7 +120,8 @@ def main() -> None:
         if "ask" in command:
             service = command.get("service", config.services[0].name)
             callers.ask(command["ask"], command.get("bytes", 8), service)
-        print(json.dumps({**callers.report(), "report": proxy.report()}), flush=True)
+        report = {**proxy.report(), **following.report()}
+        print(json.dumps({**callers.report(), "report": report}), flush=True)
 
 
 if __name__ == "__main__":

@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
 from fogft.core import names
-from fogft.core.holders import Role
 from fogft.core.model import LinkState, ReplicaId
 from fogft.wire import record_frames as frames
 from fogft.wire.dial_in import PURPOSE, DialIn
 from fogft.wire.dial_out import WAITING, DialOut
 from fogft.wire.signing import Signer, Verifier
+from tests.wire import hostile
 from tests.wire.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -132,49 +132,14 @@ def test_another_replica_at_the_loopback_port_is_sent_nothing(
 # -- hostile ------------------------------------------------------------------------------------
 
 
-def _come(door: DialIn) -> tuple[socket.socket, bytes]:
-    host, port = door.endpoint.split(":")
-    link = socket.create_connection((host, int(port)), 10.0)
-    message = next(iter(frames.Unframer().feed(link.recv(4096))))
-    return link, frames.read_challenge(message)[0]
-
-
-def _greet(door: DialIn, files: Files, purpose: str = PURPOSE) -> socket.socket:
-    link, nonce = _come(door)
-    proof = frames.proof_bytes(purpose, nonce, POOL_UID.encode())
-    link.sendall(frames.greeting(*Signer(files.certificate, files.key)(proof)))
-    return link
-
-
-def _robot(authority: Authority, folder: Path) -> Files:
-    return authority.robot()
-
-
-def _stranger(authority: Authority, folder: Path) -> Files:
-    return Authority(folder / "stranger").replica()
-
-
-def _expired(authority: Authority, folder: Path) -> Files:
-    return authority.issue(names.replica_certificate_name(ID), Role.REPLICA, days=-0.5)
-
-
-def _misnamed(authority: Authority, folder: Path) -> Files:
-    return authority.issue(names.replica_certificate_name(ID), Role.ROBOT)
-
-
-@pytest.mark.parametrize(
-    ("make", "event"),
-    [
-        (_robot, "greeting_role"),
-        (_misnamed, "greeting_role"),
-        (_stranger, "greeting_authority"),
-        (_expired, "greeting_expired"),
-    ],
-)
-def test_nobody_but_a_replica_of_the_pool_comes_in(authority, door, tmp_path, make, event):
-    with _greet(door, make(authority, tmp_path)) as link:
-        assert link.recv(1) == b""
-    assert door.counters()[event] == 1
+def test_nobody_but_a_replica_of_the_pool_comes_in(authority, door, tmp_path):
+    """Robots, misnamed ones, and those of another pool or time are counted by reason."""
+    expected: Counter[str] = Counter()
+    for files, event in hostile.impostors(authority, tmp_path):
+        with hostile.greet(door.endpoint, files) as link:
+            assert link.recv(1) == b""
+        expected[event] += 1
+    assert door.counters() == expected
     assert door.waiting() == {}
 
 
@@ -182,7 +147,7 @@ def test_a_revoked_replica_does_not_come_in(authority):
     name = names.replica_certificate_name(ID)
     files = authority.replica()
     door = DialIn("127.0.0.1:0", POOL_UID, Verifier(files.ca), revoked=lambda: {name})
-    with _greet(door, files) as link:
+    with hostile.greet(door.endpoint, files) as link:
         assert link.recv(1) == b""
     assert door.counters() == {"greeting_revoked": 1}
     door.close()
@@ -192,7 +157,7 @@ def test_noise_replays_and_hoarding_are_turned_away(authority, door, dial_out, s
     """The door stays open to the right ones throughout."""
     files = authority.replica()
     for noise in [b"", b"\x00" * 100, b"\xff" * 5000, frames.frame({"type": "greeting", "v": 9})]:
-        link, _ = _come(door)
+        link, _ = hostile.come(door.endpoint)
         with link, contextlib.suppress(OSError):
             link.sendall(noise)
             link.shutdown(socket.SHUT_WR)
@@ -200,20 +165,20 @@ def test_noise_replays_and_hoarding_are_turned_away(authority, door, dial_out, s
                 pass
     wait_for(lambda: door.counters().get("greeting_malformed") == 2)
     wait_for(lambda: door.counters().get("greeting_version") == 1)
-    first, nonce = _come(door)
-    second, _ = _come(door)
+    first, nonce = hostile.come(door.endpoint)
+    second, _ = hostile.come(door.endpoint)
     overheard = frames.proof_bytes(PURPOSE, nonce, POOL_UID.encode())
     with first, second:
         second.sendall(frames.greeting(*Signer(files.certificate, files.key)(overheard)))
         assert second.recv(1) == b""
     assert door.counters()["greeting_forged"] == 1
-    with _greet(door, files, purpose="rendezvous") as link:
+    with hostile.greet(door.endpoint, files, purpose="rendezvous") as link:
         assert link.recv(1) == b""
     assert door.counters()["greeting_forged"] == 2
     other = authority.replica(1)
-    hoard = [_greet(door, other) for _ in range(8)]
+    hoard = [hostile.greet(door.endpoint, other) for _ in range(8)]
     wait_for(lambda: door.counters().get("refused_full", 0) >= 4)
-    odd = _greet(door, authority.replica(2))
+    odd = hostile.greet(door.endpoint, authority.replica(2))
     odd.sendall(b"not a sign of life")
     with contextlib.suppress(ConnectionError):
         while odd.recv(64):
@@ -228,7 +193,7 @@ def test_noise_replays_and_hoarding_are_turned_away(authority, door, dial_out, s
 
 def test_a_replica_that_takes_no_part_after_greeting_is_dropped(authority, door):
     """It neither sends signs of life nor hangs up: a frozen one, or a black hole."""
-    with _greet(door, authority.replica()) as link:
+    with hostile.greet(door.endpoint, authority.replica()) as link:
         wait_for(lambda: door.waiting().get(ID) == 1)
         wait_for(lambda: not door.waiting())
         assert link.fileno() >= 0

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import random
-import socket
 import ssl
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,16 +14,16 @@ import zenoh
 
 from fogft.core import names
 from fogft.core.model import LinkState
-from fogft.pool.credentials import Role
 from fogft.wire import config, frame
 from fogft.wire.config import LinkSettings
 from fogft.wire.port import Refusal
 from fogft.wire.zenoh_link import ZenohLink
+from tests.wire import hostile
 from tests.wire.wire_pool import (
+    LIMIT_S,
     POOL_UID,
     SERVICE,
     Authority,
-    Files,
     Owner,
     ReplicaProcess,
     keys,
@@ -34,26 +32,10 @@ from tests.wire.wire_pool import (
     wait_for,
 )
 
-HELLO = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"  # how a TLS handshake begins
-JUNK = {
-    "random": lambda dice: dice.randbytes(dice.randint(1, 3000)),
-    "http": lambda _: b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
-    "zenoh without tls": lambda _: struct.pack("<H", 12) + b"\x01\x09" + bytes(10),
-    "truncated record": lambda dice: HELLO + dice.randbytes(20),
-    "oversized record": lambda dice: b"\x16\x03\x03\xff\xff" + dice.randbytes(60_000),
-    "wrong version": lambda dice: b"\x16\x09\x09\x00\x10" + dice.randbytes(16),
-    "nothing": lambda _: b"",
-}
-
 
 @pytest.fixture
 def replica(start_replica: Callable[..., ReplicaProcess]) -> ReplicaProcess:
     return start_replica()
-
-
-def _connect(replica: ReplicaProcess) -> socket.socket:
-    host, _, port = replica.endpoint.rpartition(":")
-    return socket.create_connection((host, int(port)), 5.0)
 
 
 def _echo(link: ZenohLink, owner: Owner, number: int) -> None:
@@ -71,7 +53,7 @@ def _untouched(link: ZenohLink, before: dict[str, object], replica: ReplicaProce
         assert after.get(event, 0) == before.get(event, 0), event
 
 
-@pytest.mark.parametrize("kind", JUNK)
+@pytest.mark.parametrize("kind", hostile.JUNK)
 def test_bytes_that_are_no_tls_are_counted_and_change_nothing(
     replica: ReplicaProcess, dial: Callable[..., ZenohLink], owner: Owner, kind: str
 ) -> None:
@@ -80,39 +62,10 @@ def test_bytes_that_are_no_tls_are_counted_and_change_nothing(
     wait_for(lambda: link.usable)
     before, dice = replica.ask(), random.Random(kind)
     for _ in range(10):
-        with _connect(replica) as connection, contextlib.suppress(OSError):
-            connection.sendall(JUNK[kind](dice))
-            connection.shutdown(socket.SHUT_WR)
-            connection.recv(1)
+        hostile.throw(replica.endpoint, hostile.JUNK[kind](dice))
     wait_for(lambda: replica.count("handshakes_refused") == 10)
     _untouched(link, before, replica)
     _echo(link, owner, 1)
-
-
-def _tls(files: Files | None, ca: Path) -> ssl.SSLContext:
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False
-    context.load_verify_locations(ca)
-    if files is not None:
-        context.load_cert_chain(files.certificate, files.key)
-    return context
-
-
-def _certificates(authority: Authority, stranger: Authority) -> Iterator[Files | None]:
-    yield None
-    yield stranger.robot()
-    yield authority.replica(1)
-    yield authority.issue(names.rendezvous_certificate_name(POOL_UID, "a"), Role.RENDEZVOUS)
-    yield authority.issue(names.manager_certificate_name(POOL_UID), Role.MANAGER)
-    yield authority.issue(names.robot_certificate_name(POOL_UID, "old"), Role.ROBOT, days=-0.5)
-
-
-def _is_turned_away(replica: ReplicaProcess, context: ssl.SSLContext) -> None:
-    """In TLS 1.3 a client's certificate is judged last: it hears so with its first read."""
-    with contextlib.suppress(OSError), _connect(replica) as raw:
-        with context.wrap_socket(raw) as connection:
-            connection.settimeout(10.0)
-            assert connection.recv(1) == b""
 
 
 def test_certificates_that_are_no_good_are_counted_and_change_nothing(
@@ -126,8 +79,9 @@ def test_certificates_that_are_no_good_are_counted_and_change_nothing(
     link = dial(replica.endpoint)
     wait_for(lambda: link.usable)
     before = replica.ask()
-    for tried, files in enumerate(_certificates(authority, Authority(tmp_path / "stranger")), 1):
-        _is_turned_away(replica, _tls(files, authority.robot().ca))
+    stranger = Authority(tmp_path / "stranger")
+    for tried, files in enumerate(hostile.certificates(authority, stranger), 1):
+        hostile.is_turned_away(replica.endpoint, hostile.tls(files, authority.robot().ca))
         wait_for(lambda tried=tried: replica.count("handshakes_refused") == tried)  # type: ignore[misc]
     _untouched(link, before, replica)
     _echo(link, owner, 1)
@@ -147,8 +101,8 @@ def test_a_robot_that_talks_garbage_after_its_handshake_is_let_go(
     before, dice = replica.ask(), random.Random(seed)
     content = dice.randbytes(dice.randint(1, 2000))
     length = [len(content), 0xFFFF, 1][seed % 3]
-    context = _tls(authority.robot("eve"), authority.robot().ca)
-    with _connect(replica) as raw, context.wrap_socket(raw) as connection:
+    context = hostile.tls(authority.robot("eve"), authority.robot().ca)
+    with hostile.connect(replica.endpoint) as raw, context.wrap_socket(raw) as connection:
         with contextlib.suppress(OSError):
             connection.sendall(struct.pack("<H", length) + content)
             connection.settimeout(30.0)
@@ -167,7 +121,7 @@ def test_connections_that_say_nothing_are_ended_and_keep_nobody_out(
     wait_for(lambda: link.usable)
     before = replica.ask()
     with contextlib.ExitStack() as stack:
-        idle = [stack.enter_context(_connect(replica)) for _ in range(100)]
+        idle = [stack.enter_context(hostile.connect(replica.endpoint)) for _ in range(100)]
         late = dial(replica.endpoint, robot="late")
         wait_for(lambda: replica.count("unauthenticated") >= 100)
         wait_for(lambda: late.usable)
@@ -197,25 +151,6 @@ def test_the_links_of_a_revoked_robot_are_ended_whatever_it_does(
     assert ada.status().reopened == 0
 
 
-def _frames() -> Iterator[tuple[str, bytes, bytes | None]]:
-    """Return key, payload and attachment of queries that a robot in wrong hands may send."""
-    request, probe = keys(0)[SERVICE], names.probe_key(POOL_UID, 0)
-    cancel = names.cancel_key(POOL_UID, 0)
-    header = frame.encode_request(request_id(1), 5.0, frame.origin("eve", bytes(8)))
-    greeting = frame.encode_greeting(frame.Greeting(bytes(8), b"c" * 500, b"s" * 70))
-    for content in (header[:10], header + bytes(100), b"\x07" + header[1:], os.urandom(40)):
-        yield request, b"x", content
-    for content in (None, greeting[:5], b"\x07" + greeting[1:], bytes(5000)):
-        yield probe, b'{"v":1,"robot":"eve","manager_age_s":null}', content
-    for payload in (b"", b"{}", b"[" * 5000, b'{"v":9,"robot":"eve"}', bytes(100_000)):
-        yield probe, payload, greeting
-    for payload in (b"", b"\x07", bytes(100_000)):
-        yield cancel, payload, None
-    token = frame.encode_greeting(frame.Greeting(bytes(8)))
-    for payload in (b"", b"{}", b'{"v":9,"records":[]}', b'{"v":1,"records":[7]}', bytes(300_000)):
-        yield names.records_key(POOL_UID, 0), payload, token
-
-
 def test_frames_that_cannot_be_read_are_counted_one_by_one(
     authority: Authority, replica: ReplicaProcess, dial: Callable[..., ZenohLink], owner: Owner
 ) -> None:
@@ -224,9 +159,11 @@ def test_frames_that_cannot_be_read_are_counted_one_by_one(
     wait_for(lambda: link.usable)
     settings = config.robot_settings(peer(replica.endpoint), authority.robot("eve"), LinkSettings())
     session = zenoh.open(config.to_zenoh(settings))
+    queries = list(hostile.queries(0, keys(0)[SERVICE]))
     try:
-        for sent, (key, payload, attachment) in enumerate(_frames(), 1):
-            list(session.get(key, payload=payload, attachment=attachment, timeout=1.0))
+        for sent, (key, payload, attachment) in enumerate(queries, 1):
+            # Not read: whether a reply comes early or late does not matter here.
+            _ = session.get(key, payload=payload, attachment=attachment, timeout=LIMIT_S)
             wait_for(lambda sent=sent: replica.count("malformed") == sent)  # type: ignore[misc]
     finally:
         session.close()
