@@ -138,6 +138,20 @@ class LinkState(str, Enum):
     SUSPECT = "suspect"  # was up; the server proxy no longer answers probes
 
 
+DOUBTED_AFTER_S = 0.6
+"""A probe unanswered for so long is a reason to look, and to look only."""
+_DOUBTED_AFTER_ROUND_TRIPS = 3
+
+
+def doubted_after_s(rtt_s: float | None) -> float:
+    """Return when a silent replica is doubted: seconds after the first unanswered probe.
+
+    Args:
+        rtt_s: Round trip of the last probe that was answered; a long way takes its time.
+    """
+    return max(DOUBTED_AFTER_S, _DOUBTED_AFTER_ROUND_TRIPS * (rtt_s or 0.0))
+
+
 @dataclass(frozen=True)
 class LinkReport:
     """What the client proxy reports of one replica. Ages and durations in seconds.
@@ -175,6 +189,16 @@ class LinkReport:
     detail: str = ""
     differs: bool = False
     offered: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def doubted(self) -> bool:
+        """Whether it was up and is silent for longer than answers take, suspect or not yet.
+
+        Nothing follows from it but a question to the cloud.
+        """
+        if self.state is LinkState.UP:
+            return self.silent_for_s >= doubted_after_s(self.rtt_s)
+        return self.state is LinkState.SUSPECT
 
 
 @dataclass(frozen=True)

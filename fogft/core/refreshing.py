@@ -1,9 +1,10 @@
 """Whom a cloud with a memory is asked about: replicas whose links have fallen silent. Pure.
 
 Such a cloud's list may still show what was preempted, so the silence of a link is a reason to
-look; and to look only, since the answer may well be that the machine is there. Asked at
-once, then less and less often while nothing changes, and for the whole pool when all links
-are silent: losing every replica together looks like a dead uplink until the cloud has told.
+look; and to look only, since the answer may well be that the machine is there. So nobody waits
+until a link is suspect: a probe whose answer is late is enough. Asked at once, then less and
+less often while nothing changes, and for the whole pool when all links are silent: losing every
+replica together looks like a dead uplink until the cloud has told.
 
 Owns: who is due.
 Not here: asking (`fogft.cloud`), on a thread of its own (`fogft.pool.operations`).
@@ -11,46 +12,89 @@ Not here: asking (`fogft.cloud`), on a thread of its own (`fogft.pool.operations
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import Enum
+
 from fogft.core.health import was_heard
 from fogft.core.history import History
-from fogft.core.model import LinkState, MachinePhase, Observed, ReplicaId
+from fogft.core.model import LinkReport, LinkState, MachinePhase, Observed, ReplicaId
 
 FIRST_PAUSE_S = 4.0
 LONGEST_PAUSE_S = 60.0
 NEVER_HEARD_PAUSE_S = 30.0
+FALSE_ALARM_REMEMBERED_S = 600.0
+"""A link that often hesitates and then answers costs a question now and then, no more."""
+
+
+class _Silence(Enum):
+    NEVER_HEARD = "never heard"
+    DOUBTED = "doubted"  # still up: a probe's answer is late
+    LOST = "lost"
+
+
+@dataclass
+class _Asked:
+    """When a replica may be asked about, and the pause after that."""
+
+    silence: _Silence
+    next_at: float
+    pause_s: float
 
 
 class Silent:
     """Remembers when each silent replica was asked about. One thread."""
 
     def __init__(self) -> None:
-        self._next: dict[ReplicaId, tuple[float, float]] = {}
+        self._asked: dict[ReplicaId, _Asked] = {}
 
     def due(self, observed: Observed, history: History) -> list[ReplicaId]:
         """Return whom to ask about now; they count as asked."""
         silent = _silent(observed, history)
-        self._next = {id: known for id, known in self._next.items() if id in silent}
-        out: list[ReplicaId] = []
-        for id, first_pause_s in silent.items():
-            first_at = observed.now + (first_pause_s if first_pause_s > FIRST_PAUSE_S else 0.0)
-            at, pause_s = self._next.setdefault(id, (first_at, first_pause_s))
-            if observed.now >= at:
-                out.append(id)
-                later_s = min(LONGEST_PAUSE_S, 2 * pause_s)
-                self._next[id] = (observed.now + pause_s, later_s)
-        return out
+        self._asked = {
+            id: asked
+            for id, asked in self._asked.items()
+            if id in silent or _is_remembered(asked, observed.now)
+        }
+        return [id for id, silence in silent.items() if self._is_due(id, silence, observed.now)]
+
+    def _is_due(self, id: ReplicaId, silence: _Silence, now: float) -> bool:
+        asked = self._asked.get(id)
+        if asked is None or (silence is _Silence.LOST and asked.silence is not _Silence.LOST):
+            asked = self._asked[id] = _first(silence, now)
+        if now < asked.next_at:
+            return False
+        asked.next_at = now + asked.pause_s
+        asked.pause_s = min(LONGEST_PAUSE_S, 2 * asked.pause_s)
+        return True
 
 
-def _silent(observed: Observed, history: History) -> dict[ReplicaId, float]:
-    """Return the machines that should answer and do not, each with its first pause."""
+def _first(silence: _Silence, now: float) -> _Asked:
+    if silence is _Silence.NEVER_HEARD:
+        return _Asked(silence, now + NEVER_HEARD_PAUSE_S, NEVER_HEARD_PAUSE_S)
+    return _Asked(silence, now, FIRST_PAUSE_S)
+
+
+def _is_remembered(asked: _Asked, now: float) -> bool:
+    """Whether one that answers again keeps its pause."""
+    recent = now - asked.next_at < FALSE_ALARM_REMEMBERED_S
+    return asked.silence is _Silence.DOUBTED and recent
+
+
+def _silent(observed: Observed, history: History) -> dict[ReplicaId, _Silence]:
+    """Return the machines that should answer and do not, each with how it is silent."""
     links = {link.id: link for link in observed.links or ()}
-    out: dict[ReplicaId, float] = {}
+    out: dict[ReplicaId, _Silence] = {}
     for machine in observed.machines or ():
         link = links.get(machine.id)
         if machine.phase is not MachinePhase.RUNNING or machine.id in observed.ending:
             continue
-        if link is not None and link.state is not LinkState.UP:
+        if link is not None and (link.doubted or link.state is not LinkState.UP):
             record = history.record(machine.id.slot, machine.id.generation)
-            heard = was_heard(link, record)
-            out[machine.id] = FIRST_PAUSE_S if heard else NEVER_HEARD_PAUSE_S
+            out[machine.id] = _how(link, heard=was_heard(link, record))
     return out
+
+
+def _how(link: LinkReport, *, heard: bool) -> _Silence:
+    if link.state is LinkState.UP:
+        return _Silence.DOUBTED
+    return _Silence.LOST if heard else _Silence.NEVER_HEARD

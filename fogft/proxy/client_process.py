@@ -253,8 +253,9 @@ def _loop(
     watched_certificate.changed()
     revocations = Watched(config.revocations) if config.revocations else None
     started = reported = time.monotonic()
+    changed = False  # since the last report
     while not stop.is_set():
-        changed = proxy.run_once()
+        changed = proxy.run_once() or changed
         memory.look()
         sign.look()
         if watched_config.changed():
@@ -269,7 +270,7 @@ def _loop(
         now = time.monotonic()
         seen.diagnose(proxy.report, now)
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
-            reported = now
+            reported, changed = now, False
             if not config_path.parent.exists():  # the pool's folder: its end is the pool's
                 log.warning("folder_gone path=%s", config_path.parent)
                 return

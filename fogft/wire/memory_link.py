@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from fogft.core.model import LinkState
+from fogft.core.model import LinkState, doubted_after_s
 from fogft.wire.diagnosis import wrong_name
 from fogft.wire.link_window import LinkWindow
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer, Refusal
@@ -58,6 +58,7 @@ class MemoryLink:
         self._events = events
         self._session: Session | None = None
         self._silence = Silence()
+        self._doubted = False
         self._next_probe = 0.0
         self._sessions = 0
         self._closed = False
@@ -187,6 +188,14 @@ class MemoryLink:
             describe = not self.usable or known is None or not known.types
             probe = Probe(self._dialer.robot, self._dialer.manager_age(), describe)
             self._wire.post(session, lambda: self._probed(session, probe, now))
+        self._doubt(now)
+
+    def _doubt(self, now: float) -> None:
+        """Tell the owner, once a silence, that a probe's answer is late; it stays UP."""
+        was = self._doubted
+        self._doubted = self._silence.for_s(now) >= doubted_after_s(self._status.rtt_s)
+        if self._doubted and not was and self.usable:
+            self._events.changed(self)
 
     def _connect(self) -> None:
         listener = self._wire.at(self._peer.endpoint)

@@ -23,7 +23,7 @@ import zenoh
 
 from fogft.core import names
 from fogft.core.errors import CredentialError, WireError
-from fogft.core.model import LinkState
+from fogft.core.model import LinkState, doubted_after_s
 from fogft.wire import config, diagnosis, frame
 from fogft.wire.compression import ZLIB
 from fogft.wire.leaving import see_off
@@ -85,6 +85,7 @@ class ZenohLink:
         self._probe_answer: ProbeAnswer | None = None
         self._heard_at: float | None = None
         self._rtt_s: float | None = None
+        self._doubted = False
         self._detail = "not reached yet"
         self._opened = 0
         self._timed_out = 0  # tries in a row
@@ -313,7 +314,8 @@ class ZenohLink:
                 connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
                 break
             often = _LOOK_EVERY_S if connection.watched else left_s
-            self._pause(min(next_probe - now, left_s, often))
+            doubt_s = self._doubt(now)
+            self._pause(min(next_probe - now, left_s, often, doubt_s))
             try:
                 up = self._listen(connection) or up
             except WireError as error:
@@ -329,6 +331,20 @@ class ZenohLink:
         if connection.flow.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
             connection.lost_because = "it takes nothing more of what is sent"
         return not connection.lost_because
+
+    def _doubt(self, now: float) -> float:
+        """Tell the owner, once a silence, that a probe's answer is late; it stays UP.
+
+        Returns:
+            In how many seconds to look again.
+        """
+        silent_s = self._silence.for_s(now)
+        left_s = doubted_after_s(self._rtt_s) - silent_s
+        was, self._doubted = self._doubted, left_s <= 0
+        if self._doubted and not was and self._live is not None:
+            log.info("link_doubted replica=%s silent_s=%.2f", self._peer.id.short, silent_s)
+            self._changed()
+        return left_s if left_s > 0 else self._suspect_after_s
 
     def _next_probe_in_s(self, *, up: bool) -> float:
         if not up:

@@ -150,7 +150,7 @@ def sky_cloud(folder: Path) -> Iterator[CloudUnderTest]:
     def outage(on: bool) -> None:
         scene.sky.unreachable = on
         scene.provider.reachable = not on
-        scene.pass_s(10)
+        scene.pass_s(20)
 
     yield CloudUnderTest(
         scene.cloud,

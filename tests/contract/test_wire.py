@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -12,7 +13,7 @@ import pytest
 from fogft.core import names
 from fogft.core.definitions import Definition
 from fogft.core.errors import WireError
-from fogft.core.model import LinkState, ReplicaId
+from fogft.core.model import LinkState, ReplicaId, doubted_after_s
 from fogft.wire.link_window import ATTEMPTS_LIMIT
 from fogft.wire.memory import MemoryWire
 from fogft.wire.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer, Refusal
@@ -54,6 +55,12 @@ class MemoryWorld:
     def settle(self) -> None:
         self._wire.advance(1.0)
 
+    def mute(self, replica: Replica) -> None:
+        self._wire.freeze(replica.listener.endpoint)
+
+    def unmute(self, replica: Replica) -> None:
+        self._wire.thaw(replica.listener.endpoint)
+
     def close(self) -> None:
         pass
 
@@ -88,6 +95,13 @@ class ZenohWorld:
         """Give what must not happen a moment in which it could."""
         time.sleep(0.2)
 
+    def mute(self, replica: Replica) -> None:
+        """Let a replica answer no probe; in its own process that takes a thread that waits."""
+        replica.speaks.clear()
+
+    def unmute(self, replica: Replica) -> None:
+        replica.speaks.set()
+
     def close(self) -> None:
         for made in self._made:
             made.close()
@@ -113,6 +127,8 @@ class Replica:
         self.echo = False
         self.answer = ProbeAnswer(slot, generation, "first", frozenset({SERVICE}))
         self.cancelled: list[bytes] = []
+        self.speaks = threading.Event()
+        self.speaks.set()
         listener.serve(keys(slot), self._request, self._probe, self._cancel)
 
     def _cancel(self, ids: Sequence[bytes]) -> None:
@@ -125,6 +141,7 @@ class Replica:
 
     def _probe(self, probe: Probe) -> ProbeAnswer:
         self.probes.append(probe)
+        self.speaks.wait(LIMIT_S)
         return self.answer
 
 
@@ -340,6 +357,27 @@ def test_silence_grows_while_nobody_is_there(
     heard_age_s = link.status().heard_age_s
     assert heard_age_s is not None
     assert heard_age_s >= 0.3
+
+
+def test_an_answer_that_is_late_is_told_before_the_link_is_suspect(
+    world: World, replica: Replica, owner: Owner
+) -> None:
+    """Once a silence; requests go there all the same, and the next answer ends it."""
+    endpoint = replica.listener.endpoint
+    link = world.dialer(suspect_after_s=600.0).dial(peer(endpoint), keys(0), owner)
+    world.wait_for(lambda: link.usable)
+    world.settle()
+    changes = owner.changes
+    world.mute(replica)
+    world.wait_for(lambda: owner.changes > changes)
+    status = link.status()
+    assert status.state is LinkState.UP
+    assert link.usable
+    assert status.silent_for_s >= doubted_after_s(status.rtt_s)
+    world.settle()
+    assert owner.changes == changes + 1
+    world.unmute(replica)
+    world.wait_for(lambda: link.status().silent_for_s == 0.0)
 
 
 def test_a_closed_link_loses_what_is_open(

@@ -6,10 +6,12 @@ import itertools
 from dataclasses import replace
 
 from hypothesis import given
+from hypothesis import strategies as st
 
 from fogft.core.model import LinkState, MachinePhase, Observed
+from fogft.core.planner import plan
 from fogft.core.refreshing import LONGEST_PAUSE_S, Silent
-from tests.core.pool_worlds import World, replica, spec, worlds
+from tests.core.pool_worlds import UID, World, replica, spec, worlds
 
 
 def times_asked(world: World, seconds: int) -> list[int]:
@@ -25,10 +27,10 @@ def times_asked(world: World, seconds: int) -> list[int]:
 @given(worlds())
 def test_only_who_should_answer_and_does_not_is_asked_about(world: World) -> None:
     """Never one that answers, is still being launched, has failed or is being ended."""
-    links = {link.id: link.state for link in world.links or ()}
+    links = {link.id: link for link in world.links or ()}
     machines = {m.id: m for m in world.machines or ()}
     for id in Silent().due(world.observed, world.history):
-        assert links[id] is not LinkState.UP
+        assert links[id].state is not LinkState.UP or links[id].silent_for_s > 0.5
         assert machines[id].phase is MachinePhase.RUNNING
         assert id not in world.ending
 
@@ -56,3 +58,53 @@ def test_who_answers_again_is_asked_about_at_once_the_next_time() -> None:
     assert not memory.due(replace(well.observed, now=well.now + 41), well.history)
     again: Observed = replace(silent.observed, now=silent.now + 42)
     assert len(memory.due(again, silent.history)) == 1
+
+
+def with_silence(world: World, silent_s: float, rtt_s: float | None = 0.05) -> World:
+    """Return a world whose links are up, and whose last probes wait for their answers."""
+    links = tuple(replace(x, silent_for_s=silent_s, rtt_s=rtt_s) for x in world.links or ())
+    return replace(world, links=links)
+
+
+def test_a_late_answer_is_reason_enough_to_ask_before_the_link_is_suspect() -> None:
+    well = World(spec()).having(replica(0))
+    assert not Silent().due(with_silence(well, 0.5).observed, well.history)
+    assert len(Silent().due(with_silence(well, 0.7).observed, well.history)) == 1
+
+
+def test_an_answer_is_late_only_when_the_way_is_not_that_long() -> None:
+    """Over a satellite an answer takes 0.7 s, and nobody is asked about anything."""
+    far = World(spec()).having(replica(0))
+    assert not Silent().due(with_silence(far, 0.8, rtt_s=0.7).observed, far.history)
+    assert len(Silent().due(with_silence(far, 2.2, rtt_s=0.7).observed, far.history)) == 1
+
+
+def test_a_late_answer_changes_nothing_but_the_question() -> None:
+    """Whoever is merely late is planned for as if nothing were."""
+    well = World(spec()).having(replica(0), replica(1))
+    late = with_silence(well, 1.9)
+    plans = [plan(UID, w.spec, w.intent, w.observed, w.history) for w in (well, late)]
+    assert plans[0].launches == plans[1].launches
+    assert plans[0].terminations == plans[1].terminations == ()
+    assert plans[0].draining == plans[1].draining
+
+
+@given(st.lists(st.booleans(), min_size=900, max_size=900))
+def test_a_link_that_hesitates_ever_so_often_costs_few_questions(late: list[bool]) -> None:
+    """A quarter of an hour, in which each second's answer is late or is not."""
+    well = World(spec()).having(replica(0))
+    memory, asked = Silent(), 0
+    for second, is_late in enumerate(late):
+        now = with_silence(well, 0.9 if is_late else 0.0).observed
+        asked += len(memory.due(replace(now, now=well.now + second), well.history))
+    assert asked <= 5 + 900 / LONGEST_PAUSE_S
+
+
+def test_who_is_lost_after_a_doubt_is_asked_about_again_at_once() -> None:
+    well, silent = (World(spec()).having(replica(0, state=s)) for s in ("ready", "silent"))
+    memory = Silent()
+    doubted = replace(with_silence(well, 0.7).observed, now=well.now)
+    assert len(memory.due(doubted, well.history)) == 1
+    assert not memory.due(replace(doubted, now=well.now + 0.5), well.history)
+    lost = replace(silent.observed, now=well.now + 1.4)
+    assert len(memory.due(lost, silent.history)) == 1

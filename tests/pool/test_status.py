@@ -59,11 +59,15 @@ def test_the_digest_ignores_counters_and_sees_states() -> None:
     """A manager is woken by what matters, not by each request."""
     busy = {**REPORT, "links": [{**LINK, "won": 99, "in_flight": 5}]}
     down = {**REPORT, "links": [{**LINK, "state": "suspect"}]}
-    first, same, other = (proxy_report.parse(raw, UID) for raw in (REPORT, busy, down))
-    assert first is not None
-    assert same is not None
-    assert other is not None
-    assert first.digest() == same.digest() != other.digest()
+    late = {**REPORT, "links": [{**LINK, "silent_for_s": 0.7, "rtt_s": 0.01}]}
+    later = {**REPORT, "links": [{**LINK, "silent_for_s": 1.7, "rtt_s": 0.01}]}
+    digests = []
+    for raw in (REPORT, busy, down, late, later):
+        report = proxy_report.parse(raw, UID)
+        assert report is not None
+        digests.append(report.digest())
+    assert digests[0] == digests[1] != digests[2]
+    assert digests[0] != digests[3] == digests[4], "a late answer is told once"
 
 
 def tick_of(world: World) -> Tick:

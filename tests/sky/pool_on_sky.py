@@ -29,6 +29,7 @@ class PoolOnSky:
     Attributes:
         boots: Whether launches succeed by themselves; else the test says how they end.
         draining: Replicas whose server proxies ask to be left alone.
+        late: Replicas whose links are up, and for how many seconds a probe waits for its answer.
     """
 
     def __init__(self, folder: Path, *, replicas: int = 1, **spec: Any) -> None:
@@ -40,6 +41,7 @@ class PoolOnSky:
         identity = Identity("perception", UID, "sky", "/pool.yaml", self.scene.now)
         self.store = MemoryStore(identity, self.spec)
         self.draining: set[ReplicaId] = set()
+        self.late: dict[ReplicaId, float] = {}
         self.last: Tick | None = None
         self.manager = self._new_manager(1)
 
@@ -70,6 +72,10 @@ class PoolOnSky:
         return tuple(self._link(member.id) for member in members)
 
     def _link(self, id: ReplicaId) -> LinkReport:
+        if id in self.late:
+            return LinkReport(
+                id, LinkState.UP, frozenset({SERVICE.name}), silent_for_s=self.late[id], rtt_s=0.05
+            )
         cluster = self.sky.records.get(cluster_name(id))
         runs = any(i.id == id for i in self.scene.provider.found.values())
         if not runs or cluster is None or cluster.state is not ClusterState.UP:

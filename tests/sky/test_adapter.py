@@ -91,6 +91,22 @@ def test_the_list_of_clusters_is_asked_once_in_five_seconds(scene: Scene):
     assert len(scene.sky.asked("clusters")) - before <= 1
 
 
+def test_nobody_waits_for_a_list_that_is_a_little_old(scene: Scene):
+    """A loss must not wait behind SkyPilot: it is read on another thread, and soon awaited."""
+    scene.launched()
+    scene.machines()
+    scene.pass_s(10)
+    scene.sky.unreachable = True
+    before = len(scene.sky.asked("clusters"))
+    assert len(scene.machines()) == len(scene.machines()) == 1
+    assert len(scene.sky.asked("clusters")) == before, "not on the thread that asked"
+    scene.work(rounds=1)
+    assert len(scene.sky.asked("clusters")) == before + 1
+    scene.pass_s(10)
+    with pytest.raises(CloudUnreachable):
+        scene.machines()
+
+
 # -- refused, failed and hanging launches -----------------------------------------------------
 
 
@@ -278,7 +294,7 @@ def test_a_stopped_machine_has_failed(scene: Scene):
     scene.launched()
     record = scene.sky.records[NAME]
     scene.sky.records[NAME] = type(record)(NAME, ClusterState.STOPPED, EAST)
-    scene.pass_s(10)
+    scene.pass_s(20)
     assert scene.machine().phase is MachinePhase.FAILED
 
 
@@ -287,7 +303,7 @@ def test_a_running_replica_that_skypilot_no_longer_understands_is_left_to_its_li
     scene.launched()
     record = scene.sky.records[NAME]
     scene.sky.records[NAME] = type(record)(NAME, ClusterState.INIT, EAST, "10.0.0.9")
-    scene.pass_s(10)
+    scene.pass_s(20)
     assert scene.machine().phase is MachinePhase.RUNNING
 
 
@@ -296,7 +312,7 @@ def test_a_running_replica_that_skypilot_no_longer_understands_is_left_to_its_li
 
 def test_credentials_that_expire_while_running_take_nothing_away(scene: Scene):
     scene.launched()
-    scene.pass_s(10)
+    scene.pass_s(20)
     scene.sky.fail_next("clusters", CloudUnreachable("ExpiredToken"))
     with pytest.raises(CloudUnreachable):
         scene.machines()
@@ -402,7 +418,7 @@ def test_a_lost_database_of_skypilot_loses_no_machine(scene: Scene):
     scene.launched()
     endpoint = scene.machine().endpoint
     scene.sky.forget_everything()
-    scene.pass_s(10)
+    scene.pass_s(20)
     machine = scene.machine()
     assert machine.phase is MachinePhase.RUNNING
     assert machine.endpoint == endpoint
@@ -413,7 +429,7 @@ def test_a_lost_database_of_skypilot_loses_no_machine(scene: Scene):
 def test_a_provider_that_does_not_answer_leaves_a_missing_machine_unknown(scene: Scene):
     scene.launched()
     scene.sky.forget_everything()
-    scene.pass_s(10)
+    scene.pass_s(20)
     scene.provider.reachable = False
     with pytest.raises(CloudUnreachable):
         scene.machines()
@@ -423,7 +439,7 @@ def test_without_a_right_to_ask_the_provider_skypilots_word_has_to_do(scene: Sce
     scene.launched()
     scene.provider.allowed = False
     scene.sky.forget_everything()
-    scene.pass_s(10)
+    scene.pass_s(20)
     assert not scene.machines()
     assert "may not list" in scene.cloud.unverified("aws")
     assert "gcp" in scene.cloud.unverified("gcp")
@@ -484,7 +500,7 @@ def test_an_audit_of_a_pool_asks_the_provider_now_and_not_from_memory(scene: Sce
     scene.machines()
     scene.sky.forget_everything()
     scene.cloud._journal.close(ID)
-    scene.pass_s(10)
+    scene.pass_s(20)
     assert not scene.machines()
     assert [m.id for m in scene.cloud.audit(ID.pool_uid).machines] == [ID]
     assert scene.provider.asked_regions[-1] is None, "everywhere, not where it should be"

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from fogft.cloud.sky.naming import cluster_name, infra
+from fogft.cloud.sky.presence import PROVIDER_SURE_AFTER_S
 from fogft.cloud.sky.sdk import JobState
 from fogft.core.errors import CloudUnreachable
 from fogft.core.model import ReplicaId
@@ -32,6 +33,32 @@ def by_hand(pool: PoolOnSky) -> PoolOnSky:
     pool.tick(3)
     assert pool.ordered() == [infra(EAST)]
     return pool
+
+
+def test_a_preempted_vm_is_replaced_at_the_first_late_answer(pool: PoolOnSky):
+    """Before its link is suspect: the cloud says that it is gone. Elsewhere, and at once."""
+    pool.until(pool.ready)
+    pool.tick(int(PROVIDER_SURE_AFTER_S))
+    pool.sky.boots = False
+    pool.sky.preempt(FIRST)
+    pool.late = {replica(0, 1): 0.65}
+    pool.tick(2)
+    assert pool.ordered() == [infra(EAST), infra(WEST)]
+    pool.tick()
+    assert FIRST not in pool.sky.records, "the dead record is cleaned up"
+
+
+def test_late_answers_of_a_vm_that_runs_replace_nothing(pool: PoolOnSky):
+    """As when the robot's uplink is gone for half an hour: the cloud is asked, ever less often."""
+    pool.until(pool.ready)
+    pool.tick(int(PROVIDER_SURE_AFTER_S))
+    pool.late = {replica(0, 1): 1.9}
+    asked_before = len(pool.scene.provider.asked_regions)
+    pool.tick(1800)
+    assert pool.ordered() == [infra(EAST)]
+    assert pool.ready() == ["0.1"]
+    questions = len(pool.scene.provider.asked_regions) - asked_before
+    assert 2 <= questions <= 2 * 1800 / 60 + 20, "of these a census a minute"
 
 
 def test_no_capacity_goes_on_in_the_next_location_and_is_remembered(pool: PoolOnSky):

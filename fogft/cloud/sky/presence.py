@@ -22,6 +22,7 @@ from fogft.core.model import Machine, ReplicaId
 log = logging.getLogger(__name__)
 
 CLUSTERS_FRESH_S = 5.0
+CLUSTERS_USABLE_S = 15.0  # so long nobody waits for a newer list, which is under way
 PROVIDER_SURE_AFTER_S = 60.0  # a provider's list may miss a machine in its first seconds
 _ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
 
@@ -56,6 +57,7 @@ class Presence:
         self._port = port
         self._lock = threading.Lock()
         self._listed: tuple[float, Sequence[Cluster]] | None = None
+        self._listing = False
         self._gone: set[ReplicaId] = set()
 
     def machines(
@@ -143,12 +145,36 @@ class Presence:
         except CloudError as error:
             log.warning("record_not_dropped replica=%s reason=%r", id.short, error.message)
 
+    def _list_later(self) -> None:
+        """Read SkyPilot's list on another thread: it may be slow, and a loss does not wait for it.
+
+        What goes wrong there is told when the list that is known is too old to be used.
+        """
+        with self._lock:
+            if self._listing:
+                return
+            self._listing = True
+
+        def read() -> None:
+            try:
+                self.everywhere()
+            except CloudError as error:
+                log.info("list_not_renewed reason=%r", error.message)
+            finally:
+                with self._lock:
+                    self._listing = False
+
+        self._submit(read)
+
     def _clusters(self, pool_uid: str, *, fresh: bool = False) -> dict[ReplicaId, Cluster]:
         with self._lock:
             kept = self._listed
-        if fresh or kept is None or self._clock() - kept[0] >= CLUSTERS_FRESH_S:
+        age_s = float("inf") if kept is None else self._clock() - kept[0]
+        if fresh or kept is None or age_s >= CLUSTERS_USABLE_S:
             clusters = self.everywhere()
         else:
             clusters = kept[1]
+            if age_s >= CLUSTERS_FRESH_S:
+                self._list_later()
         named = ((replica_of(cluster.name), cluster) for cluster in clusters)
         return {id: cluster for id, cluster in named if id and id.pool_uid == pool_uid}

@@ -180,6 +180,8 @@ class Proof:
                 process.kill()
             except psutil.NoSuchProcess:
                 continue
+        self.cloud.close()
+        self.cloud = self.another_process()  # one that remembers no list
         with step("SkyPilot's API server is killed; until machines are listed again"):
 
             def listed() -> bool:
