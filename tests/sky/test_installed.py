@@ -19,7 +19,7 @@ from unittest import mock
 
 import pytest
 
-from fogft.cloud.sky import answers, task, template
+from fogft.cloud.sky import answers, guard, task, template
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
 from fogft.core.errors import CloudUnreachable
@@ -159,6 +159,44 @@ def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any,
         *("launch", "api_status", "api_cancel", "status", "job_status", "tail_logs"),
         *("tail_provision_logs", "down", "check", "stream_and_get", "get"),
     }
+
+
+@needs_skypilot
+def test_every_launch_asks_for_the_guard_once_after_the_users_own_commands(
+    real: tuple[InstalledSky, Any, Any], monkeypatch: pytest.MonkeyPatch
+):
+    """A request carries it to the API server, which writes it into the order on AWS."""
+    from sky import skypilot_config
+    from sky.server.requests.payloads import get_override_skypilot_config_from_client as carried
+
+    installed, silent, _ = real
+    silent.launch.return_value = "r1"
+    # As the functions of the SDK do, whose place is taken here.
+    monkeypatch.setattr("sky.utils.annotations.is_on_api_server", False)
+    before = skypilot_config.to_dict()
+    try:
+        skypilot_config.apply_cli_config(["aws.post_provision_runcmd=[echo mine]"])
+        for _ in range(2):
+            installed.launch({"run": "serve"}, "c")
+            asked = carried()["aws"]["post_provision_runcmd"]
+            assert asked == ["echo mine", guard.command()]
+        assert carried()["allowed_clouds"] == ["aws"], "all else is as it was"
+    finally:
+        skypilot_config._set_loaded_config(before)
+
+
+@needs_skypilot
+def test_the_guard_is_what_cloud_init_reads(home: Path):
+    """SkyPilot writes commands into its text for AWS as they are."""
+    import jinja2
+    import sky
+    import yaml
+
+    text = (Path(sky.__file__).parent / "templates" / "aws-ray.yml.j2").read_text()
+    start = text.index("{%- if runcmd %}")
+    part = text[start : text.index("TagSpecifications", start)]
+    written = jinja2.Template(part).render(runcmd=["echo mine", guard.command()])
+    assert yaml.safe_load(written) == {"runcmd": ["echo mine", guard.command()]}
 
 
 @needs_skypilot

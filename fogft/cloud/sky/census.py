@@ -102,7 +102,10 @@ class Census:
         """Return why a cloud's own list cannot be had; empty when it can. Asks for it: seconds."""
         provider = self._providers.get(cloud)
         if provider is None:
-            return f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word"
+            return (
+                f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word, and a VM "
+                "whose launch loses this computer and SkyPilot's API server runs until `fogft sweep`"
+            )
         try:
             self._ask(provider, None, NOBODY)
         except CloudUnreachable as error:

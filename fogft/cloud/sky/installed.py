@@ -10,12 +10,14 @@ import contextlib
 import copy
 import importlib
 import io
+import json
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from fogft.cloud.sky import guard
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
 from fogft.cloud.sky.calls import Calls
 from fogft.cloud.sky.sdk import Cluster, JobState, Request
@@ -49,6 +51,7 @@ class InstalledSky:
             sky, sdk = self._sky()
             with as_answer():
                 made = sky.Task.from_yaml_config(dict(task))
+            self._set_guard()
             return str(sdk.launch(made, cluster_name=name))
 
         return self._within(LAUNCH_LIMIT_S, f"the launch of `{name}`", run)
@@ -198,6 +201,18 @@ class InstalledSky:
             }
 
         return self._within(CHECK_LIMIT_S, "the check of credentials", run)
+
+    def _set_guard(self) -> None:
+        """Have SkyPilot give every VM of ours the guard, after the user's own commands.
+
+        A request carries this process's settings, to a server elsewhere too.
+        """
+        settings = importlib.import_module("sky.skypilot_config")
+        with self._lock:
+            given = list(settings.get_nested(guard.SETTING, []) or [])
+            if guard.command() not in given:
+                key, value = ".".join(guard.SETTING), json.dumps([*given, guard.command()])
+                settings.apply_cli_config([f"{key}={value}"])  # as `sky launch --config` does
 
     def _log(self, read: Callable[[io.StringIO], object]) -> str:
         out = io.StringIO()

@@ -1,4 +1,4 @@
-"""Find and read `templates/sky_task.yaml`, in a checkout or in an installed package."""
+"""Find and read what goes to a VM, in a checkout's `templates` or in an installed package's."""
 
 from __future__ import annotations
 
@@ -11,21 +11,34 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 
 
 def read() -> dict[str, Any]:
-    """Return the template of a replica's SkyPilot task.
+    """Return the template of a replica's SkyPilot task, `sky_task.yaml`.
 
     Raises:
         CloudError: The installation is incomplete, or the template was damaged.
     """
     import yaml
 
+    name = "sky_task.yaml"
+    try:
+        value = yaml.safe_load(read_text(name))
+    except yaml.YAMLError as error:
+        raise CloudError(f"fogft's own `templates/{name}` cannot be read: {error}") from error
+    if not isinstance(value, dict):
+        raise CloudError(f"fogft's own `templates/{name}` is not a task", "install fogft again")
+    return value
+
+
+def read_text(name: str) -> str:
+    """Return the text of a template.
+
+    Raises:
+        CloudError: The installation is incomplete.
+    """
     for folder in (_PACKAGE / "templates", _PACKAGE.parent / "templates"):
-        path = folder / "sky_task.yaml"
+        path = folder / name
         if path.is_file():
             try:
-                value = yaml.safe_load(path.read_text())
-            except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+                return path.read_text()
+            except (OSError, UnicodeDecodeError) as error:
                 raise CloudError(f"`{path}` cannot be read: {error}") from error
-            if isinstance(value, dict):
-                return value
-            raise CloudError(f"`{path}` is not a task")
-    raise CloudError("fogft's own `templates/sky_task.yaml` is missing", "install fogft again")
+    raise CloudError(f"fogft's own `templates/{name}` is missing", "install fogft again")

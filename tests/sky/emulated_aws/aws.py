@@ -68,18 +68,36 @@ class World:
         print(json.dumps(self.log[-1]), flush=True)
 
     def boot(self, instance: Any) -> None:
-        user, key = user_of(instance)
+        cloud_config = config_of(instance)
+        account = cloud_config["users"][0]
+        user, key = account["name"], account["ssh_authorized_keys"][0]
+        first = "\n".join(cloud_config.get("runcmd") or [])
         name = "f" + instance.id[-8:]
         with (IMAGE / f"{instance.id}.log").open("wb") as log:
             self.vms[instance.id] = subprocess.Popen(
                 ["bash", HERE / "vm.sh", name, instance.public_ip, IMAGE, IMAGE / "host", user, key,
-                 *HIDDEN],
+                 first, *HIDDEN],
                 stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
+        threading.Thread(target=self.watch, args=(instance,), daemon=True).start()
         spot = getattr(instance, "lifecycle", None) == "spot"
         self.say(
             "boot", id=instance.id, ip=instance.public_ip, zone=instance.placement.zone, spot=spot
         )
+
+    def watch(self, instance: Any) -> None:
+        """Notice when a VM has shut itself down: a spot one has ended then, another is stopped."""
+        with self.lock:
+            vm = self.vms.get(instance.id)
+        if vm is None:
+            return
+        vm.wait()
+        with self.lock:
+            by_itself = instance.id in self.vms
+        if by_itself:
+            self.say("shutdown", id=instance.id)
+            spot = getattr(instance, "lifecycle", None) == "spot"
+            self.end(instance.id) if spot else instance.stop()
 
     def kill(self, id: str) -> None:
         with self.lock:
@@ -98,24 +116,26 @@ class World:
         self.say("kill", id=id)
 
     def preempt(self, id: str) -> None:
+        self.say("preempt", id=id)
+        self.end(id)
+
+    def end(self, id: str) -> None:
         for _, backend, instance in all_instances():
             if instance.id == id and instance.state != "terminated":
-                self.say("preempt", id=id)
                 backend.terminate_instances([id])
 
 
 WORLD = World()
 
 
-def user_of(instance: Any) -> tuple[str, str]:
-    """Return the account and the key that SkyPilot asks cloud-init for."""
+def config_of(instance: Any) -> dict[str, Any]:
+    """Return what SkyPilot asks cloud-init for: an account with a key, and commands to run."""
     text = str(instance.user_data or "")
     for _ in range(3):  # encoded by boto3, and kept encoded by moto
         if text.startswith("#cloud-config"):
             break
         text = base64.b64decode(text).decode()
-    account = yaml.safe_load(text)["users"][0]
-    return account["name"], account["ssh_authorized_keys"][0]
+    return dict(yaml.safe_load(text))
 
 
 def all_instances() -> Iterator[tuple[str, Any, Any]]:

@@ -22,6 +22,10 @@ echo "ubuntu ALL=(ALL) NOPASSWD:ALL" >"$image/root/etc/sudoers.d/ubuntu"
 in_image ssh-keygen -A >/dev/null
 install -m755 /bin/true "$image/root/usr/local/bin/systemctl"  # these VMs have no systemd
 
+# Their first process is sshd: when it ends, the machine is down.
+printf '#!/bin/sh\nkill -TERM 1\n' >"$image/root/usr/local/bin/shutdown"
+chmod 755 "$image/root/usr/local/bin/shutdown"
+
 home=$image/root/home/ubuntu
 install -d "$home/.local/bin" "$home/.aws" "$image/root/opt/wheelhouse" "$image/root/etc/uv"
 install -m755 "$venv/bin/uv" "$home/.local/bin/uv"

@@ -145,3 +145,20 @@ def processes() -> list[str]:
         except OSError:
             continue
     return found
+
+
+def kill_server() -> None:
+    """Kill SkyPilot's API server with all that it has started, as when a robot's power is cut."""
+    import psutil
+
+    servers = [
+        process
+        for process in psutil.process_iter(["cmdline"])
+        if "sky.server.server" in " ".join(process.info["cmdline"] or ())
+    ]
+    assert servers
+    for process in [*servers, *(c for s in servers for c in s.children(recursive=True))]:
+        try:
+            process.kill()
+        except psutil.NoSuchProcess:
+            continue

@@ -21,6 +21,7 @@ from fogft.cloud.sky.adapter import SkyCloud
 from fogft.core.errors import CloudUnreachable
 from fogft.core.model import Machine, MachinePhase, Offer, ReplicaId
 from tests.sky.emulated_aws.emulation import Steps, control, running, until
+from tests.sky.emulated_aws.pool import kill_server
 from tests.sky.emulated_aws.under_contract import RESOURCES, adapter, stub_server
 
 UID = "00000000000000aa"
@@ -167,19 +168,7 @@ class Proof:
         assert [i["labels"]["fogft-slot"] for i in running()] == ["1"]
 
     def server_dies(self, b: ReplicaId) -> None:
-        import psutil
-
-        servers = [
-            process
-            for process in psutil.process_iter(["cmdline"])
-            if "sky.server.server" in " ".join(process.info["cmdline"] or ())
-        ]
-        assert servers
-        for process in [*servers, *(c for s in servers for c in s.children(recursive=True))]:
-            try:
-                process.kill()
-            except psutil.NoSuchProcess:
-                continue
+        kill_server()
         self.cloud.close()
         self.cloud = self.another_process()  # one that remembers no list
         with step("SkyPilot's API server is killed; until machines are listed again"):

@@ -1,14 +1,16 @@
 """VMs that nobody looks after any more end themselves, on unmodified SkyPilot.
 
-Runs inside a world (`world.sh`). Two pools, and two more things that only a VM can show:
+Runs inside a world (`world.sh`). Three pools, and two more things that only a VM can show:
 
 * `alone`: its image has ROS 2 at /opt/ros, and its replica dials the robot, so that no port is
   opened. It answers; then its manager is ended for good.
 * `hangs`: its `setup` never ends. Its manager is ended, too.
+* `unborn`: all of the robot ends when its VM has just been made: no job, no `autostop`.
 
-So is SkyPilot's API server: the robot is gone. Each VM has to find out by itself, and to ask the
-cloud to end it. To wait for minutes and not for hours, the template's five idle minutes are made
-one, and the limit of a set-up one minute; the change vanishes with the world.
+So does SkyPilot's API server: the robot is gone. Each VM has to find out by itself, and to ask the
+cloud to end it, or to shut itself down. To wait for minutes and not for hours, the template's five
+idle minutes are made one, the limit of a set-up one minute, and the one of a VM that no replica
+runs on four; the change vanishes with the world.
 """
 
 from __future__ import annotations
@@ -23,9 +25,21 @@ from typing import Any
 
 from tests.e2e.pool import Client
 from tests.sky.emulated_aws.emulation import Steps, control, disk_of, running, until
-from tests.sky.emulated_aws.pool import HOME, Pool, machine_of, open_ports, processes
+from tests.sky.emulated_aws.pool import (
+    HOME,
+    Pool,
+    kill_server,
+    machine_of,
+    open_ports,
+    processes,
+)
 
-TEMPLATE = Path(__file__).resolve().parents[3] / "templates" / "sky_task.yaml"
+TEMPLATES = Path(__file__).resolve().parents[3] / "templates"
+SHORTENED = (
+    ("sky_task.yaml", "idle_minutes: 5", "idle_minutes: 1"),
+    ("sky_task.yaml", "@SETUP_LIMIT_S@", "60"),
+    ("vm_guard.sh", "@ALONE_MINUTES@", "4"),
+)
 DOOR = "10.66.0.1:7460"  # where VMs find the robot
 ORPHAN_AFTER_S = 60
 ALONE = f"""\
@@ -64,16 +78,24 @@ fogft:
   services:
     - {name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}
 """
+UNBORN = """\
+name: unborn
+resources: {cpus: 2, use_spot: true, infra: aws/eu-west-1}
+run: exec python3 plan_service.py
+fogft:
+  replicas: 1
+  services:
+    - {name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}
+"""
 step = Steps()
 
 
 def make_impatient() -> None:
-    """Shorten the template's waits."""
-    text = TEMPLATE.read_text()
-    for old, new in (("idle_minutes: 5", "idle_minutes: 1"), ("@SETUP_LIMIT_S@", "60")):
+    """Shorten the templates' waits."""
+    for name, old, new in SHORTENED:
+        text = (TEMPLATES / name).read_text()
         assert old in text
-        text = text.replace(old, new)
-    TEMPLATE.write_text(text)
+        (TEMPLATES / name).write_text(text.replace(old, new))
 
 
 def up_and_left(pool: Pool) -> subprocess.Popen[bytes]:
@@ -115,7 +137,7 @@ def kill(pool: Pool) -> None:
 
 def main() -> int:
     make_impatient()
-    alone, hangs = Pool(ALONE), Pool(HANGS)
+    alone, hangs, unborn = Pool(ALONE), Pool(HANGS), Pool(UNBORN)
     alone.sky_api("start")
     with step("`up` with ROS 2 in the image and a replica that dials out, until it answers"):
         print(alone.fogft("up", str(alone.file), "--yes"))
@@ -134,20 +156,27 @@ def main() -> int:
     assert result["answered"] == result["requests"] > 10, result
     assert result["failed"] == result["wrong"] == result["twice"] == 0, result
     assert len(running()) == 2
-    kill(hangs)
-    kill(alone)
-    waiting.kill()
-    waiting.wait()
-    alone.sky_api("stop")
+    also_waiting = up_and_left(unborn)
+    with step("`up` of a third pool, until its VM exists"):
+        until("it exists", lambda: len(running()) == 3)
+    for pool in (unborn, hangs, alone):
+        kill(pool)
+    for one in (also_waiting, waiting):
+        one.kill()
+        one.wait()
+    kill_server()
     with step("manager and API server are gone: until the VM that hangs has ended itself"):
         until("it is gone", lambda: not of_pool(hangs))
     with step("... until the orphan has ended itself, too"):
         until("it is gone", lambda: not of_pool(alone))
-    assert not running()
+    with step("... until the VM that was never set up has shut itself down"):
+        until("it is gone", lambda: not running())
+    by_themselves = [e for e in control("/log", post=False) if e["event"] == "shutdown"]
+    assert len(by_themselves) == 1, by_themselves
     told = [e for e in control("/log", post=False) if e["event"] in ("preempt", "refused")]
     assert not told, told
     alone.sky_api("start")
-    for pool in (alone, hangs):
+    for pool in (alone, hangs, unborn):
         with step(f"`down` of `{pool.name}`, which finds nothing"):
             print(pool.fogft("down", pool.name))
     assert not list((HOME / "pools").glob("*"))

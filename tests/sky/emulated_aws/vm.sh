@@ -1,10 +1,11 @@
 #!/bin/bash
 # One VM: network, mount and process namespaces of its own over the baked image, with a real sshd
 # in the foreground. It ends, with all that runs in it, when this process is killed.
-# usage: vm.sh NAME ADDRESS IMAGE HOST_ROOT USER PUBLIC_KEY HIDDEN...
+# usage: vm.sh NAME ADDRESS IMAGE HOST_ROOT USER PUBLIC_KEY FIRST HIDDEN...
+#   FIRST  commands that root runs at the first boot, as cloud-init does
 set -euo pipefail
-name=$1 address=$2 image=$3 host_root=$4 user=$5 key=$6
-shift 6
+name=$1 address=$2 image=$3 host_root=$4 user=$5 key=$6 first=$7
+shift 7
 disk=$image/vm/$name
 mkdir -p "$disk/upper" "$disk/work" "$disk/root"
 ip netns add "$name"
@@ -17,8 +18,8 @@ ip -n "$name" route add default via 10.66.0.1  # the emulation: nothing is forwa
 # The outer shell must not be in the way of a kill: exec.
 exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
   bash -euc '
-    disk=$1 image=$2 host_root=$3 user=$4 key=$5 address=$6
-    shift 6
+    disk=$1 image=$2 host_root=$3 user=$4 key=$5 address=$6 first=$7
+    shift 7
     mount --make-rprivate /
     mount -t overlay overlay \
       -o "lowerdir=$image/layer:$host_root,upperdir=$disk/upper,workdir=$disk/work" "$disk/root"
@@ -36,7 +37,9 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
     install -d -m700 "home/$user/.ssh"
     echo "$key" >"home/$user/.ssh/authorized_keys"
     chown -R --reference="home/$user" "home/$user/.ssh"
-    exec env -i PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
+    path=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
+    env -i PATH="$path" chroot . sh -c "$first" >/dev/null 2>&1 || echo "a first command failed"
+    exec env -i PATH="$path" \
       chroot . /usr/sbin/sshd -D -e -o UsePAM=no -o PidFile=/run/sshd.pid \
       -o SetEnv=AWS_ENDPOINT_URL=http://10.66.0.1:5566  # where a VM that ends itself finds AWS
-  ' vm "$disk" "$image" "$host_root" "$user" "$key" "$address" "$@"
+  ' vm "$disk" "$image" "$host_root" "$user" "$key" "$address" "$first" "$@"
