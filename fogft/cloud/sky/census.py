@@ -103,8 +103,9 @@ class Census:
         provider = self._providers.get(cloud)
         if provider is None:
             return (
-                f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word, and a VM "
-                "whose launch loses this computer and SkyPilot's API server runs until `fogft sweep`"
+                f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word, and a "
+                "VM whose launch loses this computer and SkyPilot's API server runs until "
+                "`fogft sweep`"
             )
         try:
             self._ask(provider, None, NOBODY)
