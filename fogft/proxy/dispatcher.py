@@ -49,6 +49,7 @@ _BLAMELESS_REFUSALS = frozenset(
     {
         Refusal.LOST,
         Refusal.SUPERSEDED,
+        Refusal.TOO_SLOW,
         Refusal.NOT_READY,
         Refusal.OVERLOADED,
         Refusal.NOT_ADMITTED,

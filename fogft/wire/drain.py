@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fogft.wire.carried import Carried
+
 # A frozen peer's kernel acknowledges probes and small requests; only more than these is a queue.
 BULK_BYTES = 16 << 10
 # Less than that in one look is no flow: probes' answers are a few hundred bytes.
@@ -37,9 +39,14 @@ class Flow:
 
 
 class Drain:
-    """Of one connection. Times are monotonic seconds."""
+    """Of one connection. Times are monotonic seconds.
+
+    Attributes:
+        carried: What it was seen to carry over some time.
+    """
 
     def __init__(self) -> None:
+        self.carried = Carried()
         self._last: Flow | None = None
         self._last_at = 0.0
         self._progress_at: float | None = None  # None: nothing is outstanding
@@ -74,7 +81,9 @@ class Drain:
         moved = flow.acknowledged - last.acknowledged
         sending = sending_for_s >= since_s
         queued = sending or last.outstanding >= BULK_BYTES
-        if sending or (queued and flow.outstanding >= BULK_BYTES):
+        full = sending or (queued and flow.outstanding >= BULK_BYTES)
+        self.carried.look(moved, since_s, now, queued=full)
+        if full:
             self._measured(moved / since_s)
         if (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES:
             waited_s, self._waited_s = self._waited_s, 0.0

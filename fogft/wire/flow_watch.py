@@ -38,6 +38,10 @@ class FlowWatch:
         rate = self._drain.bytes_per_s
         return rate is not None and rate < THIN_BYTES_PER_S
 
+    def carries_bytes_per_s(self, now: float) -> float | None:
+        """What it was lately seen to carry; None where that is not known."""
+        return self._drain.carried.bytes_per_s(now)
+
     def look(self, now: float, sending_for_s: float = 0.0) -> float:
         """Look once; return for how many of the last seconds large things moved."""
         connection = self._socket.borrow()

@@ -127,6 +127,7 @@ class Refusal:
     CANCELLED = "cancelled"  # dropped, because the robot had its answer from elsewhere
     LATE = "late"  # it was run, but the robot had its answer from elsewhere
     SUPERSEDED = "superseded"  # made locally: a newer request took its place before it was sent
+    TOO_SLOW = "too-slow"  # made locally: over this link it would not have arrived in time
     LOST = "lost"  # made locally: the link died before an answer came
 
 

@@ -37,6 +37,10 @@ class SendQueue:
         """How many wait."""
         return self._turns.qsize()
 
+    def overtakes(self, service: str) -> bool:
+        """Whether what comes last of a service goes first."""
+        return service in self._waiting
+
     def put(self, attempt: OpenAttempt | None) -> None:
         """Let an attempt wait; None ends the sender when all before it was taken."""
         waiting = self._waiting.get(attempt.service) if attempt is not None else None

@@ -26,6 +26,8 @@ from fogft.wire.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer, 
 from fogft.wire.ways import PLAIN_WAYS, Ways
 
 _ANSWERED_KEPT = 1024
+# Another uplink may do.
+_ELSEWHERE = frozenset({Refusal.LOST, Refusal.TOO_SLOW})
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 
 
@@ -193,7 +195,8 @@ class UplinksLink:
             attempt.on.discard(index)
             if answer.payload is None and attempt.on:
                 return  # it is under way elsewhere
-            again = answer.payload is None and answer.refusal == Refusal.LOST and not self._closed
+            elsewhere = answer.payload is None and answer.refusal in _ELSEWHERE
+            again = elsewhere and not self._closed
             if again:
                 self._again.append(answer.request_id)
         if again:

@@ -29,6 +29,7 @@ from fogft.wire.compression import Compression
 from fogft.wire.credit import Credit
 from fogft.wire.diagnosis import wrong_name
 from fogft.wire.flow_watch import FlowWatch
+from fogft.wire.in_time import InTime
 from fogft.wire.leaving import see_off
 from fogft.wire.link_window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.wire.port import Answer, Peer, Refusal
@@ -148,6 +149,7 @@ class Connection:
         except BaseException:
             _close_aside(self._session, peer)
             raise
+        self._in_time = InTime(self.flow.carries_bytes_per_s, self._compression)
         self._thread = threading.Thread(
             target=self._run, name=f"fogft-send-{peer.id.short}", daemon=True
         )
@@ -173,6 +175,8 @@ class Connection:
         attempt = OpenAttempt(
             service, key, request_id, payload, offered=now, remaining_s=remaining_s
         )
+        if not self._in_time.may_arrive(attempt, remaining_s, now, partial(self._before, service)):
+            return False
         if not self.window.admit(attempt) and not self._displace(attempt):
             return False
         mark = self._credit.take(attempt.size)
@@ -183,6 +187,15 @@ class Connection:
             attempt.mark = mark
             self._send_or_lose(attempt)
         return True
+
+    def _before(self, service: str) -> list[OpenAttempt]:
+        """Return what leaves before an attempt that comes now."""
+        if self._queue.overtakes(service):
+            return []
+        return [one for one in self.window.attempts() if one.payload is not None]
+
+    def _compression(self, service: str) -> Compression | None:
+        return self._compressions.get(service) if self.packs else None
 
     def _displace(self, attempt: OpenAttempt) -> bool:
         """Let a newer attempt in for the stalest unsent one, where its service wants that."""
@@ -264,6 +277,9 @@ class Connection:
         if remaining_s <= 0:
             self._end(attempt, None, Refusal.LOST)
             return
+        if not self._in_time.may_arrive(attempt, remaining_s, time.monotonic()):
+            self._end(attempt, None, Refusal.TOO_SLOW)
+            return
         attempt.payload = None
         large = attempt.size >= LARGE_BYTES
         turn = self._turns.take() if large else None
@@ -286,9 +302,9 @@ class Connection:
             self._on_large()
 
     def _get(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
-        compression = self._compressions.get(attempt.service)
+        compression = self._compression(attempt.service)
         packed = None
-        if self.packs and compression is not None:
+        if compression is not None:
             packed = compression.pack(payload, self.flow.bytes_per_s)
         self._session.get(
             attempt.key,
@@ -302,7 +318,7 @@ class Connection:
                 remaining_s,
                 self._origin,
                 packed=packed is not None,
-                may_pack=self.packs and self.flow.thin and compression is not None,
+                may_pack=self.flow.thin and compression is not None,
             ),
             timeout=self._timers[attempt.service].timeout_s(remaining_s, time.monotonic()),
             target=_ALL,

@@ -126,9 +126,7 @@ def test_a_robot_on_a_thin_cable_does_not_delay_another(authority: Authority, ne
     net.join(healthy_at, "10.83.2.1", replica_at, "10.83.2.2")
     net.limit(replica_at, far, MBIT)
     with inside(replica_at):
-        replica = ReplicaProcess(
-            authority.replica(), endpoint="0.0.0.0:7447", reply_bytes=MEGABYTE
-        )
+        replica = ReplicaProcess(authority.replica(), endpoint="0.0.0.0:7447", reply_bytes=MEGABYTE)
     replica.endpoint = "10.83.2.2:7447"
     try:
         alone, beside = compare(

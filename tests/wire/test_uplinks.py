@@ -94,6 +94,20 @@ def test_prefer_goes_back_and_failover_does_not():
         assert scene.counts() == expected, policy
 
 
+def test_what_is_too_slow_on_one_uplink_goes_out_on_the_other():
+    """It ends as lost where no uplink takes it any more, so that another replica is asked."""
+    scene = Scene("failover")
+    assert scene.offer()
+    scene.uplinks[0].room = 1
+    scene.end(0, refusal=Refusal.TOO_SLOW)
+    scene.link.flush()
+    assert (scene.counts(), scene.owner.answers) == ([1, 1], [])
+    scene.uplinks[1].room = 1
+    scene.end(1, refusal=Refusal.TOO_SLOW)
+    scene.link.flush()
+    assert [a.refusal for a in scene.owner.answers] == [LOST]
+
+
 def test_what_was_on_a_lost_uplink_goes_out_on_the_other():
     """The owner hears nothing of it, but that it shall flush: an event may send nothing."""
     scene = Scene("prefer")
