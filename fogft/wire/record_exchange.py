@@ -57,12 +57,13 @@ class Connection:
             RecordError: Something else came.
             asyncio.TimeoutError: Nothing came for `SILENCE_S`.
         """
-        while True:
+        found = list(self._unframer.feed(b""))  # what came along with a greeting
+        while not found:
             data = await asyncio.wait_for(self._reader.read(_READ_BYTES), SILENCE_S)
             if not data:
                 return []
-            if found := list(self._unframer.feed(data)):
-                return found
+            found = list(self._unframer.feed(data))
+        return found
 
     def abort(self) -> None:
         """End it at once."""

@@ -35,14 +35,18 @@ _GREETING_PREFIX = b"fogft caller 1\n"  # so that no other signature is good for
 
 
 class Unframer:
-    """Cuts a stream of bytes into messages."""
+    """Cuts a stream of bytes into messages.
+
+    Attributes:
+        limit: The longest message that is read, in bytes.
+    """
 
     def __init__(self, limit: int = FRAME_LIMIT) -> None:
-        self._limit = limit
+        self.limit = limit
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[dict[str, Any]]:
-        """Yield the messages that are complete now.
+        """Yield the messages that are complete now; what is not taken stays for the next call.
 
         Raises:
             RecordError: The stream is no such stream; it cannot go on.
@@ -50,14 +54,14 @@ class Unframer:
         self._buffer += data
         while len(self._buffer) >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._buffer)
-            if length > self._limit:
+            if length > self.limit:
                 raise RecordError("malformed", f"a frame of {length} bytes")
             end = _LENGTH.size + length
             if len(self._buffer) < end:
                 return
             content = bytes(self._buffer[_LENGTH.size : end])
             del self._buffer[:end]
-            yield read_json(content, self._limit)
+            yield read_json(content, self.limit)
 
 
 def frame(message: dict[str, Any]) -> bytes:

@@ -155,7 +155,7 @@ class RendezvousServer:
             nonce = secrets.token_bytes(frames.NONCE_BYTES)
             transport.write(frames.challenge(nonce, host))
             unframer = frames.Unframer(limit=16 << 10)
-            message = await _one_message(reader, unframer)
+            message = await _first_message(reader, unframer)
             certificate, signature = frames.read_greeting(message)
             caller = self._verify(
                 certificate, signature, frames.proof_bytes(PURPOSE, nonce, binding)
@@ -165,7 +165,8 @@ class RendezvousServer:
             transport.abort()
             raise
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
-        return Connection(reader, writer, frames.Unframer(), caller.common_name)
+        unframer.limit = frames.FRAME_LIMIT  # for one who has proved who he is
+        return Connection(reader, writer, unframer, caller.common_name)
 
     def _check(self, caller: Writer) -> None:
         if caller.role not in CALLERS or not caller.common_name.endswith(
@@ -229,17 +230,14 @@ def binding_of(certificate: bytes) -> bytes:
     return hashlib.sha256(certificate).digest()
 
 
-async def _one_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
-    """Return one message, behind which nothing may have come yet.
+async def _first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
+    """Return the first message; what came along with it stays in the unframer.
 
     Raises:
         RecordError: Something else came.
         EOFError: Nothing came.
     """
     while data := await reader.read(16 << 10):
-        found = list(unframer.feed(data))
-        if len(found) > 1:
-            raise RecordError("malformed", "more than a greeting")
-        if found:
-            return found[0]
+        for message in unframer.feed(data):
+            return message
     raise EOFError("the caller left without a greeting")

@@ -178,7 +178,7 @@ def test_no_request_fails_while_the_rendezvous_is_away(pool, call, how):
 
 
 def test_a_robot_starts_again_while_the_rendezvous_is_away(pool, call):
-    """From the records on its own disk; and so does a replica's server proxy."""
+    """From the records on its own disk; `test_restart_from_cache` shows it of all proxies."""
     pool.make_replica(0)
     pool.admit((0, 1))
     robot = pool.make_robot("ada")

@@ -63,12 +63,17 @@ class Scene:
 
     def greeted(self, files: Files, *, purpose: str = PURPOSE) -> ssl.SSLSocket:
         """Return a connection on which this one has said who it is."""
+        link, greeting = self.greeting(files, purpose)
+        link.sendall(greeting)
+        return link
+
+    def greeting(self, files: Files, purpose: str = PURPOSE) -> tuple[ssl.SSLSocket, bytes]:
+        """Return a connection, and what is to be said there first."""
         link = self.tls()
         nonce, _ = frames.read_challenge(next(iter(frames.Unframer().feed(link.recv(4096)))))
         binding = binding_of(link.getpeercert(binary_form=True))
         proof = Signer(files.certificate, files.key)(frames.proof_bytes(purpose, nonce, binding))
-        link.sendall(frames.greeting(*proof))
-        return link
+        return link, frames.greeting(*proof)
 
     def unchanged(self) -> bool:
         """Whether it lives, knows what it knew, and still serves newcomers."""
@@ -282,6 +287,25 @@ def test_a_member_that_says_odd_things_is_cut_off(scene, message):
 def _ask_for_ever(link: ssl.SSLSocket) -> None:
     while True:
         link.sendall(frames.have({}) * 500)
+
+
+@pytest.mark.parametrize("split", [0, 3, 30])
+def test_what_comes_along_with_a_greeting_is_heard(scene, split):
+    """Callers await no answer to their greeting: on a busy machine all is read at once.
+
+    The second part comes a little later only so that there may be two reads; either will do.
+    """
+    link, greeting = scene.greeting(scene.authority.robot("hasty"))
+    data = greeting + frames.have({}) * 2
+    with link:
+        link.sendall(data[: len(data) - split])
+        link.sendall(data[len(data) - split :])
+        unframer, found = frames.Unframer(), []
+        while not found:
+            data = link.recv(4096)
+            assert data, "it hung up"
+            found = [m for m in unframer.feed(data) if m["type"] == "records"]
+    assert scene.unchanged()
 
 
 def test_a_member_that_reads_nothing_is_let_go(scene):

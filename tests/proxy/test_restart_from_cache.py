@@ -1,0 +1,133 @@
+"""Every proxy starts again from the records on its own disk while no rendezvous is there.
+
+Robots, a gateway and a server proxy as processes, without ROS. None is told anything but where
+the rendezvous is: who is in, who goes through whom, which doors a replica has to dial, and who
+is revoked stands in records only.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fogft.child import tied
+from fogft.core import names
+from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.records import RecordKind
+from fogft.core.roster import admission_content
+from fogft.core.topology import Gateway, Topology
+from fogft.wire import record_cache
+from tests.proxy.gateway_pool import ROOT, GatewayPool, Process
+from tests.wire.rendezvous_pool import Party, Rendezvous, free_port, manager_files
+from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, wait_for
+
+pytestmark = pytest.mark.timeout(180)
+
+LIMIT_S = 90.0
+ID = ReplicaId(POOL_UID, 0, 1)
+EVE = names.robot_certificate_name(POOL_UID, "eve")
+
+
+class Replica:
+    """A server proxy that dials doors of which it can know from records only."""
+
+    def __init__(self, pool: GatewayPool, meeting: str) -> None:
+        self.endpoint = f"127.0.0.1:{free_port()}"
+        self._log = pool.folder / "replica.log"
+        self._config = pool.folder / "replica.yaml"
+        files = pool.authority.replica(0)
+        self._config.write_text(
+            f'pool: p\npool_uid: "{POOL_UID}"\nslot: 0\ngeneration: 1\nlisten: {self.endpoint}\n'
+            f"notice: none\nservices: [{{name: {SERVICE}, type: {TYPE}}}]\n"
+            f"run: 0 {pool.folder / 'ran'}\ndial_out: ['127.0.0.1:1']\n{meeting}"
+            f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
+        )
+        self.start()
+
+    def start(self) -> None:
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(
+                tied([sys.executable, "-m", "tests.proxy.plain_replica", str(self._config)]),
+                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+class Scene:
+    """One replica that dials out; `ada` behind gateway `edge`, `bob` by himself."""
+
+    def __init__(self, folder: Path) -> None:
+        self.pool = pool = GatewayPool(folder)
+        self.rendezvous = Rendezvous(pool.authority, "a")
+        self.manager = Party(manager_files(pool.authority), self.rendezvous.endpoint)
+        at, door = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
+        topology = Topology((Gateway("edge", at, (), (1,)),), {"ada": ("edge",)})
+        admitted = Membership("p", POOL_UID, 2, 1, (Member(ID, ""),), topology=topology)
+        say = self.manager.client.publish
+        say(RecordKind.ADMISSION, "", 2, admission_content(admitted), sequence=1)
+        say(RecordKind.REVOCATION, "", 2, {"names": [EVE]})
+        self.replica = Replica(pool, self._meeting("replica"))
+        edge = pool.gateway("edge", listen=at, extra=self._meeting("edge") + self._door())
+        self.ada = pool.robot("ada", extra=self._meeting("ada"))
+        self.bob = pool.robot("bob", extra=self._meeting("bob") + self._door(door), first=1_000_000)
+        self.proxies: tuple[Process | Replica, ...] = (self.replica, edge, self.ada, self.bob)
+
+    def _meeting(self, stem: str) -> str:
+        return f"rendezvous: ['{self.rendezvous.endpoint}']\nrecords: {stem}-records.json\n"
+
+    def _door(self, at: str = "") -> str:
+        at = at or f"127.0.0.1:{free_port()}"
+        return f"dial_in: {at}\ndial_in_listen: {at}\n"
+
+    def cached(self, stem: str) -> int:
+        """Return how many records a proxy has on its disk."""
+        return len(record_cache.read(self.pool.folder / f"{stem}-records.json"))
+
+    def serve(self) -> bool:
+        """Whether both robots are answered, each request by its own answer."""
+        for robot in (self.ada, self.bob):
+            wait_for(robot.ready, LIMIT_S)
+            robot.ask(20)
+            robot.all_right()
+        return True
+
+    def close(self) -> None:
+        self.manager.client.close()
+        self.pool.close()
+        self.replica.kill()
+        self.rendezvous.kill()
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    made = Scene(tmp_path)
+    yield made
+    made.close()
+
+
+def test_every_proxy_starts_again_while_no_rendezvous_is_there(scene):
+    """All are killed and started anew: answers flow, and whoever was revoked stays out.
+
+    Records are six: admission, revocation, the slot's, the gateway's, and two robots'.
+    """
+    assert scene.serve()
+    stems = ("replica", "edge", "ada", "bob")
+    wait_for(lambda: all(scene.cached(stem) == 6 for stem in stems), LIMIT_S)
+    scene.manager.client.close()
+    scene.rendezvous.kill()
+    for proxy in scene.proxies:
+        proxy.kill()
+    for proxy in scene.proxies:
+        proxy.start()
+    assert scene.serve()
+    eve = scene.pool.robot("eve")
+    scene.pool._members[0] = Member(ID, scene.replica.endpoint)
+    scene.pool.publish()
+    wait_for(lambda: "our certificate is revoked" in str(eve.tell()["report"]["links"]), LIMIT_S)
