@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -126,6 +127,63 @@ class Pool:
                 os.kill(pid, signal.SIGKILL)
             except ProcessLookupError:
                 continue
+
+
+class Machine:
+    """Another machine of a pool: a home and a ROS domain of its own, set up by `fogft join`.
+
+    Args:
+        pool: Whose.
+        role: Of the bundle that is issued for it.
+        name: Of its holder.
+        domain: Its ROS domain; None for the pool's.
+    """
+
+    def __init__(self, pool: Pool, role: str, name: str, domain: int | None = None) -> None:
+        self.environ = {**pool.environ, "FOGFT_HOME": str(pool.folder / name)}
+        if domain is not None:
+            self.environ["ROS_DOMAIN_ID"] = str(domain)
+        self._folder = pool.folder
+        secret = pool.folder / "secret"
+        secret.write_text("a passphrase that nobody knows\n")
+        given = ("--passphrase-file", str(secret))
+        bundle = pool.fogft("credentials", "issue", role, name, *given).strip()
+        joined = subprocess.run(
+            [sys.executable, "-m", "fogft", "join", bundle, *given],
+            env=self.environ, cwd=pool.folder, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert joined.returncode == 0, joined.stderr
+        self.config = Path(joined.stdout.strip())
+        self.command = self.config.stem if role != "robot" else "proxy"
+        self.log = self.config.with_suffix(".log")
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def configure(self, **values: str) -> None:
+        """Change keys of its configuration that stand at the beginning of a line."""
+        lines = self.config.read_text().splitlines()
+        for key, value in values.items():
+            (at,) = [n for n, line in enumerate(lines) if line.startswith(f"{key}:")]
+            lines[at] = f"{key}: {value}"
+        self.config.write_text("\n".join(lines) + "\n")
+
+    def start(self) -> None:
+        """Start what the bundle was for."""
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "fogft", self.command, "--config", str(self.config)],
+                env=self.environ, cwd=self._folder, stdout=log, stderr=log,
+            )  # fmt: skip
+
+    def report(self) -> dict[str, Any]:
+        """Return what it reports; nothing before it does."""
+        with contextlib.suppress(OSError, ValueError):
+            return dict(json.loads((self.config.parent / "proxy-status.json").read_text()))
+        return {}
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
 
 
 class Client:

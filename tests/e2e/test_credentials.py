@@ -2,63 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.e2e.pool import Client, Pool
+from tests.e2e.pool import Client, Machine, Pool
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
-
-
-class Joined:
-    """A robot of its own home and ROS domain, set up by `fogft join`."""
-
-    def __init__(self, pool: Pool, name: str, domain: int) -> None:
-        self.environ = {
-            **pool.environ,
-            "FOGFT_HOME": str(pool.folder / name),
-            "ROS_DOMAIN_ID": str(domain),
-        }
-        secret = pool.folder / "secret"
-        secret.write_text("a passphrase that nobody knows\n")
-        given = ("--passphrase-file", str(secret))
-        bundle = pool.fogft("credentials", "issue", "robot", name, *given).strip()
-        joined = subprocess.run(
-            [sys.executable, "-m", "fogft", "join", bundle, *given],
-            env=self.environ, cwd=pool.folder, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        self.config = Path(joined.stdout.strip())
-        self.log = self.config.with_suffix(".log")
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "fogft", "proxy", "--config", str(self.config)],
-                env=self.environ, cwd=pool.folder, stdout=log, stderr=log,
-            )  # fmt: skip
-
-    def links(self) -> list[dict]:
-        with contextlib.suppress(OSError, ValueError):
-            return json.loads((self.config.parent / "proxy-status.json").read_text())["links"]
-        return []
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
 
 
 @pytest.fixture
 def ada(pool, ros_domains):
     pool.write(replicas=2)
     pool.up()
-    joined = Joined(pool, "ada", ros_domains())
+    joined = Machine(pool, "robot", "ada", ros_domains())
+    joined.start()
     yield joined
-    joined.close()
+    joined.kill()
+
+
+def links(machine: Machine) -> list[dict]:
+    return machine.report().get("links", [])
 
 
 def flawless(result: dict) -> bool:
@@ -72,7 +38,7 @@ def generations(pool: Pool) -> list[str]:
 
 def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
     """Both robots use both replicas; then keys change twice over, and ada is shut out."""
-    pool.wait(lambda: [link["state"] for link in ada.links()] == ["up", "up"])
+    pool.wait(lambda: [link["state"] for link in links(ada)] == ["up", "up"])
     first = pool.client(120, 20)
     second = Client(ada.environ, 6, 20, 12.0)
     result = second.result()
@@ -81,9 +47,9 @@ def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
     os.kill(ada.process.pid, signal.SIGSTOP)  # a frozen robot holds nobody up
     assert "is taken back" in pool_said(pool, "credentials", "rotate", "robot")
     os.kill(ada.process.pid, signal.SIGCONT)
-    pool.wait(lambda: [link["state"] for link in ada.links()] == ["up", "up"])
+    pool.wait(lambda: [link["state"] for link in links(ada)] == ["up", "up"])
     pool.fogft("credentials", "revoke", "robot", "ada")
-    pool.wait(lambda: {link["detail"] for link in ada.links()} == {"our certificate is revoked"})
+    pool.wait(lambda: {link["detail"] for link in links(ada)} == {"our certificate is revoked"})
     pool.fogft("credentials", "rotate", "replica")
     pool.wait(lambda: generations(pool) == ["2", "2"])
     result = first.finish()
@@ -100,7 +66,7 @@ def pool_said(pool: Pool, *words: str) -> str:
     return pool.fogft(*words, ok=False)
 
 
-def secrets_told(pool: Pool, ada: Joined) -> list[str]:
+def secrets_told(pool: Pool, ada: Machine) -> list[str]:
     """Return where a key or the passphrase stands that is no key's own file (0600)."""
     files = [path for path in pool.folder.rglob("*") if path.is_file() and path.name != "secret"]
     keys = [path for path in files if path.suffix == ".key"]

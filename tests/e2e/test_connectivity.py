@@ -1,0 +1,92 @@
+"""A whole pool of several machines: a rendezvous, two gateways, replicas that nobody can reach."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from tests.e2e.pool import Machine, Pool
+from tests.wire.rendezvous_pool import free_port
+
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
+
+GATEWAYS = ("east", "west")
+
+
+@pytest.fixture
+def machines() -> Iterator[dict[str, Machine]]:
+    """Other machines of the pool, by name; ended with the test."""
+    made: dict[str, Machine] = {}
+    yield made
+    for machine in made.values():
+        machine.kill()
+
+
+def local() -> str:
+    return f"127.0.0.1:{free_port()}"
+
+
+def passed(machine: Machine) -> int:
+    """Return how many requests a gateway has passed on."""
+    return int(machine.report().get("forwarded", {}).get("passed", 0))
+
+
+def drawn(pool: Pool) -> str:
+    """Return the tree that `fogft status` draws."""
+    return pool.fogft("status").partition("TOPOLOGY\n")[2]
+
+
+def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines):
+    """Robot to one of two gateways, which the replicas dial; the one in use dies under load.
+
+    Who is where is learned from the rendezvous alone: the pool file names no replica's address,
+    and no replica has one.
+    """
+    meeting, at = local(), {name: local() for name in GATEWAYS}
+    listed = ", ".join(f"{{name: {name}, endpoint: '{at[name]}'}}" for name in GATEWAYS)
+    pool.write(
+        replicas=2,
+        more=f"  rendezvous: ['{meeting}']\n  dial_in: {local()}\n"
+        f"  topology: {{gateways: [{listed}], through: [{', '.join(GATEWAYS)}]}}\n",
+    )
+    up = subprocess.Popen(
+        [sys.executable, "-m", "fogft", "up", str(pool.file), "--yes"],
+        env=pool.environ, cwd=pool.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True,
+    )  # fmt: skip
+    pool.wait((pool.folder / "home" / "pools" / "e2e" / "status.json").exists)
+    machines["meet"] = Machine(pool, "rendezvous", "meet")
+    machines["meet"].configure(listen=meeting)
+    machines["meet"].start()
+    for name in GATEWAYS:
+        door = local()
+        machines[name] = Machine(pool, "gateway", name)
+        machines[name].configure(listen=at[name], dial_in=door, dial_in_listen=door)
+        machines[name].start()
+    said = up.communicate(timeout=120)[0]
+    assert up.returncode == 0, said
+    pool.wait(lambda: pool.ready() == 2 and drawn(pool).count(" up ") == len(GATEWAYS))
+    client = pool.client(120, 25)
+    pool.wait(lambda: sum(passed(machines[name]) for name in GATEWAYS) > 25)
+    used = max(GATEWAYS, key=lambda name: passed(machines[name]))
+    (other,) = set(GATEWAYS) - {used}
+    before = passed(machines[other])
+    machines[used].kill()
+    pool.wait(lambda: passed(machines[other]) > before + 25)
+    tree = pool.wait(lambda: (tree := drawn(pool)).count(" up ") == 1 and tree).splitlines()
+    result = client.finish()
+    assert result["requests"] > 50
+    assert result["failed"] == result["wrong"] == result["twice"] == 0, result
+    assert tree[0].startswith("robot ")
+    for line, mark, name in zip(tree[1:5:2], "├└", GATEWAYS, strict=True):
+        assert line.startswith(f"{mark}─ gateway {name}  {at[name]}  "), line
+        assert (" up" in line) == (name == other)
+    report = json.loads((pool.folder / "home" / "pools" / "e2e" / "proxy-status.json").read_text())
+    assert {link["through"] for link in report["links"]} == {other}
+    assert machines[other].report()["door"]["tunnels"] >= 2
+    pool.fogft("down")
+    assert pool.left() == {}
