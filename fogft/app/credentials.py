@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from fogft.core.holders import Holder, Role
 from fogft.pool.paths import PoolPaths, home
 
 if TYPE_CHECKING:
-    from fogft.pool.joining import Joined
+    from fogft.pool.joining import Issued, Joined
     from fogft.pool.ledger import Entry
 
 PUBLISH_LIMIT_S = 10.0
@@ -33,11 +34,12 @@ def certificates(pool: str) -> Sequence[Entry]:
 
 def issue(
     pool: str, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
-) -> tuple[Holder, Path]:
+) -> tuple[Issued, Path]:
     """Write a join bundle for the next generation of a holder; return both.
 
     Raises:
-        CredentialError: The name or the passphrase will not do, or the CA cannot be used.
+        CredentialError: The name or the passphrase will not do, the CA cannot be used, or
+            whoever joined would find nobody.
         FogftError: The file exists, or there is no such pool.
     """
     from fogft.pool import joining
@@ -45,17 +47,22 @@ def issue(
     file = out or Path(f"{name}.join")
     if file.exists():
         raise FogftError(f"`{file}` exists", "choose another name with `--out`")
-    holder, data = joining.issue(
+    issued = joining.issue(
         make_store(pool), role, name, passphrase, time.time(), open_for_s=open_for_s
     )
-    disk.write_whole(file, data)
-    return holder, file
+    disk.write_whole(file, issued.data)
+    return issued, file
 
 
 def join(file: Path, passphrase: str) -> Joined:
-    """Set this machine up from a join bundle, which is destroyed by it."""
+    """Set this machine up from a join bundle, which is destroyed by it.
+
+    Raises:
+        CredentialError: It is none, too old, or was used, here or elsewhere.
+    """
     from fogft.pool import joining
 
+    logging.getLogger("fogft.wire").addHandler(logging.NullHandler())  # an error says what matters
     disk.make_folder(home())
     return joining.join(file, passphrase, home(), time.time())
 

@@ -18,7 +18,7 @@ from fogft.cli import output
 from fogft.cli.complete import PoolOption
 from fogft.cli.sections import Command
 from fogft.core.errors import CredentialError, FogftError
-from fogft.core.holders import Role
+from fogft.core.holders import Holder, Role
 
 if TYPE_CHECKING:
     from fogft.pool.ledger import Entry
@@ -81,13 +81,16 @@ def issue(
 
     own = None if passphrase_file is None else _read_passphrase(passphrase_file)
     passphrase = own or bundle.new_passphrase()
-    holder, file = app.issue_credentials(
+    issued, file = app.issue_credentials(
         app.pool_name(pool), _role(role), name, out, passphrase, open_for_s=hours * 3600
     )
+    holder = issued.holder
     output.data(str(file))
     if own is None:
         output.say(f"passphrase: {passphrase}")
     output.done(f"{holder.role.value} `{holder.short}` may join for {hours:g} hours")
+    if issued.alone:
+        output.warn(_alone(holder))
     output.hint(f"copy `{file}` to the other machine, and run `fogft join {file.name}` there")
 
 
@@ -199,7 +202,8 @@ def join(
 ) -> None:
     """Set this machine up as a robot, gateway or replica of a pool, from one file.
 
-    The file is good for one time and destroyed. To give a robot new keys, join again with a
+    The file is good for one time, on one machine: where the pool has a rendezvous, that is asked,
+    so one has to run. Then the file is destroyed. To give a robot new keys, join again with a
     new bundle: a proxy that runs takes them into use without losing a request.
 
     \b
@@ -216,7 +220,17 @@ def join(
     joined = app.join(bundle, _read_passphrase(passphrase_file))
     output.data(str(joined.config))
     output.done(f"this machine is {whom}")
+    if joined.alone:
+        output.warn(_alone(joined.holder))
     output.hint(f"start it with `fogft {joined.command} --config {joined.config}`")
+
+
+def _alone(holder: Holder) -> str:
+    return (
+        f"the pool has no rendezvous: {holder.role.value} `{holder.short}` knows the replicas that "
+        "there were when its bundle was made, and hears of none that come or move later; nor can "
+        "anybody tell whether a copy of the bundle is used on another machine"
+    )
 
 
 def _role(text: str) -> Role:

@@ -1,12 +1,13 @@
 """What is in a join bundle, and how it becomes a part of the pool on this machine.
 
 The bundle brings all that a proxy needs: configuration, certificate and key, the CA, and
-the membership as it was. It is used once: the file is destroyed when it has been opened,
-and a copy is refused here by its id. What was there for the same holder is replaced, file
-by file, with the certificate last: a proxy that runs takes it into use by itself.
+the membership as it was. It is used once: the file is destroyed when it has been opened, a
+copy is refused here by its id, and on other machines by what was said at the rendezvous.
+What was there for the same holder is replaced, file by file, with the certificate last: a
+proxy that runs takes it into use by itself.
 
 Owns: the content of bundles, and the folders of joined holders.
-Not here: sealing (`bundle`), which certificates there are (`ledger`).
+Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`claiming`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,8 +25,10 @@ from fogft import disk
 from fogft.core import membership as memberships
 from fogft.core.errors import CredentialError, FogftError
 from fogft.core.holders import Holder, Role
+from fogft.core.membership import Found
 from fogft.core.model import ReplicaId
-from fogft.pool import bundle, configuration, templates
+from fogft.core.spec import PoolSpec
+from fogft.pool import bundle, claiming, configuration, templates
 from fogft.pool.bundle import Label
 from fogft.pool.credentials import Credential
 from fogft.pool.ledger import FIRST_SLOT_BY_HAND, Ledger
@@ -44,21 +49,45 @@ class Joined:
     Attributes:
         config: The configuration to start with: ``fogft <command> --config <config>``.
         command: ``proxy``, ``serve``, ``gateway`` or ``rendezvous``.
+        alone: No rendezvous tells it of what changes, nor told whether it is the first to join.
     """
 
     pool: str
     holder: Holder
     config: Path
     command: str
+    alone: bool = False
+
+
+@dataclass(frozen=True)
+class _Files:
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True)
+class Issued:
+    """A bundle.
+
+    Attributes:
+        data: Its bytes.
+        alone: See `Joined`.
+    """
+
+    holder: Holder
+    data: bytes
+    alone: bool
 
 
 def issue(
     store: PoolStore, role: Role, name: str, passphrase: str, now: float, *, open_for_s: float
-) -> tuple[Holder, bytes]:
-    """Certify the next generation of a holder, and return it with its sealed bundle.
+) -> Issued:
+    """Certify the next generation of a holder, and return its sealed bundle.
 
     Raises:
-        CredentialError: The name or the passphrase will not do, or the CA cannot be used.
+        CredentialError: The name or the passphrase will not do, the CA cannot be used, or
+            whoever joined would find nobody.
         FogftError: There is no such pool.
     """
     identity, spec = store.identity(), store.spec()
@@ -68,13 +97,33 @@ def issue(
             f"use {FIRST_SLOT_BY_HAND} or more: the manager launches those below, and certifies "
             "them itself",
         )
+    _check_found(spec, role, name)
     bundle.check_passphrase(passphrase)  # before a generation is used up
     holder, credential = Ledger(store.paths.credentials).issue_next(
         role, name, identity.uid, days=configuration.certificate_days(spec)
     )
     label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, now + open_for_s)
-    content = {"files": _files(store, holder, credential)}
-    return holder, bundle.seal(label, content, passphrase)
+    content = {"files": _files(store, holder, credential), "rendezvous": list(spec.rendezvous)}
+    alone = not spec.rendezvous and role is not Role.RENDEZVOUS
+    return Issued(holder, bundle.seal(label, content, passphrase), alone)
+
+
+def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
+    """See that whoever joins can find the others, or be found by them."""
+    if spec.rendezvous:
+        return
+    add = "add `fogft.rendezvous` to the pool file, and `fogft up` it"
+    if role is Role.REPLICA and Found.of(spec) is Found.BY_CLOUD:
+        raise CredentialError(
+            f"nobody would find replica `{name}`: no rendezvous could tell where it is",
+            f"{add}, or `fogft.dial_in`, where it dials the robot",
+        )
+    if role in (Role.ROBOT, Role.GATEWAY) and Found.of(spec) is Found.BY_DOOR:
+        raise CredentialError(
+            f"{role.value} `{name}` would find no replica: they dial this machine's robot, and "
+            "only a rendezvous could tell them of others",
+            add,
+        )
 
 
 def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str, str]:
@@ -102,7 +151,14 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
     return {**files, f"{folder}{stem}.crt": credential.certificate_pem.decode()}
 
 
-def join(file: Path, passphrase: str, root: Path, now: float) -> Joined:
+def join(
+    file: Path,
+    passphrase: str,
+    root: Path,
+    now: float,
+    *,
+    claim: Callable[[Holder, str, list[str], _Files], None] = claiming.claim,
+) -> Joined:
     """Set this machine up from a bundle, and destroy the bundle.
 
     Args:
@@ -110,24 +166,30 @@ def join(file: Path, passphrase: str, root: Path, now: float) -> Joined:
         passphrase: What it was sealed with.
         root: The folder of all of fogft's state.
         now: Seconds since the epoch.
+        claim: Sees that no other machine has joined with it.
 
     Raises:
-        CredentialError: It is no bundle, was used, is too old, or the passphrase is wrong.
+        CredentialError: It is no bundle, was used, is too old, or the passphrase is wrong; or
+            no rendezvous tells whether it was used. Then it is as good as before.
         StateError: Something cannot be written; the bundle is still there.
     """
     data = read(file)
     label, content = bundle.open_sealed(data, passphrase, now)
-    files = checked_files(content)
+    files, endpoints = checked_files(content), _rendezvous(content)
+    holder = label.holder
     disk.make_folder(root / "joined")
     used = root / "joined" / "used.json"
     with disk.locked(root / "joined" / "used.lock"):
         ids = list(disk.read_json(used) or ())
         if label.id in ids:
             raise CredentialError(
-                f"this bundle for `{label.holder.short}` was used here before",
+                f"this bundle for `{holder.short}` was used here before",
                 "each is good for one time: have a new one issued",
             )
-        holder = label.holder
+        if endpoints:
+            token = claiming.own_token(root / "joined" / "claims.json", label.id, now)
+            with _on_disk(root / "joined", files, holder) as credentials:
+                claim(holder, token, endpoints, credentials)
         folder = root / "joined" / _folder_name(label.pool, holder)
         for name, text in files.items():
             place = folder / name
@@ -136,7 +198,36 @@ def join(file: Path, passphrase: str, root: Path, now: float) -> Joined:
         disk.write_json(used, [*ids, label.id][-_USED_LIMIT:])
     _destroy(file, len(data))
     config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
-    return Joined(label.pool, holder, config, _COMMANDS.get(holder.role, "proxy"))
+    alone = not endpoints and holder.role is not Role.RENDEZVOUS
+    return Joined(label.pool, holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
+
+
+@contextlib.contextmanager
+def _on_disk(folder: Path, files: dict[str, str], holder: Holder) -> Iterator[_Files]:
+    """Have credentials in files of their own before they are put where a proxy sees them."""
+    stem, named = (
+        holder.role.value,
+        {PurePosixPath(name).name: text for name, text in files.items()},
+    )
+    with tempfile.TemporaryDirectory(dir=folder) as made:
+        place = _Files(*(Path(made) / n for n in ("ca.crt", f"{stem}.crt", f"{stem}.key")))
+        for path in (place.ca, place.certificate, place.key):
+            disk.write_whole(path, named.get(path.name, ""))
+        yield place
+
+
+def _rendezvous(content: dict[str, Any]) -> list[str]:
+    """Return the rendezvous that a bundle names; older bundles name none.
+
+    Raises:
+        CredentialError: They are no endpoints.
+    """
+    listed = content.get("rendezvous", [])
+    if not isinstance(listed, list) or not all(
+        isinstance(one, str) and memberships.is_endpoint(one) for one in listed
+    ):
+        raise CredentialError("the bundle names a rendezvous that is none")
+    return listed
 
 
 def read(file: Path) -> bytes:

@@ -48,6 +48,7 @@ def issue_ada(capsys: pytest.CaptureFixture[str]) -> str:
     assert run("credentials", "issue", "robot", "ada") == 0
     said = capsys.readouterr()
     assert said.out == "ada.join\n"
+    assert "warning: the pool has no rendezvous" in said.err
     line = next(one for one in said.err.splitlines() if one.startswith("passphrase: "))
     return line.removeprefix("passphrase: ")
 
@@ -62,6 +63,7 @@ def test_a_second_robot_from_one_file(paths, tmp_path, capsys, monkeypatch):
     config = Path(said.out.strip())
     assert config.name == "proxy.yaml"
     assert f"fogft proxy --config {config}" in said.err
+    assert "warning: the pool has no rendezvous" in said.err
     assert not (tmp_path / "ada.join").exists()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.spec import PoolSpec, ServiceSpec
 from fogft.pool import bundle, credentials, joining, rendezvous
 from fogft.pool.bundle import Label
+from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import Identity, PoolStore, write_identity
 from fogft.proxy.config import read_client, read_gateway, read_server
@@ -37,11 +39,15 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def store(tmp_path: Path) -> PoolStore:
+    return store_of(SPEC, tmp_path)
+
+
+def store_of(spec: PoolSpec, tmp_path: Path) -> PoolStore:
     paths = PoolPaths(tmp_path / "pool")
     credentials.create_authority(paths.credentials, UID)
     write_identity(paths, Identity("pool", UID, "local", str(tmp_path / "pool.yaml"), 0.0))
     paths.spec.write_text("any")
-    store = PoolStore(paths, lambda *_: SPEC, lambda: NOW)
+    store = PoolStore(paths, lambda *_: spec, lambda: NOW)
     store.write_membership(MEMBERSHIP)
     return store
 
@@ -54,7 +60,7 @@ def file(store: PoolStore, tmp_path: Path) -> Path:
 
 
 def issued(store: PoolStore, role: Role, name: str) -> bytes:
-    return joining.issue(store, role, name, PASSPHRASE, NOW, open_for_s=3600)[1]
+    return joining.issue(store, role, name, PASSPHRASE, NOW, open_for_s=3600).data
 
 
 def test_a_robot_joins_from_one_file(file: Path, tmp_path: Path) -> None:
@@ -70,8 +76,9 @@ def test_a_robot_joins_from_one_file(file: Path, tmp_path: Path) -> None:
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
 
 
-def test_a_replica_by_hand_joins_too(store: PoolStore, tmp_path: Path) -> None:
-    """In a slot that the manager leaves alone."""
+def test_a_replica_by_hand_joins_too(tmp_path: Path) -> None:
+    """In a slot that the manager leaves alone; it dials the robot."""
+    store = store_of(replace(SPEC, dial_in="ada.example:7460"), tmp_path)
     path = tmp_path / "lab.join"
     path.write_bytes(issued(store, Role.REPLICA, "100"))
     joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
@@ -108,6 +115,33 @@ def test_a_gateway_joins_too(store: PoolStore, tmp_path: Path) -> None:
     assert from_dict(json.loads(config.client.membership.read_text())) == MEMBERSHIP
     said = credentials.describe(config.client.credentials.certificate)
     assert said.common_name == f"gateway.edge.1.{UID}"
+
+
+@pytest.mark.parametrize(
+    ("spec", "role", "name"),
+    [
+        (SPEC, Role.REPLICA, "100"),
+        (replace(SPEC, dial_in="ada.example:7460"), Role.ROBOT, "bob"),
+        (replace(SPEC, dial_in="ada.example:7460"), Role.GATEWAY, "edge"),
+    ],
+)
+def test_who_would_find_nobody_gets_no_bundle(
+    tmp_path: Path, spec: PoolSpec, role: Role, name: str
+) -> None:
+    """Where there is no rendezvous; no generation is used up, and the remedy is named."""
+    store = store_of(spec, tmp_path)
+    with pytest.raises(CredentialError, match="would find") as caught:
+        issued(store, role, name)
+    assert "fogft.rendezvous" in caught.value.hint
+    assert not Ledger(store.paths.credentials).entries()
+
+
+def test_who_is_alone_is_told(file: Path, store: PoolStore, tmp_path: Path) -> None:
+    """A robot joins without a rendezvous: it has the replicas' endpoints, and hears of no more."""
+    assert joining.join(file, PASSPHRASE, tmp_path / "home", NOW).alone
+    for role, name in ((Role.ROBOT, "bob"), (Role.GATEWAY, "edge")):
+        assert joining.issue(store, role, name, PASSPHRASE, NOW, open_for_s=60).alone
+    assert not joining.issue(store, Role.RENDEZVOUS, "a", PASSPHRASE, NOW, open_for_s=60).alone
 
 
 def test_it_is_good_for_one_time(file: Path, tmp_path: Path) -> None:
@@ -158,9 +192,8 @@ def test_a_passphrase_that_is_too_short_uses_no_generation_up(
 ) -> None:
     with pytest.raises(CredentialError, match="fewer than 12"):
         joining.issue(store, Role.ROBOT, "ada", passphrase, NOW, open_for_s=60)
-    assert (
-        joining.issue(store, Role.ROBOT, "ada", PASSPHRASE, NOW, open_for_s=60)[0].generation == 1
-    )
+    issued = joining.issue(store, Role.ROBOT, "ada", PASSPHRASE, NOW, open_for_s=60)
+    assert issued.holder.generation == 1
 
 
 def test_nothing_secret_is_readable(file: Path, tmp_path: Path) -> None:
@@ -179,6 +212,15 @@ def test_made_passphrases_differ_and_are_long_enough() -> None:
     assert len(made) == 50
     for passphrase in made:
         bundle.check_passphrase(passphrase)
+
+
+@pytest.mark.parametrize("named", ["a:1", ["a"], [1], ["a:1", None], [["a:1"]]])
+def test_a_bundle_names_no_odd_rendezvous(named: object, tmp_path: Path) -> None:
+    path = tmp_path / "evil.join"
+    content = {"files": {"x": "y"}, "rendezvous": named}
+    path.write_bytes(bundle.seal(LABEL, content, PASSPHRASE))
+    with pytest.raises(CredentialError, match="rendezvous that is none"):
+        joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
 
 
 @pytest.mark.parametrize(

@@ -41,15 +41,17 @@ class Files:
 
 
 class Authority:
-    """A pool's CA in a folder, and what it issued."""
+    """A pool's CA in a folder, and what it issued; `ca` is where, if not in the same."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, ca: Path | None = None) -> None:
         self.folder = folder
-        credentials.create_authority(folder / "ca", POOL_UID)
+        self._ca = ca or folder / "ca"
+        folder.mkdir(exist_ok=True)
+        credentials.create_authority(self._ca, POOL_UID)
 
     def issue(self, common_name: str, role: Role, *, days: float = 30.0) -> Files:
         stem = f"{common_name}-{role.value}"
-        credential = credentials.issue(self.folder / "ca", common_name, role=role, days=days)
+        credential = credentials.issue(self._ca, common_name, role=role, days=days)
         credentials.write(credential, self.folder, stem)
         return Files(
             self.folder / "ca.crt", self.folder / f"{stem}.crt", self.folder / f"{stem}.key"
