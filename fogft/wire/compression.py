@@ -17,7 +17,9 @@ import zlib
 from collections.abc import Callable
 
 ZLIB = "zlib"
-ACCEPTED = frozenset({ZLIB})  # what this version reads
+# It finds out by itself for whom answers are to be compressed.
+ZLIB_ANSWERS = "zlib-answers"
+ACCEPTED = frozenset({ZLIB, ZLIB_ANSWERS})  # what this version reads, and does
 LEAST_BYTES = 2048  # smaller ones leave in one packet or two
 LIMIT_BYTES = 64 << 20  # more than a window holds: a frame that claims more is refused
 FASTEST_BYTES_PER_S = 30e6  # a link that drains faster gains nothing by zlib

@@ -5,8 +5,9 @@ likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look 
 four times a second, at this process's own sockets: what is connected to the port and is no
 authenticated link is ended when it is too old or when there are too many, a link of a revoked
 holder at once, and one that delivers nothing of what it holds after a while. All are counted.
+Who looks sees, too, which links are thin.
 
-Owns: ending connections. Not here: whose requests are refused (`guests`).
+Owns: ending connections, and how they drain. Not here: whose requests are refused (`guests`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import Callable, Collection, Mapping
 
 from fogft.wire import sockets
 from fogft.wire.drain import Drain
+from fogft.wire.flow_watch import THIN_BYTES_PER_S
 from fogft.wire.reply_queue import Counters
 from fogft.wire.sockets import Address
 
@@ -45,6 +47,9 @@ class Doorkeeper:
         counters: Counts ``unauthenticated``, ``revoked_links`` and ``stuck_links`` ended.
         also: Called with each look.
         stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.
+
+    Attributes:
+        thin: Common names of those to whom a link is thin.
     """
 
     def __init__(
@@ -63,6 +68,7 @@ class Doorkeeper:
         self._counters = counters
         self._also = also
         self._stuck_after_s = stuck_after_s
+        self.thin: frozenset[str] = frozenset()
         self._first_seen: dict[Address, float] = {}
         self._drains: dict[Address, Drain] = {}
         self._stop = threading.Event()
@@ -94,26 +100,35 @@ class Doorkeeper:
             for peer, name in links.items():
                 if name in revoked and peer in found:
                     self._end(found[peer], peer, "revoked_links", name)
-            self._end_the_stuck(links, found, now)
+            self._watch(links, found, now)
             seen = {peer: self._first_seen.get(peer, now) for peer in found if peer not in links}
             for peer in condemned(seen, now):
                 self._end(found[peer], peer, "unauthenticated", "")
                 del seen[peer]
             self._first_seen = seen
 
-    def _end_the_stuck(
+    def _watch(
         self, links: Mapping[Address, str], found: Mapping[Address, socket.socket], now: float
     ) -> None:
-        """End links whose peers have acknowledged nothing for long: frozen, or out of reach."""
+        """See how links drain: find the thin ones, and end those that stand still.
+
+        A peer that has acknowledged nothing for long is frozen, or out of reach.
+        """
+        thin = set()
         drains = {peer: self._drains.get(peer) or Drain() for peer in links if peer in found}
         for peer, drain in drains.items():
             flow = sockets.flow(found[peer])
             if flow is None:
                 continue
             drain.look(flow, now)
+            rate = drain.carried.steady_bytes_per_s
+            if rate is not None and rate < THIN_BYTES_PER_S:
+                thin.add(links[peer])
+                sockets.keep_short(found[peer])
             if drain.stuck_s(now) > self._stuck_after_s:
                 self._end(found[peer], peer, "stuck_links", links[peer])
         self._drains = drains
+        self.thin = frozenset(thin)
 
     def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:
         sockets.end(connection)

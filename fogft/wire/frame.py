@@ -25,6 +25,7 @@ VERSION = 1
 # Beside the version, only towards peers that have said that they know them.
 _PACKED = 0x80  # the payload is compressed
 _MAY_PACK = 0x40  # the answer may be
+_READS_PACKED = 0x20  # the answer may be where the replica finds the link to be thin
 TOKEN_BYTES = 8
 ROBOT_BYTES_LIMIT = 64
 REASON_LIMIT = 64
@@ -62,6 +63,7 @@ class RequestHeader:
         robot: Who asks.
         packed: The payload is compressed.
         may_pack: The answer may be.
+        reads_packed: It may be where the replica itself finds the link to be thin.
     """
 
     request_id: bytes
@@ -70,6 +72,7 @@ class RequestHeader:
     robot: str
     packed: bool = False
     may_pack: bool = False
+    reads_packed: bool = False
 
 
 @dataclass(frozen=True)
@@ -108,9 +111,10 @@ def encode_request(
     *,
     packed: bool = False,
     may_pack: bool = False,
+    reads_packed: bool = False,
 ) -> bytes:
     """Return a request's header; `origin` comes from the function of that name."""
-    first = VERSION | _PACKED * packed | _MAY_PACK * may_pack
+    first = VERSION | _PACKED * packed | _MAY_PACK * may_pack | _READS_PACKED * reads_packed
     return _REQUEST.pack(first, request_id, remaining_s) + origin
 
 
@@ -123,7 +127,7 @@ def decode_request(frame: bytes) -> RequestHeader:
     if not _ROBOT_AT < len(frame) <= _ROBOT_AT + ROBOT_BYTES_LIMIT:
         raise FrameError(f"a request's header of {len(frame)} bytes")
     first, request_id, remaining_s = _REQUEST.unpack_from(frame)
-    _check_first(first, _PACKED | _MAY_PACK)
+    _check_first(first, _PACKED | _MAY_PACK | _READS_PACKED)
     if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
         raise FrameError(f"a remaining time of {remaining_s} s")
     try:
@@ -139,6 +143,7 @@ def decode_request(frame: bytes) -> RequestHeader:
         robot,
         packed=bool(first & _PACKED),
         may_pack=bool(first & _MAY_PACK),
+        reads_packed=bool(first & _READS_PACKED),
     )
 
 

@@ -106,6 +106,10 @@ class Guests:
         for token in self._holders.pop(name, ()):
             del self._tokens[token]
 
+    def holder(self, token: bytes) -> str:
+        """Return whose connection a token names; empty for nobody's."""
+        return self._tokens.get(token, "")
+
     def admits(self, token: bytes) -> bool:
         """Whether requests under this token are let in. Cheap, asked for each request."""
         return token in self._tokens

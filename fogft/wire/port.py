@@ -93,7 +93,7 @@ class ProbeAnswer:
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
         behind: The replicas behind a gateway.
-        accepts: Names of compressions that it reads.
+        accepts: Names of compressions that it reads, or does by itself.
     """
 
     slot: int

@@ -133,6 +133,7 @@ class Connection:
         self._queue = SendQueue(ways.latest)
         self._compressions = {name: Compression() for name in keys.keys() - ways.plain}
         self.packs = False  # whether the replica reads what is compressed
+        self.packs_answers = False  # whether it finds out by itself when to compress answers
         self._credit = Credit()
         self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
         self._recalls = recalls
@@ -319,6 +320,7 @@ class Connection:
                 self._origin,
                 packed=packed is not None,
                 may_pack=self.flow.thin and compression is not None,
+                reads_packed=self.packs_answers and compression is not None,
             ),
             timeout=self._timers[attempt.service].timeout_s(remaining_s, time.monotonic()),
             target=_ALL,

@@ -25,7 +25,7 @@ from fogft.core import names
 from fogft.core.errors import CredentialError, WireError
 from fogft.core.model import LinkState, doubted_after_s
 from fogft.wire import config, diagnosis, frame
-from fogft.wire.compression import ZLIB
+from fogft.wire.compression import ZLIB, ZLIB_ANSWERS
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.wire.recalls import Recalls
@@ -428,6 +428,7 @@ class ZenohLink:
         self._probe_answer = answer
         self._ready = answer.ready
         connection.packs = ZLIB in answer.accepts
+        connection.packs_answers = ZLIB_ANSWERS in answer.accepts
         if self._live is not connection:
             self._state = LinkState.UP
             self._detail = ""

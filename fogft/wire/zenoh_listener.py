@@ -48,7 +48,9 @@ _STRANGERS = b""  # in place of a token: replies to whose connection is not know
 class ZenohIncoming:
     """A request that came over Zenoh; see `port.Incoming`."""
 
-    __slots__ = ("_chores", "_header", "_payload", "_queries", "_queues", "_service", "_turn")
+    __slots__ = (
+        *("_chores", "_header", "_payload", "_queries", "_queues", "_service", "_thin", "_turn"),
+    )
 
     def __init__(
         self,
@@ -60,7 +62,9 @@ class ZenohIncoming:
         queues: ReplyQueues,
         chores: SimpleQueue[Callable[[], None] | None],
         turn: int,
+        thin: Callable[[bytes], bool],
     ) -> None:
+        self._thin = thin
         self._service = service
         self._turn = turn
         self._header = header
@@ -109,9 +113,8 @@ class ZenohIncoming:
             return  # answered before
         self._payload = b""
         header = self._header
-        reply = Reply(
-            query, header.request_id, payload, refusal, turn=self._turn, may_pack=header.may_pack
-        )
+        packs = header.may_pack or (header.reads_packed and self._thin(header.token))
+        reply = Reply(query, header.request_id, payload, refusal, turn=self._turn, may_pack=packs)
         self._queues.put(header.token, header.robot, reply)
 
     def __del__(self) -> None:
@@ -229,6 +232,11 @@ class ZenohListener:
         links = [] if session is None else session.info.links()
         return {address(link.dst): link.auth_identifier or "" for link in links}
 
+    def _thin(self, token: bytes) -> bool:
+        """Whether what a connection's robot is sent was seen to leave slowly."""
+        doorkeeper = self._doorkeeper
+        return doorkeeper is not None and self._guests.holder(token) in doorkeeper.thin
+
     def _count_handshakes(self) -> None:
         for reason in self._handshakes.refusals() if self._handshakes else ():
             count = self._counters.add("handshakes_refused")
@@ -274,7 +282,7 @@ class ZenohListener:
                 return
         incoming = ZenohIncoming(
             service, header, payload,
-            query=query, queues=self._queues, chores=self._chores, turn=turn,
+            query=query, queues=self._queues, chores=self._chores, turn=turn, thin=self._thin,
         )  # fmt: skip
         on_request(incoming)
 

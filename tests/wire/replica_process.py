@@ -1,5 +1,6 @@
 """A replica for tests: answers each request with its own bytes, after a while if told.
 
+``noise:N`` is answered with N bytes that do not shrink, ``text:N`` with N that do.
 Arguments come as JSON in the command line, commands as JSON lines on stdin; each command is
 answered with the listener's counters.
 """
@@ -8,9 +9,11 @@ from __future__ import annotations
 
 import heapq
 import json
+import random
 import sys
 import threading
 import time
+from functools import lru_cache
 from pathlib import Path
 
 from fogft.core.model import ReplicaId
@@ -19,6 +22,17 @@ from fogft.wire.handshakes import HandshakeLog
 from fogft.wire.port import Incoming, Probe, ProbeAnswer
 from fogft.wire.zenoh_listener import ZenohListener
 from tests.wire.wire_pool import POOL_UID, SERVICE, Files, keys
+
+TEXT = b"the quick brown fox jumps over the lazy dog "
+
+
+@lru_cache
+def content(asked: bytes) -> bytes:
+    """Return what a request such as ``noise:100`` asks for."""
+    kind, _, size = asked.partition(b":")
+    if kind == b"noise":
+        return random.Random(1).randbytes(int(size))
+    return (TEXT * (int(size) // len(TEXT) + 1))[: int(size)]
 
 
 class Service(threading.Thread):
@@ -56,6 +70,8 @@ class Service(threading.Thread):
             incoming.refuse(incoming.payload[7:].decode())
         elif incoming.payload == b"ignore":
             pass
+        elif incoming.payload.startswith((b"noise:", b"text:")):
+            incoming.reply(content(incoming.payload))
         elif self._reply_bytes >= 0:
             incoming.reply(bytes(self._reply_bytes))
         else:

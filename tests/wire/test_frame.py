@@ -54,13 +54,19 @@ DECODERS: list[Callable[[bytes], Any]] = [
 ]
 
 
-@given(request_id=ids, remaining_s=remaining, token=tokens, robot=robots)
+FLAGS = st.fixed_dictionaries(
+    {name: st.booleans() for name in ("packed", "may_pack", "reads_packed")}
+)
+
+
+@given(request_id=ids, remaining_s=remaining, token=tokens, robot=robots, flags=FLAGS)
 def test_a_request_header_comes_back(
-    request_id: bytes, remaining_s: float, token: bytes, robot: str
+    request_id: bytes, remaining_s: float, token: bytes, robot: str, flags: dict[str, bool]
 ) -> None:
     """Decoding undoes encoding."""
-    sent = frame.encode_request(request_id, remaining_s, frame.origin(robot, token))
-    assert frame.decode_request(sent) == frame.RequestHeader(request_id, remaining_s, token, robot)
+    sent = frame.encode_request(request_id, remaining_s, frame.origin(robot, token), **flags)
+    expected = frame.RequestHeader(request_id, remaining_s, token, robot, **flags)
+    assert frame.decode_request(sent) == expected
 
 
 @given(request_id=ids)

@@ -32,6 +32,7 @@ from tests.wire.wire_pool import (
 )
 
 MEGABYTE = 1 << 20
+ASKS = b"noise:%d" % MEGABYTE
 MBIT = 1.0  # a response takes eight seconds there
 QUEUED, ASKED = 30, 15
 LONG_S = 120.0
@@ -58,7 +59,7 @@ def took_s(link: ZenohLink, owner: Timed, first: int) -> float:
     times = []
     for number in range(first, first + ASKED):
         began = time.monotonic()
-        assert link.offer(SERVICE, request_id(number), b"me too", LONG_S)
+        assert link.offer(SERVICE, request_id(number), ASKS, LONG_S)
         wait_for(lambda n=number: owner.of(n), LONG_S)
         times.append(owner.at[request_id(number)] - began)
         assert len(owner.of(number)[0].payload or b"") == MEGABYTE
@@ -90,7 +91,7 @@ def compare(
         took_s(healthy, owner, 1000)  # the first ones are slower
         alone = took_s(healthy, owner, 2000)
         for number in range(QUEUED):
-            assert thin.offer(SERVICE, request_id(number), b"many bytes, please", 600.0)
+            assert thin.offer(SERVICE, request_id(number), ASKS, 600.0)
         wait_for(lambda: replica.count("replies") >= QUEUED + 2 * ASKED, LONG_S)
         beside = took_s(healthy, owner, 3000)
         assert len(thin_owner.answers) < QUEUED  # it waited the whole time
@@ -109,13 +110,12 @@ def net() -> Iterator[Namespaces]:
 def test_a_robot_behind_a_thin_relay_does_not_delay_another(
     start_replica: Callable[..., ReplicaProcess], authority: Authority
 ) -> None:
-    replica = start_replica(reply_bytes=MEGABYTE)
+    replica = start_replica()
     relay = ThinRelay(replica.endpoint, MBIT * 125_000)
     try:
         alone, beside = compare(authority, replica, relay.endpoint)
     finally:
         relay.close()
-    print(alone, beside)
     assert beside < AS_LONG * alone, (alone, beside)
 
 
@@ -126,7 +126,7 @@ def test_a_robot_on_a_thin_cable_does_not_delay_another(authority: Authority, ne
     net.join(healthy_at, "10.83.2.1", replica_at, "10.83.2.2")
     net.limit(replica_at, far, MBIT)
     with inside(replica_at):
-        replica = ReplicaProcess(authority.replica(), endpoint="0.0.0.0:7447", reply_bytes=MEGABYTE)
+        replica = ReplicaProcess(authority.replica(), endpoint="0.0.0.0:7447")
     replica.endpoint = "10.83.2.2:7447"
     try:
         alone, beside = compare(
@@ -135,5 +135,4 @@ def test_a_robot_on_a_thin_cable_does_not_delay_another(authority: Authority, ne
         )  # fmt: skip
     finally:
         replica.kill()
-    print(alone, beside)
     assert beside < AS_LONG * alone, (alone, beside)
