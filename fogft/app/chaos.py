@@ -29,6 +29,6 @@ def machine_in(pool: str, slot: int) -> ReplicaId:
     machines = cloud_of(identity).machines(identity.uid)
     found = [machine.id for machine in machines if machine.id.slot == slot]
     if not found:
-        known = ", ".join(sorted({str(machine.id.slot) for machine in machines})) or "none"
+        known = ", ".join(map(str, sorted({machine.id.slot for machine in machines}))) or "none"
         raise FogftError(f"no machine runs in slot {slot} of `{pool}`", f"slots with one: {known}")
     return max(found)

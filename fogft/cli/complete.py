@@ -29,7 +29,9 @@ def slots(incomplete: str) -> list[str]:
     """Slots of the only pool, or of all pools."""
     from fogft import app
 
-    return _quietly(lambda: sorted({str(s) for p in app.pools() for s in app.slots(p)}), incomplete)
+    return _quietly(
+        lambda: map(str, sorted({s for p in app.pools() for s in app.slots(p)})), incomplete
+    )
 
 
 def locations(incomplete: str) -> list[str]:

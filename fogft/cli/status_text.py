@@ -31,8 +31,9 @@ def rendered(seen: Seen, *, width: int, colour: bool) -> list[str]:
     """Return the whole screen, line by line."""
     status = seen.status
     lines = [headline(seen, colour=colour)]
-    if status.replicas:
-        lines += ["", *replicas(status.replicas, REPLICA_COLUMNS, width=width, colour=colour)]
+    rows = [*status.replicas, *status.by_hand]
+    if rows:
+        lines += ["", *replicas(rows, REPLICA_COLUMNS, width=width, colour=colour)]
     if status.services:
         lines += ["", *services(status.services, colour=colour)]
     drawn = tree(status.topology, colour=colour)
@@ -104,7 +105,7 @@ def _of_replica(row: ReplicaStatus) -> dict[str, Cell]:
         "LINK": Cell(row.link or "-", LINKS.get(row.link, "dim")),
         "RTT": Cell(milliseconds(row.rtt_s)),
         "WON": Cell(number(row.won)),
-        "AGE": Cell(age(row.age_s)),
+        "AGE": Cell("-" if row.age_s is None else age(row.age_s)),
     }
 
 

@@ -6,7 +6,8 @@ than the pool has gets a group of its own, `CRITICAL`, whose replicas carry such
 alone.
 
 Slots tell the groups apart, so nothing else has to be remembered: group k has the slots
-from ``k * BLOCK`` on, `CRITICAL` the last block.
+from ``k * BLOCK`` on, `CRITICAL` the last block. From `FIRST_BY_HAND` on they are free for
+replicas that people start themselves.
 
 Owns: groups, their slots, and how a number of replicas is shared among them.
 Not here: how many are wanted (`sizing`), where they go (`placement`).
@@ -25,6 +26,9 @@ BLOCK = 100
 MAX_GROUPS = 8
 CRITICAL_BLOCK = 9
 CRITICAL = "critical"
+# The manager launches all slots below; replicas that people start by hand stay out of its way.
+FIRST_BY_HAND = (CRITICAL_BLOCK + 1) * BLOCK
+LAST_BY_HAND = 999_999
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from fogft.core.uplinks import is_interface
 
 MAX_RENDEZVOUS = 4
 MAX_UPLINKS = 4
-_LAST_REPLICA_PORT = 65535 - 1000  # slots of groups go up to 799
+_LAST_REPLICA_PORT = 65535 - 1000  # slots that the manager launches go up to 999
 _UPLINKS_HINT = "write what `ip link` lists, such as `uplinks: [wlan0, wwan0]`"
 _RENDEZVOUS_HINT = "write a list, such as `rendezvous: [meet.example.org:7450]`"
 _DIAL_IN_HINT = (

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.core.errors import CredentialError, FogftError
+from fogft.core.groups import FIRST_BY_HAND
 from fogft.core.middleware import Speaks
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
 from fogft.pool import credentials
@@ -154,12 +155,15 @@ def judge_links(pool: str, reported: list[dict[str, object]]) -> Iterator[Findin
     """Judge the links that a client proxy reports."""
     up = [link for link in reported if link.get("state") == "up"]
     for link in reported:
-        name = f"{link.get('slot')}.{link.get('generation')}"
+        slot = link.get("slot")
+        name = f"{slot}.{link.get('generation')}"
+        by_hand = isinstance(slot, int) and slot >= FIRST_BY_HAND
+        log = "the log on its machine" if by_hand else f"`fogft logs {slot}`"
         if link.get("state") == "up" and link.get("detail"):
             yield warn(
                 "replicas",
                 f"pool `{pool}`: replica `{name}` is not ready: {link.get('detail')}",
-                f"`fogft logs {link.get('slot')}` shows what `run` says; is each `name` and `type` "
+                f"{log} shows what `run` says; is each `name` and `type` "
                 "in the pool file what the node offers?",
             )
         elif link.get("state") != "up":
@@ -167,8 +171,9 @@ def judge_links(pool: str, reported: list[dict[str, object]]) -> Iterator[Findin
             yield warn(
                 "links",
                 f"pool `{pool}`: replica `{name}` is {link.get('state')}: {detail}",
-                "it is replaced by itself if it stays silent; see `fogft status` and "
-                f"`fogft logs {link.get('slot')}`",
+                f"it was started by hand, and nobody replaces it; see {log}"
+                if by_hand
+                else f"it is replaced by itself if it stays silent; see `fogft status` and {log}",
             )
     if reported and not up:
         yield fail(

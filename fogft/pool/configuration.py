@@ -18,7 +18,7 @@ from fogft import disk
 from fogft.cloud.port import Launch
 from fogft.core import holders, names, topics
 from fogft.core.errors import CredentialError
-from fogft.core.groups import replica_hash, services_at, task_at
+from fogft.core.groups import FIRST_BY_HAND, replica_hash, services_at, task_at
 from fogft.core.holders import Holder, holder_of
 from fogft.core.model import ReplicaId
 from fogft.core.planner import PlannedLaunch
@@ -196,7 +196,8 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "orphan_after_s": spec.health.orphan_after_s,
             "rendezvous": list(spec.rendezvous),
             "dial_out": [spec.dial_in] if spec.dial_in else [],
-            "metrics": spec.metrics.of_replica(id.slot),
+            # Those that the manager launches may share an address; others have one of their own.
+            "metrics": spec.metrics.of_replica(id.slot if id.slot < FIRST_BY_HAND else 0),
             "rmw": spec.rmw.replica.value,
         },
     )

@@ -24,6 +24,7 @@ from typing import Any
 from fogft import disk
 from fogft.core import membership as memberships
 from fogft.core.errors import CredentialError, FogftError
+from fogft.core.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.core.holders import Holder, Role
 from fogft.core.membership import Found
 from fogft.core.model import ReplicaId
@@ -31,7 +32,7 @@ from fogft.core.spec import PoolSpec
 from fogft.pool import bundle, claiming, configuration, templates
 from fogft.pool.bundle import Label
 from fogft.pool.credentials import Credential
-from fogft.pool.ledger import FIRST_SLOT_BY_HAND, Ledger
+from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import PoolStore
 
@@ -91,11 +92,11 @@ def issue(
         FogftError: There is no such pool.
     """
     identity, spec = store.identity(), store.spec()
-    if role is Role.REPLICA and not (name.isdecimal() and int(name) >= FIRST_SLOT_BY_HAND):
+    if role is Role.REPLICA and not _is_by_hand(name):
         raise CredentialError(
             f"`{name}` is no slot for a replica that is started by hand",
-            f"use {FIRST_SLOT_BY_HAND} or more: the manager launches those below, and certifies "
-            "them itself",
+            f"use {FIRST_BY_HAND} to {LAST_BY_HAND}: the manager launches those below, and "
+            "certifies them itself",
         )
     _check_found(spec, role, name)
     bundle.check_passphrase(passphrase)  # before a generation is used up
@@ -106,6 +107,11 @@ def issue(
     content = {"files": _files(store, holder, credential), "rendezvous": list(spec.rendezvous)}
     alone = not spec.rendezvous and role is not Role.RENDEZVOUS
     return Issued(holder, bundle.seal(label, content, passphrase), alone)
+
+
+def _is_by_hand(name: str) -> bool:
+    number = name.isascii() and name.isdecimal() and str(int(name[:9])) == name
+    return number and FIRST_BY_HAND <= int(name) <= LAST_BY_HAND
 
 
 def _check_found(spec: PoolSpec, role: Role, name: str) -> None:

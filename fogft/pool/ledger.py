@@ -18,14 +18,13 @@ from typing import Any
 
 from fogft import disk
 from fogft.core.errors import CredentialError, StateError
+from fogft.core.groups import FIRST_BY_HAND
 from fogft.core.holders import Holder, Role, holder_of
 from fogft.core.model import ReplicaId
 from fogft.pool import credentials
 from fogft.pool.credentials import Credential
 
 _DAY_S = 86_400.0
-# The manager counts slots from 0; replicas that people start by hand stay out of its way.
-FIRST_SLOT_BY_HAND = 100
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Ledger:
         return frozenset(
             ReplicaId(h.pool_uid, int(h.name), h.generation)
             for h in good
-            if h.role is Role.REPLICA and int(h.name) >= FIRST_SLOT_BY_HAND
+            if h.role is Role.REPLICA and int(h.name) >= FIRST_BY_HAND
         )
 
     def gateways(self) -> dict[str, tuple[int, ...]]:

@@ -41,7 +41,7 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
         if path is not None:
             found.append((id.short, Path(path)))
     if slot is not None and not found:
-        known = ", ".join(sorted({str(s) for s, _ in launched})) or "none yet"
+        known = ", ".join(map(str, sorted({s for s, _ in launched}))) or "none yet"
         raise FogftError(
             f"there is no log of a replica in slot {slot} of `{store.paths.folder.name}`",
             f"slots with one: {known}",

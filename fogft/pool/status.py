@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from fogft.core.errors import StateError
 from fogft.core.history import Event, EventKind, History
-from fogft.core.model import LinkState, Phase, ReplicaId
+from fogft.core.model import LinkReport, LinkState, Phase, ReplicaId
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.core.health import Judged
@@ -42,7 +42,7 @@ class ReplicaStatus:
         link: ``connecting``, ``up`` or ``suspect``; empty when there is no link.
         verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
             ``at risk``.
-        age_s: Since its launch.
+        age_s: Since its launch; None where that was somebody else's.
         differs: The type of a service is not the same there as here; `detail` says how.
     """
 
@@ -61,7 +61,7 @@ class ReplicaStatus:
     won: int
     in_flight: int
     restarts: int
-    age_s: float
+    age_s: float | None
     detail: str
     differs: bool = False
 
@@ -101,6 +101,7 @@ class PoolStatus:
         observed_at: Seconds since the epoch.
         cloud_reachable: Whether the cloud could say what exists; if not, `replicas` is
             what was seen last and `ready` is 0.
+        by_hand: Replicas that people started themselves, beside those of `replicas`.
         target: Replicas wanted now.
         ready: Replicas whose services answer and that are to stay.
         ended: Why the manager has ended the pool by itself; empty while it runs.
@@ -130,6 +131,7 @@ class PoolStatus:
     excluded: Sequence[str] = ()
     notes: Sequence[str] = ()
     replicas: Sequence[ReplicaStatus] = ()
+    by_hand: Sequence[ReplicaStatus] = ()
     services: Sequence[ServiceStatus] = ()
     events: Sequence[Mapping[str, Any]] = ()
     applied: str = ""
@@ -149,9 +151,10 @@ def from_json(raw: Any) -> PoolStatus:
     """
     try:
         replicas = [ReplicaStatus(**replica) for replica in raw["replicas"]]
+        by_hand = [ReplicaStatus(**replica) for replica in raw.get("by_hand", ())]
         services = [ServiceStatus(**service) for service in raw["services"]]
         update = UpdateStatus(**raw["update"]) if raw.get("update") else None
-        found = {"replicas": replicas, "services": services, "update": update}
+        found = {"replicas": replicas, "by_hand": by_hand, "services": services, "update": update}
         return PoolStatus(**{**raw, **found})
     except (KeyError, TypeError, AttributeError) as error:
         raise StateError(f"not a status: {error}", "is the manager of another version?") from error
@@ -169,10 +172,17 @@ def of_tick(
     notes: Sequence[str] = (),
 ) -> PoolStatus:
     """Return the status after a tick."""
+    from fogft.core.groups import FIRST_BY_HAND
+
     health, observed, plan = tick.plan.health, tick.observed, tick.plan
     judged = health.replicas if health is not None else ()
     leaving = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
     replicas = [_replica(one, leaving, history, observed.now) for one in judged]
+    links = {link.id: link for link in observed.links or ()}
+    members = tick.membership.members if tick.membership is not None else ()
+    by_hand = [member.id for member in members if member.id.slot >= FIRST_BY_HAND]
+    heard = [one.link for one in judged if one.link is not None]
+    heard += [links[id] for id in by_hand if id in links]
     return PoolStatus(
         pool=tick.identity.name,
         uid=tick.identity.uid,
@@ -192,7 +202,8 @@ def of_tick(
         excluded=sorted(tick.intent.excluded),
         notes=[*plan.notes, *_without_certificate(tick), *notes],
         replicas=replicas,
-        services=_services(tick.spec, judged, report),
+        by_hand=[_started_by_hand(member, links, tick.spec) for member in by_hand],
+        services=_services(tick.spec, heard, report),
         events=[_event(event) for event in recent],
         topology=_topology(tick, report if proxy_alive else None),
         applied=tick.file,
@@ -258,6 +269,34 @@ def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float)
     )
 
 
+def _started_by_hand(
+    id: ReplicaId, links: Mapping[ReplicaId, LinkReport], spec: PoolSpec
+) -> ReplicaStatus:
+    link = links.get(id) or LinkReport(id, LinkState.CONNECTING, detail="it was not found yet")
+    ready = link.state is LinkState.UP and {s.name for s in spec.services} <= link.ready
+    phase = Phase.DRAINING if link.draining else Phase.READY if ready else Phase.STARTING
+    return ReplicaStatus(
+        slot=id.slot,
+        generation=id.generation,
+        phase=phase.value,
+        verdict="good",
+        location="by hand",
+        instance="",
+        spot=False,
+        usd_per_hour=0.0,
+        endpoint=None,
+        link=link.state.value if id in links else "",
+        rtt_s=link.rtt_s,
+        silent_for_s=link.silent_for_s,
+        won=link.won,
+        in_flight=link.in_flight,
+        restarts=link.restarts,
+        age_s=None,
+        detail=link.detail,
+        differs=link.differs,
+    )
+
+
 def _detail(one: Judged) -> str:
     """Return what is worth knowing of a replica: what is wrong, else what is being done."""
     link, progress = one.link, one.machine.progress
@@ -267,16 +306,14 @@ def _detail(one: Judged) -> str:
 
 
 def _services(
-    spec: PoolSpec, judged: Sequence[Judged], report: ProxyReport | None
+    spec: PoolSpec, links: Sequence[LinkReport], report: ProxyReport | None
 ) -> list[ServiceStatus]:
     counters = report.services if report is not None else {}
     return [
         ServiceStatus(
             name=service.name,
             type=service.type,
-            ready_replicas=sum(
-                one.link is not None and service.name in one.link.ready for one in judged
-            ),
+            ready_replicas=sum(service.name in link.ready for link in links),
             counters=counters.get(service.name, {}),
         )
         for service in spec.proxied

@@ -61,8 +61,14 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
     """
     status = seen.read(paths, now).status
     found = [replica.generation for replica in status.replicas if replica.slot == slot]
+    if not found and any(replica.slot == slot for replica in status.by_hand):
+        raise FogftError(
+            f"the replica in slot {slot} of `{status.pool}` was started by hand",
+            "nobody replaces it: end it on its machine; "
+            f"`fogft credentials revoke replica {slot}` shuts it out",
+        )
     if not found:
-        known = ", ".join(sorted({str(replica.slot) for replica in status.replicas})) or "none yet"
+        known = ", ".join(map(str, sorted({one.slot for one in status.replicas}))) or "none yet"
         raise FogftError(
             f"pool `{status.pool}` has no replica in slot {slot}", f"slots with a replica: {known}"
         )

@@ -80,13 +80,13 @@ def test_a_replica_by_hand_joins_too(tmp_path: Path) -> None:
     """In a slot that the manager leaves alone; it dials the robot."""
     store = store_of(replace(SPEC, dial_in="ada.example:7460"), tmp_path)
     path = tmp_path / "lab.join"
-    path.write_bytes(issued(store, Role.REPLICA, "100"))
+    path.write_bytes(issued(store, Role.REPLICA, "1000"))
     joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
     assert joined.command == "serve"
     config = read_server(joined.config)
-    assert config.id == ReplicaId(UID, 100, 1)
+    assert config.id == ReplicaId(UID, 1000, 1)
     assert credentials.describe(config.credentials.certificate).role == "replica"
-    for slot in ("3", "99", "x", "-1"):
+    for slot in ("3", "100", "999", "1000000", "01000", "x", "-1", "1²00", "9" * 30):
         with pytest.raises(CredentialError, match="no slot for a replica"):
             issued(store, Role.REPLICA, slot)
 
@@ -120,7 +120,7 @@ def test_a_gateway_joins_too(store: PoolStore, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spec", "role", "name"),
     [
-        (SPEC, Role.REPLICA, "100"),
+        (SPEC, Role.REPLICA, "1000"),
         (replace(SPEC, dial_in="ada.example:7460"), Role.ROBOT, "bob"),
         (replace(SPEC, dial_in="ada.example:7460"), Role.GATEWAY, "edge"),
     ],
