@@ -8,23 +8,24 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
+import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from fogft.core import holders, membership, records, rmw_zenoh
+from fogft.core import holders, membership, ordering, records, rmw_zenoh, roster
 from fogft.core.definitions import Definition
 from fogft.core.errors import CredentialError, StateError
-from fogft.core.model import Member, Membership, ReplicaId
+from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.record_set import RecordSet
 from fogft.core.records import RecordError, RecordKind, SignedRecord
 from fogft.pool import bundle, credentials, joining
-from fogft.wire import frame, record_frames, topic_frames
+from fogft.wire import compression, frame, record_frames, topic_frames
 from fogft.wire.frame import FrameError, Greeting
 from fogft.wire.guests import Guests, NotAdmittedError
-from fogft.wire.port import Probe, ProbeAnswer
+from fogft.wire.port import Behind, Probe, ProbeAnswer
 from fogft.wire.signing import Signer, Verifier
 
 UID = "0123456789abcdef"
@@ -127,6 +128,33 @@ def _stream(data: bytes) -> None:
                     read(message)
 
 
+def _content(data: bytes) -> None:
+    """Read a record's content as each kind's: whose key is stolen writes what he likes."""
+    content = _object(data)
+    for kind in RecordKind:
+        with contextlib.suppress(RecordError):
+            roster.check_content(records.Record(UID, kind, "0", 1, 1, content))
+    for read in (roster.slot_state, roster.dial_in, roster.admission, roster.revoked_names):
+        with contextlib.suppress(RecordError):
+            read(records.Record(UID, RecordKind.SLOT, "0", 1, 1, content))
+
+
+def _order(data: bytes) -> None:
+    """Read a sequencer's order, and each answer to one."""
+    text = data.decode("latin-1")
+    for read_refusal in (ordering.read_gap, ordering.read_fenced, ordering.read_held):
+        read_refusal(text)
+    for read in (
+        ordering.decode_join,
+        ordering.decode_promise,
+        ordering.decode_index,
+        ordering.decode_snapshot,
+    ):
+        with contextlib.suppress(ordering.OrderError):
+            read(data)
+    ordering.decode(data)
+
+
 def _judge_greeting(data: bytes) -> None:
     greeting = frame.decode_greeting(data)
     _guests().greet(greeting)
@@ -162,12 +190,16 @@ def targets() -> dict[str, Target]:
     types = {"a/srv/B": Definition("RIHS01_0", {"request": (("x", "a/C[2]"),), "a/C": ()})}
     offered = {"/s": "a/srv/B"}
     answer = ProbeAnswer(0, 1, "x", frozenset({"/s"}), detail="why", types=types, offered=offered)
+    behind = Behind(1, 2, LinkState.UP, frozenset({"/s"}), rtt_s=0.01, through="lab/edge")
+    gateway = replace(answer, types={}, behind=(behind, behind), accepts=compression.ACCEPTED)
     plain = [json.dumps(records.to_plain(one)).encode() for one in _records()]
     known = Membership("p", UID, 1, 2, (Member(ReplicaId(UID, 0, 1), "h:1"),), frozenset({ROBOT}))
     greeting = _greeting()
     stream = b"".join(
         [
             record_frames.ping(),
+            record_frames.challenge(bytes(record_frames.NONCE_BYTES), "10.0.0.1"),
+            record_frames.greeting(*_signers()[1](ROBOT)(b"proof")),
             record_frames.have({("slot", "0"): (1, 1)}),
             *record_frames.records(_records()),
         ]
@@ -176,14 +208,41 @@ def targets() -> dict[str, Target]:
         "request": Target(
             frame.decode_request,
             framed,
-            (frame.encode_request(ID, 1.5, frame.origin("ada", TOKEN)),),
+            (
+                frame.encode_request(ID, 1.5, frame.origin("ada", TOKEN)),
+                frame.encode_request(
+                    ID,
+                    1.5,
+                    frame.origin("ada", TOKEN),
+                    packed=True,
+                    may_pack=True,
+                    reads_packed=True,
+                ),
+            ),
         ),
         "answer": Target(frame.decode_answer, framed, (frame.encode_answer(ID),)),
         "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(ID, "lost"),)),
         "cancel": Target(frame.decode_cancel, framed, (frame.encode_cancel([ID, ID]),)),
         "probe": Target(frame.decode_probe, framed, (frame.encode_probe(Probe("ada", 1.0)),)),
         "probe answer": Target(
-            frame.decode_probe_answer, framed, (frame.encode_probe_answer(answer),)
+            frame.decode_probe_answer,
+            framed,
+            (frame.encode_probe_answer(answer), frame.encode_probe_answer(gateway)),
+        ),
+        "compressed payload": Target(
+            lambda data: compression.unpack(data, 1 << 16),
+            (ValueError,),
+            (zlib.compress(bytes(1000), 1), zlib.compress(bytes(range(256)) * 4, 1)),
+        ),
+        "order": Target(
+            _order,
+            (ordering.OrderError,),
+            (ordering.encode(ordering.Op.APPLY, 1 << 32, 7),),
+        ),
+        "content of a record": Target(
+            _content,
+            recorded,
+            tuple(json.dumps(records.read_body(one).content).encode() for one in _records()),
         ),
         "greeting": Target(
             frame.decode_greeting, framed, (greeting, frame.encode_greeting(Greeting(TOKEN)))

@@ -1,12 +1,13 @@
 """``python -m tests.soak --minutes N``: damage a pool without end, and see that nobody notices.
 
-Ends with status 0 where no request failed, none was answered wrongly, and no server proxy ran a
-request twice; else with 1, and says what went wrong.
+Ends with status 0 where every kind of fault was done, no request failed, none was answered wrongly,
+and no server proxy ran a request twice; else with 1, and says what went wrong.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import statistics
 import sys
 import tempfile
@@ -16,9 +17,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.proxy.gateway_pool import ran
 from tests.soak import schedule
 from tests.soak.damage import do
 from tests.soak.load import CALM, Load
+from tests.soak.verdict import Outcome, faults_found
 from tests.soak.world import LIMIT_S, World, made
 from tests.wire.namespaces import why_not
 from tests.wire.wire_pool import wait_for
@@ -42,18 +45,28 @@ def main() -> int:
         where.mkdir(parents=True, exist_ok=True)
         uplinks = UPLINKS[given.seed % len(UPLINKS)]
         with made(where, namespaces=not reason, uplinks=uplinks) as world:
-            loads, done = run(world, kinds, given.seed, 60.0 * given.minutes)
-            return judge(world, loads, done, given.seed)
+            loads: dict[str, Load] = {}
+            done: Counter[str] = Counter()
+            trouble = ""
+            try:
+                run(world, kinds, given.seed, 60.0 * given.minutes, loads, done)
+            except AssertionError as error:  # what was awaited never came
+                trouble = str(error)
+            return judge(world, loads, done, kinds, trouble, given.seed)
 
 
 def run(
-    world: World, kinds: Sequence[str], seed: int, lasts_s: float
-) -> tuple[Mapping[str, Load], Counter[str]]:
-    """Damage the pool under load, every kind at least once; return the load and what was done."""
+    world: World,
+    kinds: Sequence[str],
+    seed: int,
+    lasts_s: float,
+    loads: dict[str, Load],
+    done: Counter[str],
+) -> None:
+    """Damage the pool under load, every kind at least once; note the load and what was done."""
     world.wait_whole(lambda name: world.robots[name].tell()["report"])
-    loads = {name: Load(name, robot, seed) for name, robot in world.robots.items()}
+    loads.update({name: Load(name, robot, seed) for name, robot in world.robots.items()})
     wait_for(lambda: all(load.told for load in loads.values()), LIMIT_S)
-    done: Counter[str] = Counter()
     end = time.monotonic() + lasts_s
     for fault in schedule.faults(seed, kinds):
         if time.monotonic() >= end and len(done) == len(kinds):
@@ -67,23 +80,46 @@ def run(
         for load in loads.values():
             load.during = CALM
         time.sleep(0.5)
-    return loads, done
 
 
 def _report(load: Load) -> Mapping[str, Any]:
     return dict(load.told["report"])
 
 
-def judge(world: World, loads: Mapping[str, Load], done: Counter[str], seed: int) -> int:
+def judge(
+    world: World,
+    loads: Mapping[str, Load],
+    done: Counter[str],
+    kinds: Sequence[str],
+    trouble: str,
+    seed: int,
+) -> int:
     """Say what came of it; return the exit status."""
     for load in loads.values():
-        wait_for(load.ended, LIMIT_S)
-    asked = sum(load.told["asked"] for load in loads.values())
-    right = sum(load.told["right"] for load in loads.values())
-    wrong = [number for load in loads.values() for number in load.told["wrong"]]
-    silent = sum(load.count("silent") + load.count("turned_away") for load in loads.values())
-    twice = world.ran_twice()
-    print(f"seed {seed}: {asked} requests of {len(loads)} robots under {sum(done.values())} faults")
+        with contextlib.suppress(AssertionError):  # what has no answer by then is counted
+            wait_for(load.ended, LIMIT_S)
+    counts = ran(world.folder)
+    outcome = Outcome(
+        asked=sum(load.told["asked"] for load in loads.values()),
+        right=sum(load.told["right"] for load in loads.values()),
+        wrong=[number for load in loads.values() for number in load.told["wrong"]],
+        silent=sum(load.count("silent") + load.count("turned_away") for load in loads.values()),
+        twice=world.ran_twice(),
+        ran=len({number for numbers in counts.values() for number in numbers}),
+        done=done,
+        trouble=trouble,
+    )
+    show(outcome, loads, seed)
+    why = faults_found(outcome, kinds)
+    for line in why:
+        print(f"FAILED: {line}")
+    return 1 if why else 0
+
+
+def show(outcome: Outcome, loads: Mapping[str, Load], seed: int) -> None:
+    """Print how long requests took, by the fault that there was when they were asked."""
+    robots, done = len(loads), outcome.done
+    print(f"seed {seed}: {outcome.asked} requests of {robots} robots, {sum(done.values())} faults")
     print(f"{'fault':<22}{'times':>6}{'requests':>10}{'p50':>10}{'p99':>10}{'longest':>10}")
     for kind in (CALM, *done):
         took = sorted(t for load in loads.values() for t in load.took.get(kind, ()))
@@ -91,14 +127,11 @@ def judge(world: World, loads: Mapping[str, Load], done: Counter[str], seed: int
             p99 = took[min(len(took) - 1, int(0.99 * len(took)))]
             cells = (statistics.median(took), p99, took[-1])
             times = "".join(f"{1e3 * s:>7.0f} ms" for s in cells)
-            print(f"{kind:<22}{done[kind] or '':>6}{len(took):>10}{times}")
-    failed = asked - right - len(wrong)
+            print(f"{kind:<22}{done.get(kind, ''):>6}{len(took):>10}{times}")
     print(
-        f"failed {failed}, wrong {len(wrong)}, unanswered in time {silent}, run twice {len(twice)}"
+        f"failed {outcome.failed}, wrong {len(outcome.wrong)}, unanswered in time "
+        f"{outcome.silent}, run twice {len(outcome.twice)}, server proxies' own count {outcome.ran}"
     )
-    for line in twice[:10]:
-        print(f"run twice: {line}")
-    return 1 if failed or wrong or silent or twice else 0
 
 
 if __name__ == "__main__":
