@@ -162,7 +162,7 @@ class OrderedReplica(Generic[T]):
     def _claim(self, epoch: int, robot: str, to: T) -> list[Effect[T]]:
         if not self.serving:
             return [Refuse(to, NOT_READY)]
-        if self.robot not in ("", robot):
+        if not self._may_obey(robot):
             return [Refuse(to, ordering.held(self.robot))]
         if epoch < self.promised:
             return [Refuse(to, ordering.fenced(self.promised))]
@@ -174,6 +174,9 @@ class OrderedReplica(Generic[T]):
         self._claims.append(to)
         return [*out, *self._go_on()]
 
+    def _may_obey(self, robot: str) -> bool:
+        return self.robot in ("", robot)
+
     def _join(self, payload: bytes, to: T) -> list[Effect[T]]:
         if not self.joined:
             at, goal = ordering.decode_join(payload)
@@ -183,11 +186,19 @@ class OrderedReplica(Generic[T]):
             if at.epoch != self.promised:
                 self._forget_answers()
                 self.position = Position(self.promised, at.index)
-        return [Reply(to, ordering.encode_index(self._expected))]
+        return [Reply(to, self._joined())]
+
+    def _is_behind(self, index: int) -> bool:
+        """Whether the state after this number is one that has been left behind."""
+        return self.joined and index < self._expected
+
+    def _joined(self) -> bytes:
+        """Return what a join or a restore is answered with."""
+        return ordering.encode_index(self._expected)
 
     def _take_restore(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
-        if self.joined and index < self._expected:  # it is behind us: a copy, or not needed
-            return [Reply(to, ordering.encode_index(self._expected))]
+        if self._is_behind(index):  # a copy, or not needed
+            return [Reply(to, self._joined())]
         goal, state = ordering.decode_snapshot(payload)
         out: list[Effect[T]] = self._give_up(NOT_JOINED) if self.joined else []
         self.joined = False
@@ -239,8 +250,8 @@ class OrderedReplica(Generic[T]):
         if self._restore is not None:
             index, payload, to = self._restore
             self._restore = None
-            if self.joined and index < self._expected:
-                out.append(Reply(to, ordering.encode_index(self._expected)))
+            if self._is_behind(index):
+                out.append(Reply(to, self._joined()))
             else:
                 # It may have joined by another restore since; what it was sent then is not for
                 # the state that comes now.
@@ -253,16 +264,24 @@ class OrderedReplica(Generic[T]):
             return [*out, self._begin(Op.SNAPSHOT, self.position.index, waiting)]
         out += [Refuse(to, NOT_JOINED) for to in self._snapshots]
         self._snapshots = []
-        if self._queue:
+        while self._queue and self._work is None:
             index, queued = self._queue.popitem(last=False)
             self._queued_bytes -= len(queued.payload)
-            out.append(self._begin(Op.APPLY, index, queued.waiting, queued.payload))
+            out += self._start(index, queued.payload, queued.waiting)
         return out
+
+    def _start(self, index: int, payload: bytes, waiting: list[T]) -> list[Effect[T]]:
+        """Begin to apply a number."""
+        return [self._begin(Op.APPLY, index, waiting, payload)]
 
     def _tell(self) -> list[Effect[T]]:
         claims, self._claims = self._claims, []
-        promise = ordering.encode_promise(Promise(self.position, self.sound))
+        promise = self._promise()
         return [Reply(to, promise) for to in claims]
+
+    def _promise(self) -> bytes:
+        """Return what a claim is answered with."""
+        return ordering.encode_promise(Promise(self.position, self.sound))
 
     def _begin(self, op: Op, index: int, waiting: list[T], payload: bytes = b"") -> Begin:
         self._serial += 1
@@ -281,25 +300,33 @@ class OrderedReplica(Generic[T]):
         self._work = None
         out: list[Effect[T]]
         if work.op is Op.APPLY:
-            self.position = Position(work.epoch, work.index)
             self.applied += 1
-            self._keep(work.index, answer)
-            out = [
-                Refuse(to, MALFORMED) if answer is None else Reply(to, answer)
-                for to in work.waiting
-            ]
+            out = self._has_applied(Position(work.epoch, work.index), answer, work.waiting)
         elif work.op is Op.SNAPSHOT:
             out = [
                 Refuse(to, NOT_READY)
                 if answer is None
-                else Reply(to, ordering.encode_snapshot(work.index, answer))
+                else Reply(to, ordering.encode_snapshot(work.index, self._snapshot_of(answer)))
                 for to in work.waiting
             ]
         else:
             out = self._restored(work, answer is not None)
         return [*out, *self._go_on()]
 
+    def _has_applied(self, at: Position, answer: bytes | None, waiting: list[T]) -> list[Effect[T]]:
+        self.position = at
+        self._keep(at.index, answer)
+        return [Refuse(to, MALFORMED) if answer is None else Reply(to, answer) for to in waiting]
+
+    def _snapshot_of(self, state: bytes) -> bytes:
+        """Return a snapshot's bytes, given the service's own."""
+        return state
+
+    def _took_state(self, ok: bool) -> None:
+        """A restore has ended; one that failed has left nobody knows what."""
+
     def _restored(self, work: _Work[T], ok: bool) -> list[Effect[T]]:
+        self._took_state(ok)
         if not ok:
             return [Refuse(to, NOT_JOINED) for to in work.waiting]
         self.sound = True
@@ -307,7 +334,7 @@ class OrderedReplica(Generic[T]):
         if work.epoch != self.promised:  # fenced meanwhile
             return [Refuse(to, ordering.fenced(self.promised)) for to in work.waiting]
         self.joined = True
-        return [Reply(to, ordering.encode_index(self._expected)) for to in work.waiting]
+        return [Reply(to, self._joined()) for to in work.waiting]
 
     def _keep(self, index: int, answer: bytes | None) -> None:
         _, _, kept, kept_bytes = self._limits

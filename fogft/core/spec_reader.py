@@ -34,6 +34,7 @@ from fogft.core.spec_plan import (
     read_schedule,
 )
 from fogft.core.spec_services import read_services
+from fogft.core.spec_shared import fewest_replicas, with_founders
 from fogft.core.spec_state import StateSpec
 from fogft.core.spec_task import check_task
 from fogft.core.spec_topics import read_actions, read_topics
@@ -128,6 +129,7 @@ def pool_spec(
     sections = ours.sections("services", "") if services else ()
     for section, service in zip(sections, services, strict=True):
         _check_quorum(section, service, spec)
+    spec = with_founders(spec, sections)
     for section, service in zip(sections, services, strict=True):
         passes_through = spec.rmw.robot is Speaks.ZENOH and not service.needs_type
         if check_types is not None and not passes_through:
@@ -172,8 +174,7 @@ def _judge_topics(ours: Section, check_types: TypeCheck | None) -> None:
 
 def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> None:
     """Refuse a quorum that can never be reached, or at some time of the week cannot."""
-    windows = spec.schedule.windows if spec.schedule else ()
-    fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas is not None)])
+    fewest = fewest_replicas(spec)
     carry = max(fewest, service.replicas)
     if service.quorum > carry:
         where = " in a window of `schedule`" if fewest < spec.replicas else ""

@@ -7,7 +7,7 @@ Not here: the types themselves (`fogft.ros.state_bytes`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from fogft.core import ros_names
@@ -16,7 +16,7 @@ from fogft.core.spec_tree import Section, shown
 SNAPSHOT_TYPE = "nav_msgs/srv/GetMap"
 RESTORE_TYPE = "nav_msgs/srv/SetMap"
 FIELD = "map.data"
-STATE_KEYS = ("snapshot", "restore")
+STATE_KEYS = ("snapshot", "restore", "shared")
 STATE_SERVICE_KEYS = ("name", "type", "field")
 _HINT = "write `state: {snapshot: /svc/get_state, restore: /svc/set_state}`"
 
@@ -37,14 +37,22 @@ class StateService:
 
 @dataclass(frozen=True)
 class StateSpec:
-    """How a service's state is taken and given."""
+    """How a service's state is taken and given.
+
+    Attributes:
+        shared: Whether several robots may use it: a majority of the replicas then counts.
+        founders: How many replicas a shared service needs to begin; 0 where it is not shared.
+    """
 
     snapshot: StateService
     restore: StateService
+    shared: bool = field(default=False, repr=False)
+    founders: int = field(default=0, repr=False, compare=False)
 
-    def to_plain(self) -> dict[str, dict[str, str]]:
+    def to_plain(self) -> dict[str, Any]:
         """Return it as a configuration file has it."""
-        return {"snapshot": vars(self.snapshot).copy(), "restore": vars(self.restore).copy()}
+        ends = {"snapshot": vars(self.snapshot).copy(), "restore": vars(self.restore).copy()}
+        return {**ends, "shared": self.founders} if self.shared else dict(ends)
 
 
 def from_plain(raw: Mapping[str, Any] | None) -> StateSpec | None:
@@ -56,8 +64,12 @@ def from_plain(raw: Mapping[str, Any] | None) -> StateSpec | None:
     """
     if raw is None:
         return None
-    ends = (raw["snapshot"], raw["restore"])
-    return StateSpec(*(StateService(*(str(end[k]) for k in STATE_SERVICE_KEYS)) for end in ends))
+    snapshot, restore = (
+        StateService(*(str(raw[end][k]) for k in STATE_SERVICE_KEYS))
+        for end in ("snapshot", "restore")
+    )
+    founders = int(raw.get("shared", 0))
+    return StateSpec(snapshot, restore, founders > 0, founders)
 
 
 def read_state(service: Section) -> StateSpec | None:
@@ -70,10 +82,11 @@ def read_state(service: Section) -> StateSpec | None:
         return None
     state = service.section("state", _HINT)
     state.only(STATE_KEYS)
-    for key in STATE_KEYS:
+    for key in ("snapshot", "restore"):
         if key not in state.children:
             raise state.error(key, "is missing", _HINT)
-    return StateSpec(_end(state, "snapshot", SNAPSHOT_TYPE), _end(state, "restore", RESTORE_TYPE))
+    ends = (_end(state, "snapshot", SNAPSHOT_TYPE), _end(state, "restore", RESTORE_TYPE))
+    return StateSpec(*ends, shared=state.flag("shared", False))
 
 
 def _end(state: Section, key: str, default_type: str) -> StateService:

@@ -1,17 +1,16 @@
 """One stateful service on the robot: number each request, return the first answer.
 
-The same ways in and out as `dispatcher.Dispatcher`. Decisions are the sequencer's; here are its
-lock, its clock, its file, and the callers who wait. Orders leave in the order in which the
-sequencer made them: `_sending` is held from `take` to the last `offer`.
+The same ways in and out as `dispatcher.Dispatcher`. Decisions are those of its `ServiceOrder`;
+here are its lock, its clock, and the callers who wait. Orders leave in the order in which they
+were made: `_sending` is held from `take` to the last `offer`.
 
-Owns: callers and their deadlines. Not here: numbers (`fogft.core.sequencer`), links.
+Owns: callers and their deadlines. Not here: numbers and terms (`service_order`), links.
 Protocol: docs/design/state.md.
 """
 
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 import time
 from collections import deque
@@ -22,18 +21,21 @@ from fogft.core import ordering
 from fogft.core.errors import RosError
 from fogft.core.hedging import NEVER
 from fogft.core.model import ReplicaId
+from fogft.core.ordered_peer import Order
 from fogft.core.ordering import Op, OrderError
-from fogft.core.sequencer import Handover, Order, Sequencer
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.dispatcher import key_of
 from fogft.proxy.mark import MarkFile
 from fogft.proxy.outcomes import Outcomes
+from fogft.proxy.service_order import Numbered, OrderId, OwnOrder, ServiceOrder, SharedOrder
 from fogft.wire.port import Answer, Link, Refusal
 
 log = logging.getLogger(__name__)
 
 # An order is not given up at its caller's deadline: it must be applied all the same.
 _ATTEMPT_S = 60.0
+# Orders that have the service called: what they end with speaks for or against the replica.
+_COPIES = (Op.APPLY,)
 
 
 class _Caller:
@@ -56,6 +58,7 @@ class OrderedDispatcher:
         spec: The service and its policy.
         respond: Sends a response to the caller of a handle. Any thread.
         mark: What survives this process.
+        robot: This robot's name: others are told who orders a service that they share.
         empty_response: The serialised default response, for ``on_timeout: empty``.
         wake: Has `tick` called soon. Any thread.
         clock: Monotonic seconds.
@@ -69,6 +72,7 @@ class OrderedDispatcher:
         respond: Callable[[Any, bytes], None],
         mark: MarkFile,
         *,
+        robot: str = "",
         empty_response: bytes | None = None,
         wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
@@ -84,27 +88,23 @@ class OrderedDispatcher:
         self._lock = threading.Lock()
         self._sending = threading.Lock()
         self._links: dict[int, Link] = {}
-        self._versions: dict[int, str] = {}
-        self._leaving: list[int] = []
         self._numbered: dict[int, _Caller] = {}
         self._early: deque[_Caller] = deque()
         self._early_bytes = 0
         self._outcomes = Outcomes()
         self._trouble = self._told = ""
-        self._sequencer = self._begin_term()
-
-    def _begin_term(self, above: int = 0, begin: Handover | None = None) -> Sequencer:
-        epoch = self._mark.new_term(secrets.randbits(32), above=above)
-        mark = self._mark.position
-        log.info("term_began service=%s epoch=%x mark=%d", self.spec.name, epoch, mark.index)
-        return Sequencer(epoch, mark=mark, holder=self._mark.holder, begin=begin)
+        shared = spec.state is not None and spec.state.shared
+        founders = spec.state.founders if spec.state is not None else 0
+        self._order: ServiceOrder = (
+            SharedOrder(spec.name, robot, mark, founders) if shared else OwnOrder(spec.name, mark)
+        )
 
     # -- requests -------------------------------------------------------------------------
 
     @property
     def able(self) -> bool:
         """Whether a replica can answer now."""
-        return self._sequencer.ready
+        return self._order.ready
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request, number it, and order it applied by every replica."""
@@ -129,21 +129,19 @@ class OrderedDispatcher:
 
     def _number(self, caller: _Caller) -> bool:
         """Give a request its number, if a replica can take it now. Under the lock."""
-        if not self._sequencer.ready:
-            return False
-        index = self._sequencer.submit(caller.payload)
-        if index is None:
+        number = self._order.submit(caller.payload, self._clock())
+        if number is None:
             return False
         caller.payload = b""
-        self._numbered[index] = caller
+        self._numbered[number] = caller
         return True
 
     def _send(self) -> None:
-        """Send what the sequencer has to send. Not from a link's callback."""
+        """Send what is to be sent. Not from a link's callback."""
         with self._sending:
             with self._lock:
-                orders, epoch, links = self._sequencer.take(), self._sequencer.epoch, self._links
-            for order in orders:
+                orders, links = self._order.take(), self._links
+            for epoch, order in orders:
                 self._offer(order, epoch, links)
 
     def _offer(self, order: Order, epoch: int, links: dict[int, Link]) -> None:
@@ -151,54 +149,60 @@ class OrderedDispatcher:
         id = ordering.encode(order.op, epoch, order.index)
         limit_s = max(_ATTEMPT_S, 4 * self.spec.timeout_s)
         if link is not None and link.offer(self.spec.name, id, order.payload, limit_s):
-            if order.op is Op.APPLY:
+            if order.op in _COPIES:
                 self._outcomes.count["sent"] += 1
             return
         with self._lock:
-            if epoch == self._sequencer.epoch:
-                self._sequencer.declined(order.replica, order.op, order.index, self._clock())
+            self._order.declined(
+                order.replica, (order.op, epoch, order.index), self._clock()
+            )  # fmt: skip
 
     def answered(self, link: Link, answer: Answer) -> None:
         """Take the end of an order from a link's thread."""
-        replica = key_of(link)
-        caller = None
         try:
-            op, epoch, index = ordering.decode(answer.request_id)
+            id = ordering.decode(answer.request_id)
         except OrderError:  # of the time before this service was stateful
             return
-        payload = answer.payload
         with self._lock:
-            sequencer = self._sequencer
-            if epoch != sequencer.epoch:
-                return
             now = self._clock()
-            if payload is None:
-                asked = link.peer.id if op is Op.APPLY else None
-                self._outcomes.refusal(answer.refusal.split(":")[0], asked)
-                sequencer.refused(replica, op, index, answer.refusal, now)
-            else:
-                try:
-                    first = sequencer.replied(replica, op, index, payload)
-                except OrderError as error:
-                    log.warning("order_unreadable service=%s reason=%r", self.spec.name, error)
-                    sequencer.refused(replica, op, index, Refusal.MALFORMED, now)
-                    first = False
-                if op is Op.APPLY:
-                    self._outcomes.served(link.peer.id)
-                if first:
-                    # Before anybody sees the answer.
-                    self._mark.write(sequencer.mark, sequencer.office.holder or "")
-                    caller = self._numbered.pop(index, None)
-                if caller is not None:
-                    self._outcomes.won(link.peer.id, now - caller.arrived, len(payload))
-            ends = sequencer.deposed_by is not None or sequencer.handover is not None
-            sends = sequencer.sends or ends or (op is Op.APPLY and sequencer.changing)
-        if caller is not None and payload is not None:
+            numbered = self._take_end(link, id, answer, now)
+            if numbered is None:
+                return
+            callers = self._callers(numbered)
+            for caller, payload in callers:
+                self._outcomes.won(link.peer.id, now - caller.arrived, len(payload))
+            due = self._order.due
+        for caller, payload in callers:
             self._return(caller.handle, payload)
-        elif op is Op.APPLY and payload is not None:
+        if not callers and id[0] is Op.APPLY and answer.payload is not None:
             self._outcomes.late()
-        if sends:
+        if due:
             self._wake()
+
+    def _take_end(
+        self, link: Link, id: OrderId, answer: Answer, now: float
+    ) -> Sequence[Numbered] | None:
+        """Pass the end of an order on; return what is answered by it. Under the lock."""
+        replica, applies = key_of(link), id[0] in _COPIES
+        refusal = answer.refusal
+        if answer.payload is not None:
+            try:
+                numbered = self._order.replied(replica, id, answer.payload, now)
+            except OrderError as error:
+                log.warning("order_unreadable service=%s reason=%r", self.spec.name, error)
+                refusal = Refusal.MALFORMED
+            else:
+                if applies and numbered is not None:
+                    self._outcomes.served(link.peer.id)
+                return numbered
+        self._outcomes.refusal(refusal.split(":")[0], link.peer.id if applies else None)
+        self._order.refused(replica, id, refusal, now)
+        return ()
+
+    def _callers(self, numbered: Sequence[Numbered]) -> list[tuple[_Caller, bytes]]:
+        """Take out who waits for these answers. Under the lock."""
+        found = [(self._numbered.pop(number, None), answer) for number, answer in numbered]
+        return [(caller, answer) for caller, answer in found if caller is not None]
 
     def late(self, link: Link, request: bytes) -> None:
         """Nothing is ever forgotten here, so no answer comes too late for its link."""
@@ -222,6 +226,7 @@ class OrderedDispatcher:
         """Follow another policy from now on; requests under way keep their deadlines."""
         with self._lock:
             self.spec = spec
+            self._order.adopt(spec.state)
 
     def route(
         self,
@@ -233,20 +238,19 @@ class OrderedDispatcher:
 
         Args:
             links: Them.
-            versions: What each replica runs.
+            versions: What each replica of the pool runs, reached or not.
             leaving: The replicas that are to go soon.
         """
         with self._lock:
             self._links = {key_of(link): link for link in links}
-            self._versions = {
+            known = {
                 key: (versions or {}).get(link.peer.id, "") for key, link in self._links.items()
             }
-            self._leaving = [k for k, link in self._links.items() if link.peer.id in leaving]
-            self._reach(self._clock())
+            going = [key for key, link in self._links.items() if link.peer.id in leaving]
+            self._order.reach(
+                self._links, self._clock(), known, going, max(len(versions or {}), len(self._links))
+            )
         self._send()
-
-    def _reach(self, now: float) -> None:
-        self._sequencer.reach(self._links, now, versions=self._versions, leaving=self._leaving)
 
     def tick(self) -> float:
         """Number what waited, send what is due, let callers' deadlines come. Call at 50 Hz.
@@ -256,38 +260,26 @@ class OrderedDispatcher:
         """
         now = self._clock()
         with self._lock:
-            if self._sequencer.deposed_by is not None:
-                self._depose(now)
-            self._sequencer.tick(now)
-            if self._sequencer.handover is not None:
-                self._hand_over(self._sequencer.handover, now)
+            answers = self._callers(self._order.tick(now))
+            for _, payload in answers:
+                self._outcomes.count["answered"] += 1
+                self._outcomes.count["response_bytes"] += len(payload)
             expired = self._expired(now)
             while self._early and self._number(self._early[0]):
                 self._early_bytes -= self._early.popleft().size
             self._look_for_trouble()
         self._send()
+        for caller, payload in answers:
+            self._return(caller.handle, payload)
         for caller in expired:
             self._time_out(caller)
         return NEVER
-
-    def _depose(self, now: float) -> None:
-        """A later term is obeyed: this robot's own, of which its file has lost track."""
-        above = self._sequencer.deposed_by or 0
-        log.warning("term_ended service=%s obeyed=%x", self.spec.name, above)
-        self._sequencer = self._begin_term(above)
-        self._reach(now)
-
-    def _hand_over(self, begin: Handover, now: float) -> None:
-        """Another version takes over: all numbers given are answered, and none waits."""
-        log.info("office_changed service=%s version=%s", self.spec.name, begin.version)
-        self._sequencer = self._begin_term(begin=begin)
-        self._reach(now)
 
     def _expired(self, now: float) -> list[_Caller]:
         """Take out the callers whose deadline has come. Under the lock."""
         numbered = [i for i, caller in self._numbered.items() if caller.deadline <= now]
         for index in numbered:
-            self._sequencer.abandon(index)
+            self._order.abandon(index)
         expired = [self._numbered.pop(index) for index in numbered]
         while self._early and self._early[0].deadline <= now:
             self._early_bytes -= self._early[0].size
@@ -307,12 +299,7 @@ class OrderedDispatcher:
             self._return(caller.handle, self._empty_response)
 
     def _look_for_trouble(self) -> None:
-        sequencer = self._sequencer
-        trouble = ""
-        if sequencer.held_by:
-            trouble = f"robot `{sequencer.held_by}` orders this service"
-        elif sequencer.stranded:
-            trouble = "no replica that can be reached holds the state; see docs/design/state.md"
+        trouble = self._order.trouble
         if trouble and trouble != self._told:
             self._told = trouble
             log.error("state_unavailable service=%s reason=%r", self.spec.name, trouble)
@@ -331,21 +318,11 @@ class OrderedDispatcher:
     def report(self) -> dict[str, Any]:
         """Return counters, latency quantiles (seconds) and the state of the order."""
         with self._lock:
-            sequencer, log_ = self._sequencer, self._sequencer.log
             return {
                 **self._outcomes.report(),
                 "pending": len(self._numbered) + len(self._early),
-                "pending_bytes": self._early_bytes + (log_.held_bytes if log_ else 0),
-                "order": {
-                    "epoch": sequencer.epoch >> 32,
-                    "last": log_.last if log_ else None,
-                    "answered": sequencer.mark.index,
-                    "joined": len(sequencer.joined),
-                    "version": sequencer.office.holder or "",
-                    "log": len(log_) if log_ else 0,
-                    "checkpoint": log_.checkpoint.index if log_ and log_.checkpoint else None,
-                    "trouble": self._trouble,
-                },
+                "pending_bytes": self._early_bytes + self._order.held_bytes,
+                "order": {**self._order.report(), "trouble": self._trouble},
             }
 
     def close(self) -> None:

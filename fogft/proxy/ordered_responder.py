@@ -11,6 +11,7 @@ Not here: decisions (`fogft.core.ordered_replica`), what the bytes of a state se
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from fogft.core import ordering
 from fogft.core.errors import RosError, Unreadable
 from fogft.core.ordered_replica import Begin, OrderedReplica, Refuse, Reply
 from fogft.core.ordering import Op, OrderError
+from fogft.core.shared_replica import SharedReplica
 from fogft.ros.port import RosClient
 from fogft.wire.port import Incoming, Refusal
 
@@ -65,16 +67,25 @@ class OrderedResponder:
         name: The service's name.
         state: How its state travels.
         clock: Monotonic seconds.
+        shared: Whether several robots may order it.
     """
 
     def __init__(
-        self, name: str, state: StateBytes, clock: Callable[[], float] = time.monotonic
+        self,
+        name: str,
+        state: StateBytes,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        shared: bool = False,
     ) -> None:
         self._name = name
         self._state = state
         self._clock = clock
         self._lock = threading.Lock()
-        self._machine: OrderedReplica[Incoming] = OrderedReplica()
+        # Another process is another member: it knows nothing of what this one promised.
+        self._machine: OrderedReplica[Incoming] = (
+            SharedReplica(secrets.randbits(64)) if shared else OrderedReplica()
+        )
         self._clients: Clients | None = None
         self._begun: Begin | None = None
         self._begun_at = 0.0

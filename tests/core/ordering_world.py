@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fogft.core import ordering
+from fogft.core.ordered_peer import Order
 from fogft.core.ordered_replica import Begin, OrderedReplica, Refuse, Reply
 from fogft.core.ordering import START, Op
-from fogft.core.sequencer import Order, Sequencer
+from fogft.core.sequencer import Sequencer
 from tests.linearizability import Call
 
 LOST = "lost"

@@ -1,0 +1,328 @@
+"""Several robots that share a service, its replicas, and a network that loses, repeats, reorders
+and may be cut between any robot and any replica. Each step does one thing, chosen from outside.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, field
+from typing import Any
+
+from fogft.core import ordering
+from fogft.core.ordered_replica import Begin, Refuse, Reply
+from fogft.core.ordering import START, Op, Position
+from fogft.core.shared_replica import SharedReplica
+from fogft.core.shared_robot import Outgoing, SharedRobot
+from tests.core.ordering_world import LOST, Asked
+from tests.linearizability import Call
+
+
+@dataclass(eq=False)
+class Sent:
+    """An order on its way, until it ends: exactly once."""
+
+    robot: Robot
+    host: Host
+    what: Outgoing
+
+
+@dataclass(eq=False)
+class Letter:
+    """Something in the network: an order (to a replica), or its end (to a robot)."""
+
+    sent: Sent
+    to_replica: bool
+    payload: bytes | None = None
+    reason: str = ""
+
+
+@dataclass(eq=False)
+class Host:
+    """A replica: one process of the server proxy, with a service under it."""
+
+    replica: int
+    machine: SharedReplica[Sent]
+    state: Any = None
+    work: Begin | None = None
+    applied: list[Any] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Robot:
+    """One run of a client proxy."""
+
+    name: str
+    brain: SharedRobot
+    pending: dict[int, Asked] = field(default_factory=dict)
+
+
+class SharedWorld:
+    """The whole of it, with one history of what all callers saw.
+
+    Args:
+        step: The service: state and question in, next state and answer out.
+        start: The service's first state.
+        source: Chance.
+        log_entries: Of a sequencer.
+    """
+
+    def __init__(
+        self, step: Any, start: Any, source: random.Random, *,
+        robots: int = 2, replicas: int = 3, log_entries: int = 64,
+    ) -> None:  # fmt: skip
+        self.step, self.start, self.source = step, start, source
+        self.now = 0.0
+        self.log_entries = log_entries
+        self.letters: list[Letter] = []
+        self.open: dict[Sent, None] = {}  # orders that have not ended
+        self.history: list[Call] = []
+        self.questions: dict[bytes, Any] = {}
+        self.cut: set[tuple[str, int]] = set()
+        self.hosts: dict[int, Host] = {}
+        self.robots: dict[str, Robot] = {}
+        self.marks: dict[str, Position] = {}  # on the robots' disks
+        self.epochs: dict[str, int] = {}  # likewise
+        self.next_replica = 0
+        self.asked = 0
+        self.moved = 0
+        self.killed = 0  # calls whose proxy was killed
+        self.sequencers: set[int] = set()
+        for _ in range(replicas):
+            self.add_replica()
+        for number in range(robots):
+            self.start_robot(f"r{number}")
+
+    # -- faults and events ----------------------------------------------------------------
+
+    def add_replica(self) -> int:
+        replica, self.next_replica = self.next_replica, self.next_replica + 1
+        self.begin_process(replica)
+        self.reach()
+        return replica
+
+    def begin_process(self, replica: int) -> None:
+        host = Host(replica, SharedReplica(self.source.getrandbits(64)), self.start)
+        host.machine.serving = True
+        self.hosts[replica] = host
+
+    def kill_process(self, replica: int) -> None:
+        """The server proxy is killed and started again: it remembers nothing."""
+        self.lose_all(lambda sent: sent.host.replica == replica)
+        self.begin_process(replica)
+
+    def remove_replica(self, replica: int) -> None:
+        """The machine is gone for good."""
+        del self.hosts[replica]
+        self.lose_all(lambda sent: sent.host.replica == replica)
+        self.reach()
+
+    def crash_service(self, replica: int) -> None:
+        """The service dies and starts anew, in its first state."""
+        host = self.hosts[replica]
+        host.work, host.state, host.applied = None, self.start, []
+        self.effects(host, host.machine.lost())
+        host.machine.serving = True
+
+    def start_robot(self, name: str) -> None:
+        """A client proxy begins; one that was killed has only its epoch and its mark left."""
+
+        def new_epoch(above: int) -> int:
+            known = max(above, self.epochs.get(name, 0))
+            self.epochs[name] = ordering.next_epoch(known, self.source.getrandbits(32))
+            return self.epochs[name]
+
+        brain = SharedRobot(
+            self.source.getrandbits(63) + 1, new_epoch, self.source.random,
+            mark=self.marks.get(name, START), log_entries=self.log_entries,
+        )  # fmt: skip
+        self.robots[name] = Robot(name, brain)
+        self.reach()
+
+    def kill_robot(self, name: str) -> None:
+        robot = self.robots.pop(name)
+        self.killed += len(robot.pending)
+        for asked in robot.pending.values():
+            self.history.append(Call(asked.began, asked.asked))
+
+    def reach(self) -> None:
+        for robot in self.robots.values():
+            near = [r for r in self.hosts if (robot.name, r) not in self.cut]
+            robot.brain.reach(near, self.now, listed=len(self.hosts))
+            self.send(robot)
+
+    def cut_off(self, name: str, replica: int) -> None:
+        self.cut.add((name, replica))
+        self.lose_all(lambda sent: (sent.robot.name, sent.host.replica) == (name, replica))
+        self.reach()
+
+    def heal(self) -> None:
+        self.cut.clear()
+        self.reach()
+
+    def lose_all(self, which: Any) -> None:
+        for sent in [sent for sent in self.open if which(sent)]:
+            self.end(sent, None, LOST)
+
+    # -- callers --------------------------------------------------------------------------
+
+    def ask(self, name: str, client: int, asked: Any) -> None:
+        robot = self.robots[name]
+        self.asked += 1
+        payload = repr((self.asked, asked)).encode()
+        self.questions[payload] = asked
+        seq = robot.brain.submit(payload, self.now)
+        assert seq is not None
+        robot.pending[seq] = Asked(self.now, asked, client)
+        self.send(robot)
+
+    def busy(self, name: str) -> set[int]:
+        return {asked.client for asked in self.robots[name].pending.values()}
+
+    def give_up(self, name: str, client: int) -> None:
+        """A caller's deadline has come."""
+        robot = self.robots[name]
+        for seq, asked in list(robot.pending.items()):
+            if asked.client == client:
+                del robot.pending[seq]
+                robot.brain.abandon(seq)
+                self.history.append(Call(asked.began, asked.asked))
+
+    def take_answers(self, robot: Robot) -> None:
+        for answered in robot.brain.take_answers():
+            self.marks[robot.name] = robot.brain.mark
+            asked = robot.pending.pop(answered.seq)
+            answer = eval(answered.answer.decode())
+            self.history.append(Call(asked.began, asked.asked, self.now, answer))
+
+    def tick(self, seconds: float = 0.1) -> None:
+        self.now += seconds
+        for robot in self.robots.values():
+            robot.brain.tick(self.now)
+            self.take_answers(robot)
+            self.send(robot)
+            term = robot.brain.term
+            if term is not None and term.base is not None and term.epoch not in self.sequencers:
+                self.sequencers.add(term.epoch)
+                self.moved += 1
+
+    # -- network --------------------------------------------------------------------------
+
+    def send(self, robot: Robot) -> None:
+        for what in robot.brain.take():
+            host = self.hosts.get(what.order.replica)
+            if host is not None and (robot.name, host.replica) not in self.cut:
+                sent = Sent(robot, host, what)
+                self.open[sent] = None
+                self.letters.append(Letter(sent, to_replica=True))
+            else:
+                id = (what.order.op, what.epoch, what.order.index)
+                robot.brain.declined(what.order.replica, id, self.now)
+
+    def deliver(self, at: int, *, keep: bool = False) -> None:
+        """Let a letter arrive; with `keep` it will arrive once more."""
+        letter = self.letters[at]
+        if not keep:
+            self.letters[at] = self.letters[-1]
+            self.letters.pop()
+        if letter.to_replica:
+            self.arrive(letter.sent)
+        else:
+            self.end(letter.sent, letter.payload, letter.reason)
+
+    def lose(self, at: int) -> None:
+        """The sender is told that a letter was lost: it may arrive all the same."""
+        self.end(self.letters[at].sent, None, LOST)
+
+    def arrive(self, sent: Sent) -> None:
+        host = self.hosts.get(sent.host.replica)
+        if host is None or (sent.robot.name, host.replica) in self.cut:
+            self.end(sent, None, LOST)
+            return
+        order = sent.what.order
+        op, epoch, index = ordering.decode(
+            ordering.encode(order.op, sent.what.epoch, order.index)
+        )  # fmt: skip
+        effects = host.machine.order(
+            op, epoch, index, order.payload, robot=sent.robot.name, to=sent
+        )  # fmt: skip
+        self.effects(host, effects)
+
+    def effects(self, host: Host, effects: list[Any]) -> None:
+        for effect in effects:
+            if isinstance(effect, Reply):
+                self.letters.append(Letter(effect.to, False, effect.payload))
+            elif isinstance(effect, Refuse):
+                self.letters.append(Letter(effect.to, False, None, effect.reason))
+            else:
+                assert host.work is None, "the service was given two things at once"
+                host.work = effect
+
+    def end(self, sent: Sent, payload: bytes | None, reason: str) -> None:
+        if self.open.pop(sent, sent) is sent:
+            return
+        robot, order = sent.robot, sent.what.order
+        if self.robots.get(robot.name) is not robot:
+            return  # it was killed
+        id = (order.op, sent.what.epoch, order.index)
+        if payload is None:
+            robot.brain.refused(order.replica, id, reason, self.now)
+        else:
+            robot.brain.replied(order.replica, id, payload, self.now)
+        self.take_answers(robot)
+        self.send(robot)
+
+    # -- services -------------------------------------------------------------------------
+
+    def work(self, replica: int) -> None:
+        """The service ends what it does."""
+        host = self.hosts[replica]
+        begun, host.work = host.work, None
+        assert begun is not None
+        answer: bytes | None
+        if begun.op is Op.APPLY:
+            host.state, result = self.step(host.state, self.questions[begun.payload])
+            assert begun.payload not in host.applied, "a request was applied twice"
+            host.applied.append(begun.payload)
+            answer = repr(result).encode()
+        elif begun.op is Op.SNAPSHOT:
+            answer = repr((host.state, host.applied)).encode()
+        else:
+            host.state, host.applied = eval(begun.payload.decode())
+            answer = b""
+        self.effects(host, host.machine.done(begun.serial, answer))
+
+    def working(self) -> list[int]:
+        return [replica for replica, host in self.hosts.items() if host.work is not None]
+
+    # -- the end --------------------------------------------------------------------------
+
+    def settle(self, limit: int = 30_000, until: Any = None) -> bool:
+        """No more faults: let everything come to rest. Return whether it did."""
+        until = until or self.at_rest
+        for _ in range(limit):
+            if until():
+                break
+            self.now += 0.0005
+            working = self.working()
+            if self.letters:
+                self.deliver(0)
+            elif working:
+                self.work(working[0])
+            else:
+                self.tick(0.1)
+        return bool(until())
+
+    def finish(self) -> None:
+        """Write down the calls that were never answered."""
+        for robot in self.robots.values():
+            for asked in robot.pending.values():
+                self.history.append(Call(asked.began, asked.asked, math.inf))
+            robot.pending.clear()
+
+    def at_rest(self) -> bool:
+        """Whether all is answered, and all replicas are in one state."""
+        machines = [host.machine for host in self.hosts.values()]
+        calm = not self.working() and not any(r.pending for r in self.robots.values())
+        joined = all(m.current for m in machines) and len({m.position for m in machines}) == 1
+        return calm and joined
