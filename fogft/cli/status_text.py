@@ -74,10 +74,25 @@ def headline(seen: Seen, *, colour: bool) -> str:
 
 def notes(status: PoolStatus, *, colour: bool) -> list[str]:
     """Return the sentences below the tables."""
-    found = list(status.notes)
+    found = [*status.notes, *_orders(status.services)]
     if status.excluded:
         found.append(f"excluded: {', '.join(status.excluded)}")
     return [f"{Cell('note:', 'note').painted(colour=colour)} {note}" for note in found]
+
+
+def _orders(rows: Sequence[ServiceStatus]) -> list[str]:
+    """Return who orders the requests of services that several robots share, and what is wrong."""
+    found = []
+    for row in rows:
+        order = row.counters.get("order") or {}
+        if order.get("trouble"):
+            found.append(f"`{row.name}` cannot be had: {order['trouble']}")
+        elif order.get("sequencer"):
+            found.append(
+                f"`{row.name}` is ordered by robot `{order['sequencer']}`, "
+                f"and {order['members']} replicas have a vote"
+            )
+    return found
 
 
 def replicas(

@@ -23,7 +23,7 @@ from fogft.core.shared_sequencer import Answered, SharedSequencer
 
 LOOK_EVERY_S = 0.25
 STALE_S = 1.5
-SILENCE_S = 1.5
+SILENCE_S = 2.0
 FIRST_SILENCE_S = 0.2
 TROUBLE_AFTER_S = 10.0
 RETRY_S = 1.0

@@ -98,6 +98,22 @@ def test_what_sounds_alarm_stands_in_the_first_line(home, capsys):
     assert first.endswith("NO MANAGER  NO CLIENT PROXY  UPLINK SUSPECTED  ENDING")
 
 
+@pytest.mark.parametrize(
+    ("trouble", "note"),
+    [
+        ("", "note: `/plan` is ordered by robot `one`, and 3 replicas have a vote"),
+        ("most are away", "note: `/plan` cannot be had: most are away"),
+    ],
+)
+def test_who_orders_a_shared_service_stands_below(home, capsys, trouble, note):
+    order = {"sequencer": "one", "members": 3, "trouble": trouble}
+    (service,) = STATUS.services
+    service = replace(service, counters={**service.counters, "order": order})
+    lay_down(home, replace(STATUS, services=(service,)))
+    main.run(["status"])
+    assert note in capsys.readouterr().out.splitlines()
+
+
 def test_a_pool_that_nobody_looked_at_yet_has_the_same_schema(home, capsys):
     lay_down(home, None)
     assert main.run(["status", "--json"]) == 0

@@ -7,6 +7,7 @@ import random
 import pytest
 
 from fogft.core import lag, ordered_term
+from fogft.core.shared_robot import AHEAD, SharedRobot
 from tests.core.shared_world import SharedWorld
 from tests.core.test_ordering_simulated import ask_counter, ask_key_value
 from tests.linearizability import counter, key_value, linearizable
@@ -131,3 +132,129 @@ def whole(world: SharedWorld):
         return world.at_rest() and books == {frozenset(members)}
 
     return holds
+
+
+def begun(robots: int = 2, replicas: int = 3) -> SharedWorld:
+    world = SharedWorld(counter, 0, random.Random(1), robots=robots, replicas=replicas)
+    assert world.settle(4000, whole(world))
+    return world
+
+
+def sequencer_of(world: SharedWorld) -> str:
+    (name,) = [n for n, robot in world.robots.items() if robot.brain.term is not None]
+    return name
+
+
+def answers(world: SharedWorld) -> list[int]:
+    return [call.answer for call in world.history if call.answered]
+
+
+def test_another_robot_goes_on_when_the_sequencer_is_lost():
+    """What it had been answered is there, and what had been handed in is answered once."""
+    world = begun()
+    first = sequencer_of(world)
+    (other,) = world.robots.keys() - {first}
+    for name in (first, other):
+        world.ask(name, 0, ("add", 1))
+        assert world.settle(2000)
+    world.ask(other, 0, ("add", 1))
+    world.kill_robot(first)
+    assert world.settle(4000)
+    assert answers(world) == [1, 2, 3]
+    assert sequencer_of(world) == other
+
+
+def test_a_sequencer_without_a_majority_answers_nothing_and_another_goes_on():
+    """Each robot reaches other replicas; where two are, it goes on, and nothing is lost."""
+    world = begun()
+    first = sequencer_of(world)
+    (other,) = world.robots.keys() - {first}
+    world.cut_off(first, 0)
+    world.cut_off(first, 1)
+    world.cut_off(other, 2)
+    world.ask(first, 0, ("add", 5))
+    world.ask(other, 0, ("add", 1))
+    assert world.settle(3000, lambda: bool(world.history))
+    world.settle(200, lambda: False)
+    assert answers(world) == [1], "nobody was there to agree with the first"
+    world.heal()
+    assert world.settle(4000)
+    assert answers(world) == [1, 6]
+    assert sequencer_of(world) == other
+
+
+def test_one_replica_that_both_reach_is_enough_to_be_answered_through():
+    """Cut off from two of three, a robot hands in at the third, which obeys the other one."""
+    world = begun()
+    first = sequencer_of(world)
+    world.cut_off(first, 0)
+    world.cut_off(first, 1)
+    world.ask(first, 0, ("add", 5))
+    assert world.settle(3000)
+    assert answers(world) == [5]
+    assert sequencer_of(world) != first
+
+
+def test_the_services_of_all_replicas_die_while_proxies_and_sequencer_live():
+    """They are restored from checkpoint and log."""
+    world = begun()
+    for _ in range(50):
+        world.ask(sequencer_of(world), 0, ("add", 1))
+        assert world.settle(2000)
+    for replica in world.hosts:
+        world.crash_service(replica)
+    world.ask(sequencer_of(world), 0, ("add", 1))
+    assert world.settle(20_000)
+    assert answers(world) == list(range(1, 52))
+
+
+def test_a_majority_lost_at_once_is_said_and_never_answered_from_an_older_state():
+    """One of three is left, and might lack what the two others had: nobody answers any more."""
+    world = begun()
+    world.ask("r0", 0, ("add", 5))
+    assert world.settle(2000)
+    world.kill_process(0)
+    world.kill_process(1)
+    for name in ("r0", "r1"):
+        world.kill_robot(name)
+        world.start_robot(name)
+        world.ask(name, 0, ("get", 0))
+    assert not world.settle(3000)
+    assert answers(world) == [5]
+    troubles = {robot.brain.trouble for robot in world.robots.values()}
+    assert any("most of the 3 replicas that have the state" in trouble for trouble in troubles)
+
+
+def test_new_replicas_alone_do_not_begin_anew_for_a_robot_that_was_answered():
+    world = begun(robots=1)
+    world.ask("r0", 0, ("add", 5))
+    assert world.settle(2000)
+    for replica in list(world.hosts):
+        world.kill_process(replica)
+    world.kill_robot("r0")
+    world.start_robot("r0")
+    world.ask("r0", 0, ("get", 0))
+    assert not world.settle(2000)
+    assert answers(world) == [5]
+
+
+def test_a_service_begins_only_with_all_replicas_that_the_pool_has():
+    """Two of three might be all that one robot sees, and the third with others all of another."""
+    world = SharedWorld(counter, 0, random.Random(1))
+    for name in world.robots:
+        world.cut_off(name, 2)
+    world.ask("r0", 0, ("add", 1))
+    assert not world.settle(500)
+    assert all("2 of 3 replicas" in robot.brain.trouble for robot in world.robots.values())
+    world.heal()
+    assert world.settle(4000)
+    assert answers(world) == [1]
+
+
+def test_a_robot_that_waits_for_much_is_given_no_more_numbers():
+    """Replicas keep the answers to all that a robot may still ask for."""
+    brain = SharedRobot(1, lambda above: above + 1, lambda: 0.5)
+    assert all(brain.submit(b"", 0.0) is not None for _ in range(AHEAD))
+    assert brain.submit(b"", 0.0) is None
+    brain.abandon(1)
+    assert brain.submit(b"", 0.0) is not None
