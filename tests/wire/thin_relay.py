@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import random
 import socket
 import threading
 import time
@@ -24,6 +25,7 @@ class ThinRelay:
     Attributes:
         bytes_per_s: As given.
         delay_s: What passes is held up by so long.
+        jitter_s: And by up to so much more.
         endpoint: ``host:port`` where it listens.
         open: Clear it, and nothing passes until it is set again.
         passed_bytes: What has passed, both ways together.
@@ -35,7 +37,8 @@ class ThinRelay:
         far, _, port = target.rpartition(":")
         self._target = (far, int(port))
         self.bytes_per_s = bytes_per_s
-        self.delay_s = 0.0
+        self.delay_s = self.jitter_s = 0.0
+        self._chance = random.Random(1)
         self._server = socket.socket()
         # Small buffers, set before listening: what waits shall wait at the sender.
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
@@ -77,7 +80,8 @@ class ThinRelay:
                     begin = max(self._next[way], time.monotonic())
                     self._next[way] = begin + len(data) / self.bytes_per_s
                     self.passed_bytes += len(data)
-                time.sleep(max(0.0, self._next[way] - time.monotonic()) + self.delay_s)
+                late_s = self.delay_s + self._chance.uniform(0.0, self.jitter_s)
+                time.sleep(max(0.0, self._next[way] - time.monotonic()) + late_s)
                 self.open.wait()
                 sink.sendall(data)
         for end in (source, sink):
