@@ -191,6 +191,40 @@ class Process:
                 stream.close()
 
 
+class ServerProxy:
+    """A server proxy without ROS, whose service echoes; see `plain_replica`.
+
+    Args:
+        pool: Whose.
+        slot: Its slot; the launch is the first.
+        extra: Further lines of its configuration.
+    """
+
+    def __init__(self, pool: GatewayPool, slot: int, extra: str = "") -> None:
+        self.endpoint = f"127.0.0.1:{free_port()}"
+        self._log = pool.folder / f"replica{slot}.log"
+        self._config = pool.folder / f"replica{slot}.yaml"
+        files = pool.authority.replica(slot)
+        self._config.write_text(
+            f'pool: p\npool_uid: "{POOL_UID}"\nslot: {slot}\ngeneration: 1\n'
+            f"listen: {self.endpoint}\nadvertise: {self.endpoint}\nnotice: none\n"
+            f"services: [{{name: {SERVICE}, type: {TYPE}}}]\nrun: 0 {pool.folder / 'ran'}\n{extra}"
+            f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
+        )
+        self.start()
+
+    def start(self) -> None:
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(
+                tied([sys.executable, "-m", "tests.proxy.plain_replica", str(self._config)]),
+                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
 class Robot(Process):
     """A client proxy without ROS; see `plain_robot`."""
 

@@ -7,57 +7,26 @@ is revoked stands in records only.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fogft.child import tied
 from fogft.core import names
 from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.records import RecordKind
 from fogft.core.roster import admission_content
 from fogft.core.topology import Gateway, Topology
 from fogft.wire import record_cache
-from tests.proxy.gateway_pool import ROOT, GatewayPool, Process
+from tests.proxy.gateway_pool import GatewayPool, Process, ServerProxy
 from tests.wire.rendezvous_pool import Party, Rendezvous, free_port, manager_files
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, wait_for
+from tests.wire.wire_pool import POOL_UID, wait_for
 
 pytestmark = pytest.mark.timeout(180)
 
 LIMIT_S = 90.0
 ID = ReplicaId(POOL_UID, 0, 1)
 EVE = names.robot_certificate_name(POOL_UID, "eve")
-
-
-class Replica:
-    """A server proxy that dials doors of which it can know from records only."""
-
-    def __init__(self, pool: GatewayPool, meeting: str) -> None:
-        self.endpoint = f"127.0.0.1:{free_port()}"
-        self._log = pool.folder / "replica.log"
-        self._config = pool.folder / "replica.yaml"
-        files = pool.authority.replica(0)
-        self._config.write_text(
-            f'pool: p\npool_uid: "{POOL_UID}"\nslot: 0\ngeneration: 1\nlisten: {self.endpoint}\n'
-            f"notice: none\nservices: [{{name: {SERVICE}, type: {TYPE}}}]\n"
-            f"run: 0 {pool.folder / 'ran'}\ndial_out: ['127.0.0.1:1']\n{meeting}"
-            f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
-        )
-        self.start()
-
-    def start(self) -> None:
-        with self._log.open("ab") as log:
-            self.process = subprocess.Popen(
-                tied([sys.executable, "-m", "tests.proxy.plain_replica", str(self._config)]),
-                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-            )  # fmt: skip
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
 
 
 class Scene:
@@ -73,11 +42,12 @@ class Scene:
         say = self.manager.client.publish
         say(RecordKind.ADMISSION, "", 2, admission_content(admitted), sequence=1)
         say(RecordKind.REVOCATION, "", 2, {"names": [EVE]})
-        self.replica = Replica(pool, self._meeting("replica"))
+        dials = "dial_out: ['127.0.0.1:1']\n"  # who is where it learns from records
+        self.replica = ServerProxy(pool, 0, dials + self._meeting("replica"))
         edge = pool.gateway("edge", listen=at, extra=self._meeting("edge") + self._door())
         self.ada = pool.robot("ada", extra=self._meeting("ada"))
         self.bob = pool.robot("bob", extra=self._meeting("bob") + self._door(door), first=1_000_000)
-        self.proxies: tuple[Process | Replica, ...] = (self.replica, edge, self.ada, self.bob)
+        self.proxies: tuple[Process | ServerProxy, ...] = (self.replica, edge, self.ada, self.bob)
 
     def _meeting(self, stem: str) -> str:
         return f"rendezvous: ['{self.rendezvous.endpoint}']\nrecords: {stem}-records.json\n"

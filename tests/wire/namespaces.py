@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 
 _CLONE_NEWNET = 0x40000000
 _ETHERNET_HEADER_BYTES = 14
@@ -89,6 +90,11 @@ class Namespaces:
     def by_packets(self, where: str, cable: str) -> None:
         """Have packets leave one by one, as on a real cable, so that their headers are counted."""
         _run("ip", "-n", where, "link", "set", "dev", cable, "gso_max_segs", "1")
+
+    def forward(self, where: str) -> None:
+        """Have a namespace pass on what is not for itself."""
+        with inside(where):
+            Path("/proc/sys/net/ipv4/ip_forward").write_text("1")
 
     def sent_bytes(self, where: str, cable: str) -> int:
         """Return how many bytes of IP have left on a cable, the headers of IP and TCP included."""
