@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import stat
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -137,3 +141,32 @@ def test_a_bundle_is_not_written_over(paths, capsys):
     assert run("credentials", "issue", "robot", "ada") == 1
     assert "exists" in capsys.readouterr().err
     assert len(Ledger(paths.credentials).entries()) == 1
+
+
+CRASH = """
+from fogft import disk
+from fogft.cli import main
+def write_whole(path, content, *, durable=True):
+    raise RuntimeError("boom")
+disk.write_whole = write_whole
+main.main(["join", "ada.join", "--passphrase-file", "told"])
+"""
+
+
+def test_a_crash_report_holds_no_secret(paths, tmp_path, capsys, monkeypatch):
+    """An error that nobody thought of ends `fogft join` while key and passphrase are in hand."""
+    monkeypatch.undo()  # the other process needs as long as ever for a passphrase
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    passphrase = issue_ada(capsys)
+    (tmp_path / "told").write_text(passphrase + "\n")
+    ended = subprocess.run(
+        [sys.executable, "-c", CRASH],
+        env={**os.environ, "FOGFT_HOME": str(tmp_path / "another machine")},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "RuntimeError: boom" in ended.stderr
+    key = bundle.open_sealed((tmp_path / "ada.join").read_bytes(), passphrase, time.time())[1]
+    secrets = key["files"]["credentials/robot.key"].splitlines()[1:-1]
+    for secret in (passphrase, "BEGIN", *secrets):
+        assert secret not in ended.stdout + ended.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from fogft.core.roster import admission_content
 from fogft.pool.credentials import Role
 from fogft.wire import record_cache
 from fogft.wire.signing import Signer
-from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
+from tests.wire.rendezvous_pool import Party, Rendezvous, free_port, manager_files
 from tests.wire.wire_pool import POOL_UID, Authority, Files, wait_for
 
 
@@ -120,6 +121,46 @@ def test_one_of_two_suffices_and_callers_carry_records_across(authority, rendezv
     party(authority.replica(0), b).announce(0, 1, "10.0.0.1:1")
     for one in (robot, both):
         wait_for(lambda one=one: one.endpoint(0) == "10.0.0.1:1")
+
+
+def test_one_that_is_started_elsewhere_is_found_by_its_name_or_in_the_list(
+    authority, party, monkeypatch
+):
+    """Another machine, with no memory; what joined meanwhile is known there too.
+
+    The robot knows it by a name, which means another address then; the manager and the replica
+    by a list, where the new one is the second.
+    """
+    hosts, port = ["127.0.0.1", "127.0.0.2"], free_port()
+    find, at = socket.getaddrinfo, [hosts[0]]
+
+    def found(host: str, *rest: object, **named: object) -> object:
+        return find(at[0] if host == "meet.test" else host, *rest, **named)
+
+    monkeypatch.setattr(socket, "getaddrinfo", found)
+    first = Rendezvous(authority, "a", endpoint=f"{hosts[0]}:{port}")
+    listed = [f"{host}:{port}" for host in hosts]
+    robot = Party(authority.robot(), f"meet.test:{port}")
+    manager = Party(manager_files(authority), *listed)
+    others = [robot, manager]
+    try:
+        manager.admit(1, (0, 1))
+        wait_for(lambda: robot.endpoint(0) == "")
+        first.kill()
+        wait_for(lambda: not robot.client.known.connected and not manager.client.known.connected)
+        manager.admit(2, (0, 1), (1, 1))
+        others.append(Party(authority.replica(1), *listed))
+        others[-1].announce(1, 1, "10.0.0.2:1")
+        at[0] = hosts[1]
+        second = Rendezvous(authority, "b", endpoint=listed[1])
+        try:
+            wait_for(lambda: robot.endpoint(1) == "10.0.0.2:1")
+        finally:
+            second.kill()
+    finally:
+        first.kill()
+        for one in others:
+            one.client.close()
 
 
 def test_a_restarted_writer_goes_on_above_what_it_said(authority, rendezvous, party):
