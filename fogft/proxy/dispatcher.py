@@ -73,6 +73,7 @@ class Dispatcher:
         wake: Has `tick` called soon. Any thread.
         clock: Monotonic seconds.
         max_pending_bytes: Requests kept at once, in bytes; more are turned away and counted.
+        max_pending: The same, by number.
     """
 
     def __init__(
@@ -85,6 +86,7 @@ class Dispatcher:
         wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         max_pending_bytes: int = 256 << 20,
+        max_pending: int = 1 << 16,
     ) -> None:
         self.spec = spec
         self._respond = respond
@@ -94,6 +96,7 @@ class Dispatcher:
         self._wake = wake
         self._clock = clock
         self._max_pending_bytes = max_pending_bytes
+        self._max_pending = max_pending
         self._pending_bytes = 0
         self._lock = threading.Lock()
         self._requests: FirstResponse[Request] = FirstResponse()
@@ -126,7 +129,8 @@ class Dispatcher:
         count = self._outcomes.count
         with self._lock:
             self._outcomes.received(len(payload))
-            if self._pending_bytes + len(payload) > self._max_pending_bytes:
+            bytes_over = self._pending_bytes + len(payload) > self._max_pending_bytes
+            if bytes_over or len(self._requests) >= self._max_pending:
                 count["turned_away"] += 1
                 turned_away = count["turned_away"]
                 self._outcomes.note(request, "turned_away", took_s=0.0)

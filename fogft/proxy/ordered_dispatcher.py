@@ -64,6 +64,7 @@ class OrderedDispatcher:
         clock: Monotonic seconds.
         max_waiting_bytes: Requests kept while no replica can take them, in bytes; more are
             turned away and counted.
+        max_waiting: The same, by number.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class OrderedDispatcher:
         wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         max_waiting_bytes: int = 64 << 20,
+        max_waiting: int = 1 << 16,
     ) -> None:
         self.spec = spec
         self._respond = respond
@@ -85,6 +87,7 @@ class OrderedDispatcher:
         self._wake = wake
         self._clock = clock
         self._max_waiting_bytes = max_waiting_bytes
+        self._max_waiting = max_waiting
         self._lock = threading.Lock()
         self._sending = threading.Lock()
         self._links: dict[int, Link] = {}
@@ -114,7 +117,8 @@ class OrderedDispatcher:
         with self._lock:
             self._outcomes.received(len(payload))
             if self._early or not self._number(caller):
-                if self._early_bytes + len(payload) > self._max_waiting_bytes:
+                bytes_over = self._early_bytes + len(payload) > self._max_waiting_bytes
+                if bytes_over or len(self._early) >= self._max_waiting:
                     count["turned_away"] += 1
                     turned_away = count["turned_away"]
                     if turned_away & (turned_away - 1) == 0:  # log the 1st, 2nd, 4th, ...

@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 WINDOW = 5  # of the ten in rmw_qos_profile_services_default
 WINDOW_LIMIT = 64
+# What waits for one client; what comes beyond is sent at once, as a fast service would.
+WAITING_LIMIT, WAITING_BYTES_LIMIT = 1024, 64 << 20
 EVERY_S = 0.005  # so a burst may meet a client that takes nothing for 25 ms
 _QUIET_S = 0.05  # after so long without a request a client must prove anew that it is quick
 _USUAL_GROWS = 4  # each `EVERY_S`, and by a twentieth of what is open: faster is a burst
@@ -42,6 +44,7 @@ class Pace:
 
     def __init__(self, now: float) -> None:
         self.waiting: deque[tuple[Any, bytes]] = deque()
+        self._waiting_bytes = 0
         self._open = 0  # asked and not answered; one that is never answered stays: no harm
         self._usual = WINDOW  # no more open than this is nothing new
         self._untaken = 0
@@ -67,6 +70,21 @@ class Pace:
             self._proofs += 1
             if self._proofs >= 4 * self._window:
                 self._window, self._proofs = min(2 * self._window, WINDOW_LIMIT), 0
+
+    def hold(self, handle: Any, payload: bytes) -> bool:
+        """Have a response wait; False where too much waits already."""
+        whole = self._waiting_bytes + len(payload)
+        if self.waiting and (len(self.waiting) >= WAITING_LIMIT or whole > WAITING_BYTES_LIMIT):
+            return False
+        self._waiting_bytes = whole
+        self.waiting.append((handle, payload))
+        return True
+
+    def next(self) -> tuple[Any, bytes]:
+        """Return the response that waited for longest."""
+        handle, payload = self.waiting.popleft()
+        self._waiting_bytes -= len(payload)
+        return handle, payload
 
     def take(self, now: float) -> bool:
         """Whether a response may be sent now; if so, it counts as sent."""
@@ -133,8 +151,7 @@ class Pacer:
         client = _client(handle)
         with self._wake:
             pace = self._paces.get(client) or self._new(client, now)
-            if pace.waiting or not pace.take(now):
-                pace.waiting.append((handle, payload))
+            if (pace.waiting or not pace.take(now)) and pace.hold(handle, payload):
                 self._held[client] = pace
                 self._begin()
                 return
@@ -187,7 +204,7 @@ class Pacer:
         due, self._again = self._again, []
         for client, pace in list(self._held.items()):
             while pace.waiting and pace.take(now):
-                due.append((*pace.waiting.popleft(), now + _FIND_LIMIT_S))
+                due.append((*pace.next(), now + _FIND_LIMIT_S))
             if not pace.waiting:
                 del self._held[client]
         return due

@@ -42,6 +42,7 @@ log = logging.getLogger(__name__)
 
 _CLOSE_WAIT_S = 1.0
 _NO_REQUEST = bytes(names.REQUEST_ID_BYTES)
+_CHORES_LIMIT = 1024  # probes, records and recalls that wait; a robot has a few on the way
 _STRANGERS = b""  # in place of a token: replies to whose connection is not known
 
 
@@ -297,7 +298,17 @@ class ZenohListener:
         except frame.FrameError as error:
             self._malformed(error, query, turn)
             return
-        self._chores.put(partial(self._answer_probe, on_probe, probe, greeting, query, turn))
+        answer = partial(self._answer_probe, on_probe, probe, greeting, query, turn)
+        self._do_later(answer, query, turn)
+
+    def _do_later(self, chore: Callable[[], None], query: zenoh.Query, turn: int) -> None:
+        """Have the probe thread do something; where too much waits for it, the query just ends."""
+        if self._chores.qsize() < _CHORES_LIMIT:
+            self._chores.put(chore)
+            return
+        self._counters.add("chores_dropped")
+        ended = Reply(query, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
+        self._queues.put(_STRANGERS, "strangers", ended)
 
     def _turn_away(self, refused: Reply, why: str) -> None:
         count = self._counters.add("not_admitted")
@@ -317,7 +328,8 @@ class ZenohListener:
         # Nobody awaits an answer.
         ended = Reply(query, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
         self._queues.put(_STRANGERS, "strangers", ended)
-        self._chores.put(partial(on_cancel, ids))
+        if self._chores.qsize() < _CHORES_LIMIT:
+            self._chores.put(partial(on_cancel, ids))
 
     def _heard_records(self, query: zenoh.Query, turn: int) -> None:
         self._counters.add("records")
@@ -328,7 +340,7 @@ class ZenohListener:
         except (frame.FrameError, RecordError) as error:
             self._malformed(error, query, turn)
             return
-        self._chores.put(partial(self._take_records, greeting, offered, query, turn))
+        self._do_later(partial(self._take_records, greeting, offered, query, turn), query, turn)
 
     def _malformed(self, error: ValueError, query: zenoh.Query, turn: int) -> None:
         count = self._counters.add("malformed")
@@ -404,7 +416,7 @@ class ZenohListener:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
         ``malformed``, ``records``, ``records_refused``, ``records_older``, ``not_admitted``,
         ``handshakes_refused``, ``unauthenticated``, ``revoked_links``, ``stuck_links``,
-        ``reply_dropped``, ``failed``, ``cancellations``.
+        ``reply_dropped``, ``failed``, ``cancellations``, ``chores_dropped``.
         """
         return self._counters.snapshot()
 

@@ -22,7 +22,9 @@ class Scene:
         self.clock = Clock()
         self.responses: list[tuple[object, bytes]] = []
         options = {
-            key: spec.pop(key) for key in ("empty_response", "max_pending_bytes") if key in spec
+            key: spec.pop(key)
+            for key in ("empty_response", "max_pending_bytes", "max_pending")
+            if key in spec
         }
         if (is_ok := spec.pop("is_ok", None)) is not None:
             spec["ok_field"] = "ok"
@@ -227,6 +229,16 @@ def test_pending_bytes_are_bounded():
     assert (report["turned_away"], report["pending_bytes"]) == (1, 10)
     scene.answer(0, b"a", n=0)
     assert scene.dispatcher.report()["pending_bytes"] == 5
+
+
+def test_pending_requests_are_bounded_however_small():
+    scene = Scene(1, max_pending=2)
+    for _ in range(3):
+        scene.dispatcher.submit(b"", "caller")
+    assert scene.dispatcher.report()["turned_away"] == 1
+    scene.answer(0, b"a", n=0)
+    scene.dispatcher.submit(b"", "caller")
+    assert scene.dispatcher.report()["turned_away"] == 1
 
 
 def test_a_full_window_is_tried_again_while_a_frozen_replica_works_on_the_request():

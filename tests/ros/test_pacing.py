@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.core.errors import RosError
-from fogft.ros.pacing import EVERY_S, WINDOW, WINDOW_LIMIT, Pace, Pacer
+from fogft.ros.pacing import (
+    EVERY_S,
+    WAITING_BYTES_LIMIT,
+    WAITING_LIMIT,
+    WINDOW,
+    WINDOW_LIMIT,
+    Pace,
+    Pacer,
+)
 from fogft.ros.port import NotFoundYet
 
 ORDINARY = 10  # responses that a client with the default quality of service keeps
@@ -131,6 +139,22 @@ def test_every_response_is_sent_once_and_in_order():
     assert sent.all.wait(30)
     assert sent.responses == [(handle(1, n), b"%d" % n) for n in range(100) if n != 50]
     pacer.close()
+
+
+@pytest.mark.parametrize(("size", "most"), [(0, WAITING_LIMIT), (1 << 20, 64)])
+def test_what_waits_for_one_client_is_bounded(size, most):
+    """Beyond that it is sent at once: nothing is kept without end, and nothing is dropped."""
+    sent = []
+    pacer = Pacer(lambda handle, payload: sent.append(handle), clock=lambda: 0.0)
+    payload = bytes(size)
+    asked = [handle(0, number) for number in range(WINDOW + most + 100)]
+    for one in asked:
+        pacer.requested(one)
+    for one in asked:
+        pacer.respond(one, payload)
+    pacer.close()
+    assert len(sent) == WINDOW + 100
+    assert WAITING_BYTES_LIMIT == 64 << 20
 
 
 def test_one_clients_burst_does_not_hold_up_another():

@@ -7,9 +7,18 @@ import signal
 import sys
 from collections.abc import Callable
 
+from fogft.core.model import ReplicaId
 from fogft.wire.config import LinkSettings
 from fogft.wire.zenoh_link import ZenohLink
-from tests.wire.wire_pool import SERVICE, ReplicaProcess, request_id, wait_for
+from fogft.wire.zenoh_listener import ZenohListener
+from tests.wire.wire_pool import (
+    POOL_UID,
+    SERVICE,
+    Authority,
+    ReplicaProcess,
+    request_id,
+    wait_for,
+)
 
 # A send to the frozen replica blocks for longer than any test waits.
 STUCK = LinkSettings(
@@ -66,3 +75,23 @@ def test_small_requests_to_a_frozen_replica_never_block(
         link.offer(SERVICE, request_id(number), payload if number % 2 else b"q", 60.0)
         link.forget(request_id(number))
     assert link.usable
+
+
+class Query:
+    """Stands in for one of Zenoh's that nobody answers."""
+
+    ended = 0
+
+    def drop(self) -> None:
+        type(self).ended += 1
+
+
+def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authority) -> None:
+    """A robot that probes without end has its probes dropped and counted, and each query ended."""
+    listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
+    for turn in range(3000):
+        listener._turns.came()
+        listener._do_later(lambda: None, Query(), turn)
+    dropped = listener.counters()["chores_dropped"]
+    assert 0 < listener._chores.qsize() == 3000 - dropped <= 1024
+    wait_for(lambda: Query.ended == dropped)
