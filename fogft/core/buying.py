@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 from fogft.core.endings import Census, Standing
 from fogft.core.groups import Group
@@ -37,8 +38,7 @@ from fogft.core.spec import PoolSpec
 _NOT_THE_PLACES_FAULT = ("outdated", "moves", "spot")
 
 
-@dataclass(frozen=True)
-class PlannedLaunch:
+class PlannedLaunch(NamedTuple):
     """Order a machine for a slot, under a generation never used before."""
 
     slot: int
@@ -137,6 +137,11 @@ class Buyer:
             resting=resting,
             avoid=(*self._avoided, *(s.location for s in self.census.lost)),
         )
+
+    def whole_market(self, group: Group, spot: bool | None) -> Market:
+        """Return what is sold to a group where nothing rests and nothing is avoided."""
+        listing = self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale)
+        return Market(listing)
 
     def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
         """Return the market of what rests longest, where all rests; None to wait for another."""

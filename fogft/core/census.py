@@ -61,6 +61,8 @@ def _supersede(census: Census, health: Health, size: Size) -> None:
     So a replica that moves is ended when its successor serves, and not the other way round.
     """
     newest = {s.slot: s.id.generation for s in census.good}  # in the order of generations
+    if len(newest) == len(census.good):
+        return
     for group, wanted in zip(size.groups, size.counts, strict=True):
         here = part(census, size.groups, group)
         surplus = len(here.good) + len(here.replaced) - wanted
@@ -76,15 +78,17 @@ def _supersede(census: Census, health: Health, size: Size) -> None:
 def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged, size: Size) -> str:
     """Return why a working replica is to be replaced; empty when it is not."""
     machine, slot = judged.machine, judged.id.slot
-    location = machine.placement.location
-    reasons = {
-        "drained by the user": intent.is_drained(slot, judged.id.generation),
-        f"excluded location {location}": intent.is_excluded(location),
-        judged.why: judged.verdict in (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES),
-        "its group is not in the pool file": not any(g.owns(slot) for g in size.groups),
-        "outdated by another version": machine.spec_hash != replica_hash(spec, slot),
-    }
-    return next((why for why, holds in reasons.items() if holds), "")
+    if intent.is_drained(slot, judged.id.generation):
+        return "drained by the user"
+    if intent.is_excluded(machine.placement.location):
+        return f"excluded location {machine.placement.location}"
+    if judged.verdict in (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES):
+        return judged.why
+    if not any(group.owns(slot) for group in size.groups):
+        return "its group is not in the pool file"
+    if machine.spec_hash != replica_hash(spec, slot):
+        return "outdated by another version"
+    return ""
 
 
 def _is_young(standing: Standing, health: Health) -> bool:

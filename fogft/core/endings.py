@@ -23,7 +23,7 @@ from fogft.core.placement import crowding, domains
 DRAIN_SETTLE_S = 2.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Standing:
     """A judged machine with its record, and why it should be replaced, if it should."""
 
@@ -34,12 +34,12 @@ class Standing:
     @property
     def id(self) -> ReplicaId:
         """The replica."""
-        return self.judged.id
+        return self.judged.machine.id
 
     @property
     def slot(self) -> int:
         """Its slot."""
-        return self.judged.id.slot
+        return self.judged.machine.id.slot
 
     @property
     def short(self) -> str:
@@ -155,10 +155,11 @@ class Endings:
         """Those that end now."""
         return {s.id for s, _ in self.now}
 
-    def __add__(self, other: Endings) -> Endings:
-        return Endings(
-            self.now + other.now, self.draining + other.draining, self.notes + other.notes
-        )
+    def add(self, other: Endings) -> None:
+        """Take in another group's."""
+        self.now += other.now
+        self.draining += other.draining
+        self.notes += other.notes
 
 
 def choose_endings(
@@ -180,16 +181,21 @@ def choose_endings(
         first: One that makes room for its successor: it ends although it is missed.
         dear_first: The pool is over its cap: of those that are too many the dearest go first.
     """
-    chooser = _Chooser(wanted, census, now, drain_limit_s)
     surplus = len(census.good) + len(census.replaced) - wanted
+    if surplus <= 0 and not census.lost and first is None:
+        return Endings()
+    chooser = _Chooser(wanted, census, now, drain_limit_s)
     if health.uplink_suspected or not health.links_known:
         if surplus > 0 or census.lost:
             chooser.out.notes.append("nothing is ended while no replica can be heard")
         return chooser.out
     for standing in census.lost:
         chooser.end_lost(standing, history)
-    expendable = _by_expendability(census.good, dear_first=dear_first)
-    chooser.end_some(expendable, len(census.good) - wanted, "not wanted")
+    if len(census.good) > wanted:
+        expendable = _by_expendability(census.good, dear_first=dear_first)
+        chooser.end_some(expendable, len(census.good) - wanted, "not wanted")
+    if not census.replaced:
+        return chooser.out
     left = len(census.good) + len(census.replaced) - chooser.counted_out - wanted
     ready_slots = {s.slot for s in census.good if s.judged.serving}
     if first is not None:

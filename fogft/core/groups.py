@@ -91,26 +91,31 @@ def critical_group(spec: PoolSpec, wanted: int) -> Group:
         spec: The pool file.
         wanted: How many replicas the pool has besides, which carry everything.
     """
-    last = groups_of(spec)[-1]
-    most = max((service.replicas for service in spec.services), default=0)
-    return Group(
-        CRITICAL,
-        last.offers,
-        CRITICAL_BLOCK,
-        max(0, most - wanted),
-        last.resources,
-        OnDemandSpec(0, last.on_demand.fallback),
-        critical_services(spec) or spec.services,
-    )
+    key = CRITICAL, wanted
+    if key not in spec.derived:
+        last = groups_of(spec)[-1]
+        most = max((service.replicas for service in spec.services), default=0)
+        spec.derived[key] = Group(
+            CRITICAL,
+            last.offers,
+            CRITICAL_BLOCK,
+            max(0, most - wanted),
+            last.resources,
+            OnDemandSpec(0, last.on_demand.fallback),
+            critical_services(spec) or spec.services,
+        )
+    group: Group = spec.derived[key]
+    return group
 
 
 def group_at(spec: PoolSpec, slot: int) -> Group:
     """Return the group that a slot belongs to; the last one for a slot of no group now."""
     key = "group", slot // BLOCK
-    if key not in spec.derived:
+    group: Group | None = spec.derived.get(key)
+    if group is None:
         found = [*groups_of(spec), critical_group(spec, 0)]
-        spec.derived[key] = next((group for group in found if group.owns(slot)), found[-2])
-    group: Group = spec.derived[key]
+        group = next((group for group in found if group.owns(slot)), found[-2])
+        spec.derived[key] = group
     return group
 
 
@@ -122,10 +127,11 @@ def services_at(spec: PoolSpec, slot: int) -> tuple[ServiceSpec, ...]:
 def replica_hash(spec: PoolSpec, slot: int) -> str:
     """Return the hash that a replica in this slot should have; see `PoolSpec.replica_hash`."""
     key = "hash", slot // BLOCK
-    if key not in spec.derived:
+    found: str | None = spec.derived.get(key)
+    if found is None:
         group = group_at(spec, slot)
-        spec.derived[key] = spec.hash_with(group.services, group.resources)
-    return str(spec.derived[key])
+        found = spec.derived[key] = spec.hash_with(group.services, group.resources)
+    return found
 
 
 def task_at(spec: PoolSpec, slot: int) -> dict[str, Any]:

@@ -10,8 +10,8 @@ Not here: what to do about it (`planner`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from fogft.core.groups import replica_hash, services_at
 from fogft.core.history import History, Record
@@ -45,8 +45,7 @@ class Verdict(str, Enum):
     STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
 
 
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """One of our machines with all that is known of it.
 
     Attributes:
@@ -69,8 +68,7 @@ class Judged:
         return self.machine.id
 
 
-@dataclass(frozen=True)
-class Health:
+class Health(NamedTuple):
     """The whole pool, judged; ordered by replica.
 
     Attributes:
@@ -86,16 +84,18 @@ class Health:
 def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
     """Judge what is observed. Machines of other pools are left out."""
     links = {report.id: report for report in observed.links or ()}
-    ours = sorted(
-        (m for m in observed.machines or () if m.id.pool_uid == pool_uid), key=lambda m: m.id
-    )
+    ours = [
+        (machine, links.get(machine.id), history.record(machine.id.slot, machine.id.generation))
+        for machine in sorted(observed.machines or (), key=_slot_and_generation)
+        if machine.id.pool_uid == pool_uid
+    ]
     heard = [
         link
-        for machine in ours
-        if machine.phase is MachinePhase.RUNNING
+        for machine, link, record in ours
+        if link is not None
+        and machine.phase is MachinePhase.RUNNING
         and machine.id not in observed.ending
-        and (link := links.get(machine.id)) is not None
-        and was_heard(link, history.record(machine.id.slot, machine.id.generation))
+        and was_heard(link, record)
     ]
     answering = sum(link.state is LinkState.UP for link in heard)
     alone = len(heard) == 1
@@ -104,23 +104,23 @@ def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -
     if alone and heard[0].silent_for_s > patience_s:
         uplink_suspected = False
     may_doubt = observed.links is not None and not uplink_suspected
+    serving = [is_ready(spec, machine, link) for machine, link, _ in ours]
     ready_somewhere = any(
-        is_ready(spec, machine, links.get(machine.id)) for machine in ours if not machine.notice
+        ready and not machine.notice for ready, (machine, _, _) in zip(serving, ours, strict=True)
     )
     context = _Context(spec, observed, patience_s, may_doubt, ready_somewhere)
     return Health(
         replicas=tuple(
-            _judge_one(
-                context,
-                machine,
-                links.get(machine.id),
-                history.record(machine.id.slot, machine.id.generation),
-            )
-            for machine in ours
+            _judge_one(context, machine, link, record, ready)
+            for ready, (machine, link, record) in zip(serving, ours, strict=True)
         ),
         uplink_suspected=uplink_suspected,
         links_known=observed.links is not None,
     )
+
+
+def _slot_and_generation(machine: Machine) -> tuple[int, int]:
+    return machine.id.slot, machine.id.generation
 
 
 def was_heard(link: LinkReport, record: Record | None) -> bool:
@@ -142,8 +142,7 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
     return bool(wanted) and link.ready.issuperset(service.name for service in wanted)
 
 
-@dataclass(frozen=True)
-class _Context:
+class _Context(NamedTuple):
     spec: PoolSpec
     observed: Observed
     patience_s: float
@@ -152,24 +151,20 @@ class _Context:
 
 
 def _judge_one(
-    context: _Context, machine: Machine, link: LinkReport | None, record: Record | None
+    context: _Context,
+    machine: Machine,
+    link: LinkReport | None,
+    record: Record | None,
+    serving: bool,
 ) -> Judged:
-    serving = is_ready(context.spec, machine, link)
     verdict, why = _verdict(context, machine, link, record, serving)
     ever_ready = record is not None and record.first_ready_at is not None
     answers = link is not None and link.state is LinkState.UP
     may_serve = serving or (
         ever_ready and not answers and verdict not in (Verdict.UNRESPONSIVE, Verdict.FAILED)
     )
-    return Judged(
-        machine=machine,
-        link=link,
-        phase=_phase(machine, verdict, serving),
-        verdict=verdict,
-        serving=serving,
-        may_serve=may_serve,
-        why=why,
-    )
+    phase = _phase(machine, verdict, serving)
+    return Judged(machine, link, phase, verdict, serving, may_serve, why)
 
 
 def _phase(machine: Machine, verdict: Verdict, serving: bool) -> Phase:

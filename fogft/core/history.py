@@ -15,7 +15,7 @@ from bisect import insort
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from fogft.core.errors import StateError
 from fogft.core.model import supply
@@ -122,12 +122,20 @@ class Record:
         return supply(self.location, on_demand=self.on_demand)
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(NamedTuple):
     """A location disappointed: it refused, a launch failed there, or a replica died young."""
 
     at: float
     cause: str
+
+
+@dataclass
+class Lasting(Generic[T]):
+    """Something that is so from `since` until before `until`, unless something happens."""
+
+    value: T
+    since: float
+    until: float
 
 
 class History:
@@ -141,8 +149,9 @@ class History:
         self._proven_at: dict[str, float] = {}
         self._losses: dict[str, list[float]] = {}
         self.version = 0  # of all facts: counts events
-        self._places = 0  # of failures, proofs and losses alone
-        self._worked_out: dict[Callable[..., Any], tuple[int, float, Any]] = {}
+        # What follows from failures, proofs and losses: of one supply, and of all together.
+        self._of_supply: dict[str, dict[Callable[..., Any], Lasting[Any]]] = {}
+        self._of_all: dict[Callable[..., Any], Lasting[Any]] = {}
         for event in events:
             self.add(event)
 
@@ -173,7 +182,7 @@ class History:
         # Launches and marks change none of these.
         later._failures, later._proven_at = self._failures, self._proven_at
         later._losses = self._losses
-        later._places, later._worked_out = self._places, self._worked_out
+        later._of_supply, later._of_all = self._of_supply, self._of_all
         for event in events:
             if event.kind not in _ORDERS:
                 raise ValueError(f"`{event.kind.value}` is none of our own orders")
@@ -190,7 +199,7 @@ class History:
                 record.first_ready_at = event.at
             record.unready_since = None
             self._proven_at[record.supply] = event.at
-            self._places += 1
+            self._forget(record.supply)
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
         elif kind is EventKind.DRAINING:
@@ -207,12 +216,16 @@ class History:
                 self._fail(record, event)
             if kind is EventKind.GONE:
                 insort(self._losses.setdefault(record.location, []), event.at)
-                self._places += 1
+                self._forget(record.location)
             record.closed = kind
             record.closed_at = event.at
 
+    def _forget(self, supply: str) -> None:
+        self._of_supply.pop(supply, None)
+        self._of_all.clear()
+
     def _fail(self, record: Record, event: Event) -> None:
-        self._places += 1
+        self._forget(record.supply)
         cause = event.detail.split(":")[0].split(" ")[0] or "error"
         failures = self._failures.setdefault(record.supply, [])
         insort(failures, Failure(event.at, cause), key=lambda failure: failure.at)
@@ -248,19 +261,27 @@ class History:
         """Return when a replica from there last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
 
-    def of_places(self, work_out: Callable[[History, float], T], now: float) -> T:
-        """Return what follows from failures, proofs and losses at a time; worked out only once.
+    def of_places(self, work_out: Callable[[History, float], Lasting[T]], now: float) -> Lasting[T]:
+        """Return what follows from failures, proofs and losses; worked out anew when it may differ.
 
         Args:
             work_out: Pure, and looks at nothing else of a history.
             now: Seconds since the epoch.
         """
-        known = self._worked_out.get(work_out)
-        if known is None or known[:2] != (self._places, now):
-            known = (self._places, now, work_out(self, now))
-            self._worked_out[work_out] = known
-        found: T = known[2]
-        return found
+        known = self._of_all.get(work_out)
+        if known is None or not known.since <= now < known.until:
+            known = self._of_all[work_out] = work_out(self, now)
+        return known
+
+    def of_supply(
+        self, work_out: Callable[[History, str, float], Lasting[T]], supply: str, now: float
+    ) -> Lasting[T]:
+        """Return what follows from those of one supply or location alone; likewise."""
+        memory = self._of_supply.setdefault(supply, {})
+        known = memory.get(work_out)
+        if known is None or not known.since <= now < known.until:
+            known = memory[work_out] = work_out(self, supply, now)
+        return known
 
     @property
     def losses(self) -> Mapping[str, list[float]]:

@@ -53,6 +53,36 @@ class Move:
     urgency: tuple[float, ...]
 
 
+def is_restless(buyer: Buyer) -> bool:
+    """Whether anybody would move if no location rested or were avoided, and all had stayed.
+
+    Else nobody moves before something happens, however long that takes: what a location that
+    rests no longer sells has been in question already.
+    """
+    if buyer.spec.migration is None:
+        return False
+    return any(_would_move(buyer, standing) for standing in buyer.census.good)
+
+
+def has_stand_ins(buyer: Buyer) -> bool:
+    """Whether there are on-demand machines that are to make way for spot ones."""
+    return any(
+        not standing.judged.machine.placement.spot
+        and buyer.kind(home(buyer.groups, standing.slot), standing)
+        for standing in buyer.census.good
+    )
+
+
+def _would_move(buyer: Buyer, standing: Standing) -> bool:
+    placement = standing.judged.machine.placement
+    kind = buyer.kind(home(buyer.groups, standing.slot), standing)
+    if kind is not None and kind != placement.spot:
+        return False
+    market = buyer.whole_market(home(buyer.groups, standing.slot), kind)
+    choice = market.choose(buyer.places(standing), budget_usd_per_hour=buyer.budget)
+    return _is_better(buyer, standing, choice) is not None
+
+
 def mover(buyer: Buyer, now: float) -> Move | None:
     """Return the replica that should move; None when all are well where they are.
 
@@ -88,18 +118,27 @@ def _moves(buyer: Buyer, now: float) -> Iterator[Move]:
         kind = buyer.kind(home(buyer.groups, standing.slot), standing)
         if kind is not None and kind != placement.spot:  # `_returns` decides about those
             continue
-        choice = _best(buyer, standing, at_leisure=True)
-        if choice.offer is None or choice.rank[0] or choice.offer.placement == placement:
-            continue
-        count = crowding(buyer.places(standing))
-        before = tuple(count[domain] for domain in domains(placement))
-        there = choice.offer.placement.location
-        if choice.rank[1:] < before:
-            yield Move(standing, f"moves to {there}: better spread", (0.0, *choice.rank[1:]))
-            continue
-        better = gain(_score(buyer, standing), buyer.scale.score(choice.offer))
-        if choice.rank[1:] == before and better >= rules.gain:
-            yield Move(standing, f"moves to {there}: {better:.0%} better", (1.0, -better))
+        move = _is_better(buyer, standing, _best(buyer, standing, at_leisure=True))
+        if move is not None:
+            yield move
+
+
+def _is_better(buyer: Buyer, standing: Standing, choice: Choice) -> Move | None:
+    """Return the move to a place if that is so much better."""
+    rules, placement = buyer.spec.migration, standing.judged.machine.placement
+    offer, (avoided, *there) = choice.offer, choice.rank
+    if rules is None or offer is None or avoided or offer.placement == placement:
+        return None
+    count = crowding(buyer.places(standing))
+    here = [count[domain] for domain in domains(placement)]
+    if there < here:
+        why = f"moves to {offer.placement.location}: better spread"
+        return Move(standing, why, (0.0, *there))
+    better = gain(_score(buyer, standing), buyer.scale.score(offer))
+    if there == here and better >= rules.gain:
+        why = f"moves to {offer.placement.location}: {better:.0%} better"
+        return Move(standing, why, (1.0, -better))
+    return None
 
 
 def _best(buyer: Buyer, standing: Standing, *, at_leisure: bool = False) -> Choice:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 
 from fogft.core.topology import Topology
 
@@ -48,15 +49,20 @@ class Placement:
     instance: str
     spot: bool = True
 
-    @property
+    @cached_property
     def location(self) -> str:
         """``cloud/region/zone``: what can be excluded, full or quarantined."""
         return f"{self.cloud}/{self.region}/{self.zone}"
 
-    @property
+    @cached_property
     def supply(self) -> str:
         """What can run short by itself: a location's spot machines, or those on demand."""
         return supply(self.location, on_demand=not self.spot)
+
+    @cached_property
+    def domains(self) -> tuple[str, str, str]:
+        """The failure domains that it lies in, the widest first: cloud, region, location."""
+        return self.cloud, f"{self.cloud}/{self.region}", self.location
 
     def within(self, location: str) -> bool:
         """Whether this lies in a location given as ``cloud``, ``cloud/region`` or all three."""

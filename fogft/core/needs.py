@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fogft.core.endings import Census, Standing
 from fogft.core.groups import CRITICAL, Group
 from fogft.core.history import History
 
 
-@dataclass(frozen=True)
-class Need:
+class Need(NamedTuple):
     """One launch that is called for.
 
     Attributes:
@@ -63,6 +62,8 @@ def needed_launches(
         for need in _missing(group, wanted, part(census, groups, group), history)
     ]
     yield from missing
+    if not census.replaced:
+        return
     one_is_coming = any(not s.ever_ready for s in census.good)
     if missing or one_is_coming or census.ending or settling:
         return
@@ -80,10 +81,10 @@ def needed_launches(
 
 
 def _missing(group: Group, wanted: int, census: Census, history: History) -> Iterator[Need]:
-    used = {s.slot for s in (*census.good, *census.replaced)}
     missing = wanted - len(census.good) - len(census.replaced)
     if missing <= 0:
         return
+    used = {s.slot for s in (*census.good, *census.replaced)}
     vacant = [s for s in census.lost if s.slot not in used and group.owns(s.slot)]
     lost_slots = {s.slot for s in vacant}
     for standing in vacant:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fogft.core.listing import Listing, Row, catalogue
 from fogft.core.model import Offer, Placement
@@ -27,8 +27,7 @@ EPSILON_USD = 1e-9
 Rank = tuple[bool, int, int, int]
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """An offer, or none and why not, in words.
 
     Attributes:
@@ -43,13 +42,16 @@ class Choice:
 
 def domains(placement: Placement) -> tuple[str, str, str]:
     """Return the failure domains that a placement lies in, the widest first."""
-    region = f"{placement.cloud}/{placement.region}"
-    return placement.cloud, region, placement.location
+    return placement.domains
 
 
 def crowding(taken: Iterable[Placement]) -> Counter[str]:
     """Count replicas in each failure domain."""
-    return Counter(domain for placement in taken for domain in domains(placement))
+    count: Counter[str] = Counter()
+    for placement in taken:
+        for domain in placement.domains:
+            count[domain] += 1
+    return count
 
 
 class Market:

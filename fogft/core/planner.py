@@ -55,6 +55,8 @@ class Plan:
         wanted: How many replicas should be ready.
         health: What the plan was based on; None when the cloud could not tell.
         closed: It is known without trying that planning again while it is under way adds nothing.
+        waits: For a location's rest to end: a launch that is needed, or a stand-in's return.
+        restless: Somebody would move if he had stayed long enough and no location rested.
     """
 
     wanted: int
@@ -64,6 +66,8 @@ class Plan:
     notes: tuple[str, ...] = ()
     health: Health | None = None
     closed: bool = False
+    waits: bool = False
+    restless: bool = False
 
 
 def plan(
@@ -115,6 +119,8 @@ def plan(
             terminations=decided.terminations + latest.terminations,
             draining=latest.draining,
             notes=tuple(dict.fromkeys(decided.notes + latest.notes)),
+            waits=decided.waits or latest.waits,
+            restless=decided.restless or latest.restless,
         )
         if is_done:
             break
@@ -156,7 +162,10 @@ def _plan_once(
     settling = rollout.is_settling(census, observed.now)
     needs = list(needed_launches(sized.groups, counts, census, history, settling=settling))
     may_move = not needs and len(census.good) == wanted and spec.max_surge > 0
-    if may_move and migration.is_quiet(census, health):
+    may_move = may_move and migration.is_quiet(census, health)
+    waits = may_move and migration.has_stand_ins(buyer)
+    restless = may_move and migration.is_restless(buyer)
+    if waits or restless:
         found = migration.mover(buyer, observed.now)
         if found is not None:
             census.good.remove(found.standing)
@@ -167,20 +176,24 @@ def _plan_once(
     for need in needs:
         if not buyer.buy(need, room=room):
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
+            waits = True
             break
     held = [s.id for s in census.replaced if rollout.is_outdated(s) and not s.draining_since]
     endings = Endings()
     for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
-        endings += choose_endings(
-            count,
-            part(census, sized.groups, group),
-            health,
-            history,
-            now=observed.now,
-            drain_limit_s=drain_limit_s,
-            dear_first=bool(excess),
-            held=held if settling else (),
-            first=first if first is not None and home(sized.groups, first.slot) is group else None,
+        makes_room = first is not None and home(sized.groups, first.slot) is group
+        endings.add(
+            choose_endings(
+                count,
+                part(census, sized.groups, group),
+                health,
+                history,
+                now=observed.now,
+                drain_limit_s=drain_limit_s,
+                dear_first=bool(excess),
+                held=held if settling else (),
+                first=first if makes_room else None,
+            )
         )
     ends = [PlannedEnd(s.id, s.why) for s in (*census.failed, *census.aborted)]
     ends += [PlannedEnd(s.id, why) for s, why in endings.now]
@@ -197,6 +210,8 @@ def _plan_once(
         health=health,
         # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
         closed=not (ends or endings.draining or census.replaced or census.ending or excess),
+        waits=waits,
+        restless=restless,
     )
 
 

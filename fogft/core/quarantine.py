@@ -27,23 +27,23 @@ that jumped back leaves behind, count for nothing.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
-from fogft.core.history import Failure, History
+from fogft.core.history import Failure, History, Lasting
 
 BASE_S = 5.0
 LIMIT_S = 600.0
 FORGIVE_S = 3600.0
 EVERYWHERE = "*"
+NEVER = float("inf")
 EAGER_S = 60.0
 AVOID_S = 300.0
 AVOID_LIMIT_S = 3600.0
 AVOID_MEMORY_S = 4 * 3600.0
 
 
-@dataclass(frozen=True)
-class Backoff:
+class Backoff(NamedTuple):
     """A location at rest.
 
     Attributes:
@@ -64,27 +64,38 @@ def resting(history: History, now: float) -> Mapping[str, Backoff]:
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """
-    return history.of_places(_resting, now)
+    return history.of_places(_resting, now).value
 
 
-def _resting(history: History, now: float) -> Mapping[str, Backoff]:
+def _resting(history: History, now: float) -> Lasting[Mapping[str, Backoff]]:
     out: dict[str, Backoff] = {}
     setup_failures: list[Failure] = []
-    for location, failures in history.failures.items():
-        lately = _lately(failures, now)
-        if not lately:
-            continue
-        setup_failures += [f for f in lately if f.cause == "setup"]
-        proven_at = history.proven_at(location)
-        rest = backoff([f for f in lately if f.cause != "setup" and f.at > proven_at], now)
+    until = NEVER
+    for supply in history.failures:
+        found = history.of_supply(_rest, supply, now)
+        until = min(until, found.until)
+        rest, setup = found.value
+        setup_failures += setup
         if rest is not None:
-            out[location] = rest
+            out[supply] = rest
     if setup_failures:
         proven_at = max(history.proven_at(place) for place in history.failures)
         everywhere = backoff([f for f in setup_failures if f.at > proven_at], now)
         if everywhere is not None:
             out[EVERYWHERE] = everywhere
-    return out
+            until = min(until, everywhere.until)
+    return Lasting(out, now, until)
+
+
+def _rest(
+    history: History, supply: str, now: float
+) -> Lasting[tuple[Backoff | None, Sequence[Failure]]]:
+    """Return a supply's rest, and its failures of late that are the pool file's."""
+    lately, until = _lately(history.failures[supply], now)
+    setup = [f for f in lately if f.cause == "setup"]
+    proven_at = history.proven_at(supply)
+    rest = backoff([f for f in lately if f.cause != "setup" and f.at > proven_at], now)
+    return Lasting((rest, setup), now, until if rest is None else min(until, rest.until))
 
 
 def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | None:
@@ -101,29 +112,44 @@ def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | 
 
 def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
     """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
-    return history.of_places(_disappointing, now)
+    return history.of_places(_disappointing, now).value
 
 
-def _disappointing(history: History, now: float) -> Mapping[str, Backoff]:
+def _disappointing(history: History, now: float) -> Lasting[Mapping[str, Backoff]]:
     out: dict[str, Backoff] = {}
-    for supply, failures in history.failures.items():
-        lately = [f for f in _lately(failures, now) if f.at > history.proven_at(supply)]
-        if lately:
-            last = lately[-1]
-            out[supply] = Backoff(last.at + FORGIVE_S, len(lately), last.cause, since=last.at)
-    return out
+    until = NEVER
+    for supply in history.failures:
+        found = history.of_supply(_disappointment, supply, now)
+        until = min(until, found.until)
+        if found.value is not None:
+            out[supply] = found.value
+    return Lasting(out, now, until)
 
 
-def _lately(failures: Sequence[Failure], now: float) -> Sequence[Failure]:
-    """Return those that still count, of failures in order of time."""
+def _disappointment(history: History, supply: str, now: float) -> Lasting[Backoff | None]:
+    lately, until = _lately(history.failures[supply], now)
+    proven_at = history.proven_at(supply)
+    bad = [f for f in lately if f.at > proven_at]
+    if not bad:
+        return Lasting(None, now, until)
+    last = bad[-1]
+    return Lasting(Backoff(last.at + FORGIVE_S, len(bad), last.cause, since=last.at), now, until)
+
+
+def _lately(failures: Sequence[Failure], now: float) -> tuple[Sequence[Failure], float]:
+    """Return those that still count, of failures in order of time, and until when it is those."""
     if not failures or failures[-1].at <= now - FORGIVE_S:
-        return ()
+        return (), NEVER
     first = end = len(failures)
+    until = NEVER
     while end and failures[end - 1].at > now:
         end -= 1
+        until = failures[end].at
     while first and failures[first - 1].at > now - FORGIVE_S:
         first -= 1
-    return failures[first:end]
+    if first < end:
+        until = min(until, failures[first].at + FORGIVE_S)
+    return failures[first:end], until
 
 
 def backoff(failures: list[Failure], now: float) -> Backoff | None:
@@ -132,46 +158,72 @@ def backoff(failures: list[Failure], now: float) -> Backoff | None:
     if not recent:
         return None
     last = recent[-1]
-    rest_s = min(BASE_S * 2.0 ** min(len(recent) - 1, 16), LIMIT_S)
-    if last.cause == "quota":  # waiting a little does not help: the account is full
-        rest_s = LIMIT_S
-    if now >= last.at + rest_s:
-        return None
-    return Backoff(last.at + rest_s, len(recent), last.cause, since=last.at)
+    # Waiting a little does not help where the account is full.
+    until = last.at + (LIMIT_S if last.cause == "quota" else rest_s(len(recent)))
+    return None if now >= until else Backoff(until, len(recent), last.cause, since=last.at)
+
+
+def rest_s(failures: int) -> float:
+    """Return how long so many failures in a row make a location rest, in seconds."""
+    return min(BASE_S * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
 
 
 def avoided(history: History, now: float) -> Mapping[str, float]:
     """Return the locations to use only when no other is left, and until when."""
-    return history.of_places(_avoided, now)
+    return history.of_places(_avoided, now).value
 
 
-def _avoided(history: History, now: float) -> Mapping[str, float]:
+def _avoided(history: History, now: float) -> Lasting[Mapping[str, float]]:
     out: dict[str, float] = {}
-    for location, losses in history.losses.items():
-        first = bisect_right(losses, now - AVOID_MEMORY_S)
-        recent = losses[first : bisect_right(losses, now, lo=first)]
-        if recent:
-            until = recent[-1] + min(AVOID_S * 2.0 ** min(len(recent) - 1, 16), AVOID_LIMIT_S)
-            if now < until:
-                out[location] = until
-    return out
+    until = NEVER
+    for location in history.losses:
+        found = history.of_supply(_avoidance, location, now)
+        until = min(until, found.until)
+        if found.value > now:
+            out[location] = found.value
+    return Lasting(out, now, until)
 
 
-def next_change(history: History, now: float, *, needy: bool = True) -> float:
-    """Return when, if nothing happens, another location may be chosen.
+def _avoidance(history: History, location: str, now: float) -> Lasting[float]:
+    """Return until when a location is avoided; a time that is over if it is not."""
+    losses = history.losses[location]
+    first = bisect_right(losses, now - AVOID_MEMORY_S)
+    end = bisect_right(losses, now, lo=first)
+    holds = losses[end] if end < len(losses) else NEVER
+    if first == end:
+        return Lasting(-NEVER, now, holds)
+    until = losses[end - 1] + min(AVOID_S * 2.0 ** min(end - first - 1, 16), AVOID_LIMIT_S)
+    if until > now:
+        holds = min(holds, until)
+    return Lasting(until, now, min(holds, losses[first] + AVOID_MEMORY_S))
 
-    Infinity for never. An older failure that is forgiven meanwhile may end a rest early.
+
+def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:
+    """Return when, if nothing happens, another location may be chosen; infinity for never.
 
     Args:
-        needy: A machine is wanted that a rest keeps from being launched. Else only who could be
-            better off elsewhere waits for anything.
+        waits: For the end of a rest; see `Plan`.
+        restless: Somebody could be better off elsewhere.
     """
-    times = [rest.until for rest in disappointing(history, now).values()]
-    for location, rest in resting(history, now).items() if needy else ():
-        places = list(history.failures) if location == EVERYWHERE else [location]
-        forgiven = (f.at + FORGIVE_S for p in places for f in _lately(history.failures[p], now))
-        times += [rest.since + EAGER_S, rest.until, *(at for at in forgiven if at < rest.until)]
-    for location, until in avoided(history, now).items():
-        forgotten = (at + AVOID_MEMORY_S for at in history.losses[location])
-        times += [until, *(at for at in forgotten if at < until)]
-    return min((at for at in times if at > now), default=float("inf"))
+    times: list[float] = []
+    rests = resting(history, now)
+    if waits and rests:
+        times.append(max(rest.since for rest in rests.values()) + EAGER_S)
+    for supply, rest in rests.items():
+        if waits or supply == EVERYWHERE:
+            times += [rest.until, *_shortened(history, supply, rest, now)]
+    if restless:
+        times += [rest.until for rest in disappointing(history, now).values()]
+        for location, until in avoided(history, now).items():
+            forgotten = (at + AVOID_MEMORY_S for at in history.losses[location])
+            times += [until, *(at for at in forgotten if at < until)]
+    return min((at for at in times if at > now), default=NEVER)
+
+
+def _shortened(history: History, supply: str, rest: Backoff, now: float) -> Iterator[float]:
+    """Yield when failures are forgiven by which a rest may end early."""
+    places = list(history.failures) if supply == EVERYWHERE else [supply]
+    lately = [f for place in places for f in _lately(history.failures[place], now)[0]]
+    forgiven = [f.at + FORGIVE_S for f in lately if f.at + FORGIVE_S < rest.until]
+    if rest_s(rest.failures - len(forgiven)) < rest.until - rest.since:
+        yield from forgiven

@@ -222,7 +222,7 @@ def describe(
         health: The pool, judged by `spec`.
         wanted: How many replicas should serve.
     """
-    if good is None:
+    if good is None or (spec is good and not trial.fault):
         return None
     current = [
         judged.machine.spec_hash == replica_hash(spec, judged.id.slot) for judged in health.replicas
@@ -236,7 +236,7 @@ def describe(
         back = all(current) and done >= wanted
         state = UpdateState.ROLLED_BACK if back else UpdateState.STOPPED
         return Update(state, done, wanted, trial.fault)
-    if spec is good or not differs(spec, good, [judged.id.slot for judged in health.replicas]):
+    if not differs(spec, good, [judged.id.slot for judged in health.replicas]):
         return None
     return Update(UpdateState.IN_PROGRESS, done, wanted)
 

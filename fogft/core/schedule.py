@@ -15,15 +15,14 @@ from __future__ import annotations
 
 import datetime
 import zoneinfo
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fogft.core.spec_choices import ScheduleSpec, WindowSpec
 
 DAY_S = 86_400
 
 
-@dataclass(frozen=True)
-class Wish:
+class Wish(NamedTuple):
     """What is wanted at a moment.
 
     Attributes:

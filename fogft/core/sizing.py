@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from fogft.core.availability import Expected, expected
 from fogft.core.groups import Group, critical_group, groups_of, shares
@@ -28,8 +29,7 @@ from fogft.core.score import Scale
 from fogft.core.spec import MAX_REPLICAS, PoolSpec
 
 
-@dataclass(frozen=True)
-class Size:
+class Size(NamedTuple):
     """What is wanted.
 
     Attributes:

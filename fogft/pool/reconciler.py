@@ -14,6 +14,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.core import lifetime
@@ -142,6 +143,7 @@ class Reconciler:
         self._remember = Remembering(store, clock)
         self._updating = Updating(store)
         self._membership: Membership | None = store.membership()
+        self._published_for: tuple[Any, ...] | None = None  # what it follows from
 
     def tick(self) -> Tick:
         """Observe, plan and apply once.
@@ -217,7 +219,7 @@ class Reconciler:
             for id, order in busy.items():
                 if order is not None:
                     listed[id] = replace(listed.get(id, order), launched_at=now)
-            machines = tuple(listed[id] for id in sorted(listed))
+            machines = tuple(sorted(listed.values(), key=_by_id))
         except CloudError as error:
             log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
             trouble.append(f"the cloud did not answer: {told(error)}")
@@ -246,7 +248,9 @@ class Reconciler:
         known = self._offers_for
         if known is None or known[0] != key or not 0 <= now - known[1] < OFFERS_EVERY_S:
             try:
-                self._offers = offers.ask(self._cloud, spec)
+                sold = offers.ask(self._cloud, spec)
+                if sold != self._offers:  # the planner keeps what it worked out of a tuple
+                    self._offers = sold
                 self._offers_for = (key, now)
             except FogftError as error:
                 trouble.append(f"no prices can be had: {told(error)}")
@@ -280,16 +284,22 @@ class Reconciler:
 
     def _publish(self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan) -> None:
         revoked = self._revoked()
+        found = Found.of(spec)
+        by_hand = self._by_hand() if found is not Found.BY_CLOUD else frozenset()
+        gateways = self._gateways() if spec.topology else {}
+        ending = {end.id for end in plan.terminations} | observed.ending
+        cause = spec, observed.machines, plan.draining, ending, revoked, by_hand, gateways
+        if cause == self._published_for:
+            return
         members = members_of(
             observed.machines or (),
             pool_uid=identity.uid,
             draining=plan.draining,
-            ending={end.id for end in plan.terminations} | observed.ending,
+            ending=ending,
             revoked=revoked,
-            found=Found.of(spec),
+            found=found,
         )
-        if Found.of(spec) is not Found.BY_CLOUD:
-            members = with_by_hand(members, self._by_hand())
+        members = with_by_hand(members, by_hand)
         membership = successor(
             self._membership,
             pool=identity.name,
@@ -297,11 +307,12 @@ class Reconciler:
             epoch=self._epoch,
             members=members,
             revoked=revoked,
-            topology=certified(spec.topology, self._gateways()) if spec.topology else None,
+            topology=certified(spec.topology, gateways) if spec.topology else None,
         )
         if membership is not None:
             self._store.write_membership(membership)
             self._membership = membership
+        self._published_for = cause
 
     def _launch(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> None:
         order = self._build_order(identity, spec, planned)
@@ -332,6 +343,11 @@ class Reconciler:
             self._remember.add(EventKind.ENDING, id, detail=reason)
             log.info("terminate_ordered replica=%s reason=%r", id.short, reason)
         self._operations.start(id, None, lambda: self._cloud.terminate(id))
+
+
+def _by_id(machine: Machine) -> tuple[str, int, int]:
+    id = machine.id
+    return id.pool_uid, id.slot, id.generation
 
 
 def _refusal(error: Exception) -> str:

@@ -54,10 +54,11 @@ class Remembering:
         not take the loss for something of the future, and go to the same place again.
         """
         uid = self._store.identity().uid
-        listed = {m.id for m in observed.machines or ()}
+        ids = [m.id for m in observed.machines or ()]
+        listed = {(id.slot, id.generation) for id in ids if id.pool_uid == uid}
         for record in self._store.history().open():
-            id = ReplicaId(uid, record.slot, record.generation)
-            if id not in listed:
+            if (record.slot, record.generation) not in listed:
+                id = ReplicaId(uid, record.slot, record.generation)
                 kind = EventKind.ENDED if record.ending else EventKind.GONE
                 log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
                 self.add(kind, id, at=observed.now)

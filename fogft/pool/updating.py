@@ -73,7 +73,7 @@ class Updating:
             StateError: It cannot be kept.
         """
         good = self._store.good()
-        if not trial.fault and spec != good:
+        if not trial.fault and spec is not good and spec != good:
             settle_s = rollout.SETTLE_S if good is not None else 0.0
             if rollout.is_whole(
                 spec, health, history, wanted=wanted, now=now, settle_s=settle_s

@@ -7,20 +7,21 @@ Owns: the links' report, and when the manager can next have something to do.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from fogft.core import migration, quarantine, schedule
 from fogft.core.endings import DRAIN_SETTLE_S
-from fogft.core.groups import groups_of
+from fogft.core.health import LONE_SILENCE_FACTOR
 from fogft.core.history import Event, History, compacted
 from fogft.core.intent import Intent
-from fogft.core.model import LinkReport, LinkState, Membership, ReplicaId
+from fogft.core.model import LinkReport, LinkState, MachinePhase, Membership, ReplicaId
 from fogft.core.planner import DRAIN_LIMIT_S
 from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
 from fogft.pool.reconciler import Reconciler, Tick
 from fogft.pool.store import Identity
-from fogft.simulation.world import NEVER, TICK_S, Target, World
+from fogft.simulation.world import NEVER, TICK_S, UNSEEN, Target, World
 
 UID = "0" * 16
 LOOK_EVERY_S = 6 * 3600.0  # a safety net: tests show that the results do not depend on it
@@ -110,9 +111,13 @@ class Managed:
         self.world = world
         self.wanted = target
         self.store = Memory(replace(spec, max_hours=None), world.now)  # a run is as long as asked
+        health = spec.health
+        patience_s = health.replace_after_s
+        silences = (health.suspect_after_s, patience_s, patience_s * LONE_SILENCE_FACTOR)
+        world.silences = [silence_s + TICK_S for silence_s in silences]
         self._ready = frozenset(service.name for service in spec.services)
         self._reconciler = Reconciler(
-            world, self.store, clock=lambda: world.now, links=self._links, submit=world.submit
+            world, self.store, clock=lambda: world.now, links=self._links, submit=self._submit
         )
 
     def tick(self, now: float) -> float:
@@ -127,7 +132,8 @@ class Managed:
     def _next_timer(self, tick: Tick) -> float:
         history, now = self.store.history(), tick.observed.now
         health = tick.spec.health
-        times = [quarantine.next_change(history, now, needy=self._is_needy(tick))]
+        restless = tick.plan.restless
+        times = [quarantine.next_change(history, now, waits=tick.plan.waits, restless=restless)]
         if tick.spec.schedule is not None:
             times.append(schedule.next_change(tick.spec.schedule, now))
         for record in history.open():
@@ -137,22 +143,27 @@ class Managed:
             if record.first_ready_at is None:
                 times.append(record.launched_at + health.start_limit_s + TICK_S)
                 continue
-            stays = [migration.RETURN_AFTER_S] if record.on_demand else []
-            stays += [tick.spec.migration.stay_s] if tick.spec.migration else []
-            times += [record.first_ready_at + stay_s for stay_s in stays]
-        for vm in self.world.vms.values():
-            if vm.gone_at <= now:
-                times += [
-                    vm.gone_at + patience_s + TICK_S
-                    for patience_s in (health.suspect_after_s, health.replace_after_s)
-                ]
+            if restless or tick.plan.waits:
+                stays = [migration.RETURN_AFTER_S] if record.on_demand else []
+                stays += [tick.spec.migration.stay_s] if tick.spec.migration else []
+                times += [record.first_ready_at + stay_s for stay_s in stays]
+        times += [
+            machine.launched_at + health.start_limit_s + TICK_S
+            for machine in tick.observed.machines or ()
+            if machine.phase is MachinePhase.PROVISIONING
+        ]
         return min((at for at in times if at > now), default=NEVER)
 
-    def _is_needy(self, tick: Tick) -> bool:
-        """Whether a launch may be waiting for a rest to end."""
-        there = [vm for vm in self.world.vms.values() if vm.gone_at == NEVER and not vm.noticed]
-        stand_ins = any(g.on_demand.fallback or g.on_demand.base for g in groups_of(tick.spec))
-        return stand_ins or len(there) < tick.plan.wanted or bool(tick.plan.notes)
+    def _submit(self, call: Callable[[], None]) -> None:
+        """Make a call of the cloud. That it accepts an order makes no difference until it boots."""
+        vms = self.world.vms
+
+        def answer() -> object:
+            before = len(vms)
+            call()
+            return UNSEEN if len(vms) > before else None
+
+        self.world.submit(answer)
 
     def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...]:
         """Report as the client proxy does: of the published members, by what was heard."""
@@ -162,14 +173,15 @@ class Managed:
             if vm is None:
                 continue
             silent_s = max(now - vm.gone_at, 0.0)
-            silent = silent_s > self.store.the_spec.health.suspect_after_s
-            reports.append(
-                LinkReport(
+            report = vm.report if not silent_s else None
+            if report is None:
+                silent = silent_s > self.store.the_spec.health.suspect_after_s
+                report = vm.report = LinkReport(
                     member.id,
                     LinkState.SUSPECT if silent else LinkState.UP,
                     ready=self._ready,
                     draining=vm.noticed,
                     silent_for_s=silent_s,
                 )
-            )
+            reports.append(report)
         return tuple(reports)

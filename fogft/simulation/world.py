@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 from fogft.cloud.port import Launch
 from fogft.core.errors import NoCapacity
-from fogft.core.model import Machine, MachinePhase, Offer, ReplicaId
+from fogft.core.model import LinkReport, Machine, MachinePhase, Offer, ReplicaId
 from fogft.simulation.market import Change, Market, changes, rounded_up
 from fogft.simulation.meter import Meter
 
@@ -62,6 +62,7 @@ class Vm:
     noticed: bool = False
     gone_at: float = NEVER
     machine: Machine | None = None  # as listed; None when that has to be made anew
+    report: LinkReport | None = None  # of its link while it answers; likewise
 
     @property
     def id(self) -> ReplicaId:
@@ -91,6 +92,8 @@ class World:
         self.vms: dict[ReplicaId, Vm] = {}
         self.meter = Meter(EPOCH + settle_s, keep_curve)
         self.asked = 0  # how often the policy was
+        # A policy that goes by links sees that a machine is gone so long after; else at once.
+        self.silences: Sequence[float] = ()
         self._until = EPOCH + length_s
         self._chance = random.Random(f"machines {seed}")
         self._capacity: dict[str, int] = {}
@@ -161,7 +164,8 @@ class World:
             return UNSEEN
         for vm in self._chance.sample(here, excess):
             if EPOCH + change.ends_s > self.now:
-                vm.noticed, vm.machine = True, None
+                vm.noticed = True
+                vm.machine = vm.report = None
             self.at(EPOCH + change.ends_s, partial(self._lose, vm))
         return None
 
@@ -176,15 +180,18 @@ class World:
             and not vm.noticed
         ]
 
-    def _lose(self, vm: Vm) -> None:
+    def _lose(self, vm: Vm) -> object:
         if vm.id not in self.vms or vm.gone_at != NEVER:
-            return  # it was ended before
+            return UNSEEN  # it was ended before
         vm.gone_at, vm.ready = self.now, False
         self.meter.preemptions += self.meter.counts(self.now)
+        for silence_s in self.silences:
+            self.after(silence_s, lambda: None if vm.id in self.vms else UNSEEN)
         self.after(self.market.timing.detect_s, lambda: self._forget(vm))
+        return UNSEEN if self.silences else None
 
-    def _forget(self, vm: Vm) -> None:
-        self.vms.pop(vm.id, None)
+    def _forget(self, vm: Vm) -> object:
+        return UNSEEN if self.vms.pop(vm.id, None) is None else None
 
     def _boot(self, vm: Vm) -> None:
         if vm.id in self.vms and vm.gone_at == NEVER:
@@ -192,7 +199,7 @@ class World:
 
     # -- the cloud port -----------------------------------------------------------------------
 
-    def submit(self, call: Callable[[], None]) -> None:
+    def submit(self, call: Happening) -> None:
         """Make a call of the cloud, which takes its time to answer."""
         self.after(self.market.timing.answer_s, call)
 
@@ -202,7 +209,7 @@ class World:
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         """List the machines, those lost and not yet missed included."""
-        return [vm.machine or _listed(vm) for _, vm in sorted(self.vms.items())]
+        return [vm.machine or _listed(vm) for vm in self.vms.values()]
 
     def launch(self, order: Launch) -> None:
         """Start a machine if there is room.
