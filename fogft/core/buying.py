@@ -19,7 +19,7 @@ from fogft.core.groups import Group
 from fogft.core.health import Verdict
 from fogft.core.history import History
 from fogft.core.intent import Intent
-from fogft.core.listing import catalogue
+from fogft.core.listing import Listing, catalogue
 from fogft.core.model import Observed, Offer, Placement
 from fogft.core.needs import Need, home
 from fogft.core.placement import Choice, Market
@@ -70,6 +70,7 @@ class Buyer:
     def __post_init__(self) -> None:
         self._catalogue = catalogue(self.observed.offers)
         self._markets: dict[tuple[str, bool | None, bool], Market] = {}
+        self._whole: dict[tuple[str, bool | None], Market] = {}
         self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
         wrong = self._catalogue.impossible
         if wrong:
@@ -133,15 +134,20 @@ class Buyer:
 
     def _market(self, group: Group, spot: bool | None, resting: Mapping[str, Backoff]) -> Market:
         return Market(
-            self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale),
+            self._listing(group, spot),
             resting=resting,
             avoid=(*self._avoided, *(s.location for s in self.census.lost)),
         )
 
     def whole_market(self, group: Group, spot: bool | None) -> Market:
         """Return what is sold to a group where nothing rests and nothing is avoided."""
-        listing = self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale)
-        return Market(listing)
+        key = (group.offers, spot)
+        if key not in self._whole:
+            self._whole[key] = Market(self._listing(group, spot))
+        return self._whole[key]
+
+    def _listing(self, group: Group, spot: bool | None) -> Listing:
+        return self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale)
 
     def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
         """Return the market of what rests longest, where all rests; None to wait for another."""

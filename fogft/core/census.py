@@ -6,10 +6,11 @@ Not here: health (`health`), and moving those that could be better placed (`migr
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 
 from fogft.core.endings import Census, Standing
-from fogft.core.groups import replica_hash
+from fogft.core.groups import BLOCK, replica_hash
 from fogft.core.health import Health, Judged, Verdict
 from fogft.core.history import History
 from fogft.core.intent import Intent
@@ -32,6 +33,7 @@ def take_census(
 ) -> Census:
     """Sort every machine of the pool."""
     census = Census()
+    blocks = {group.block for group in size.groups}
     for judged in health.replicas:
         record = history.record(judged.id.slot, judged.id.generation)
         standing = Standing(judged, record)
@@ -41,8 +43,8 @@ def take_census(
             census.failed.append(standing)
         elif judged.verdict in (Verdict.LEAVING, Verdict.UNRESPONSIVE):
             census.lost.append(standing)
-        elif why := _unwanted(spec, intent, judged, size):
-            standing = Standing(judged, record, why)
+        elif why := _unwanted(spec, intent, judged, blocks):
+            standing.reason = why
             if _is_young(standing, health) or _never_served(standing, health):
                 census.aborted.append(standing)
             else:
@@ -75,16 +77,16 @@ def _supersede(census: Census, health: Health, size: Size) -> None:
             (census.aborted if young else census.replaced).append(goes)
 
 
-def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged, size: Size) -> str:
+def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged, blocks: Collection[int]) -> str:
     """Return why a working replica is to be replaced; empty when it is not."""
     machine, slot = judged.machine, judged.id.slot
     if intent.is_drained(slot, judged.id.generation):
         return "drained by the user"
-    if intent.is_excluded(machine.placement.location):
+    if intent.excluded and intent.is_excluded(machine.placement.location):
         return f"excluded location {machine.placement.location}"
     if judged.verdict in (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES):
         return judged.why
-    if not any(group.owns(slot) for group in size.groups):
+    if slot // BLOCK not in blocks:
         return "its group is not in the pool file"
     if machine.spec_hash != replica_hash(spec, slot):
         return "outdated by another version"

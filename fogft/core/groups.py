@@ -124,6 +124,16 @@ def services_at(spec: PoolSpec, slot: int) -> tuple[ServiceSpec, ...]:
     return group_at(spec, slot).services
 
 
+def ready_at(spec: PoolSpec, slot: int) -> frozenset[str]:
+    """Return the names of the services that make the replica in a slot ready; none for never."""
+    key = "ready", slot // BLOCK
+    found: frozenset[str] | None = spec.derived.get(key)
+    if found is None:
+        services = services_at(spec, slot) or spec.discovered
+        found = spec.derived[key] = frozenset(service.name for service in services)
+    return found
+
+
 def replica_hash(spec: PoolSpec, slot: int) -> str:
     """Return the hash that a replica in this slot should have; see `PoolSpec.replica_hash`."""
     key = "hash", slot // BLOCK

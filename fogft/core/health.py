@@ -13,7 +13,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import NamedTuple
 
-from fogft.core.groups import replica_hash, services_at
+from fogft.core.groups import ready_at, replica_hash
 from fogft.core.history import History, Record
 from fogft.core.model import (
     LinkReport,
@@ -138,8 +138,8 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
         return False
     if machine.spec_hash != replica_hash(spec, machine.id.slot):
         return bool(link.ready)
-    wanted = services_at(spec, machine.id.slot) or spec.discovered
-    return bool(wanted) and link.ready.issuperset(service.name for service in wanted)
+    wanted = ready_at(spec, machine.id.slot)
+    return bool(wanted) and wanted <= link.ready
 
 
 class _Context(NamedTuple):

@@ -138,6 +138,40 @@ class Lasting(Generic[T]):
     until: float
 
 
+class Digest(Generic[T]):
+    """What follows from the events of each of several places, kept as long as it is so.
+
+    Args:
+        outdated: Places to be worked out when next asked for.
+    """
+
+    def __init__(self, outdated: set[str]) -> None:
+        self.outdated = outdated
+        self._known: dict[str, Lasting[T | None]] = {}
+        self._values: dict[str, T] = {}
+        self._since, self._until = float("-inf"), float("inf")
+
+    def at(self, now: float, work_out: Callable[[str], Lasting[T | None]]) -> Mapping[str, T]:
+        """Return what is so at a time, by place; None is left out."""
+        if not self._since <= now < self._until:
+            self.outdated.update(
+                place for place, one in self._known.items() if not one.since <= now < one.until
+            )
+        if self.outdated:
+            for place in self.outdated:
+                self._known[place] = work_out(place)
+            self.outdated.clear()
+            self._values = {p: one.value for p, one in self._known.items() if one.value is not None}
+            self._since = max(one.since for one in self._known.values())
+            self._until = min(one.until for one in self._known.values())
+        return self._values
+
+
+def _outdate(digests: Mapping[Any, Digest[Any]], place: str) -> None:
+    for digest in digests.values():
+        digest.outdated.add(place)
+
+
 class History:
     """Events folded into facts. `add` is the only change; planner and placement only read."""
 
@@ -149,9 +183,9 @@ class History:
         self._proven_at: dict[str, float] = {}
         self._losses: dict[str, list[float]] = {}
         self.version = 0  # of all facts: counts events
-        # What follows from failures, proofs and losses: of one supply, and of all together.
-        self._of_supply: dict[str, dict[Callable[..., Any], Lasting[Any]]] = {}
-        self._of_all: dict[Callable[..., Any], Lasting[Any]] = {}
+        # What follows from failures and proofs of each supply, and from losses at each location.
+        self._of_supplies: dict[Callable[..., Any], Digest[Any]] = {}
+        self._of_losses: dict[Callable[..., Any], Digest[Any]] = {}
         for event in events:
             self.add(event)
 
@@ -182,7 +216,7 @@ class History:
         # Launches and marks change none of these.
         later._failures, later._proven_at = self._failures, self._proven_at
         later._losses = self._losses
-        later._of_supply, later._of_all = self._of_supply, self._of_all
+        later._of_supplies, later._of_losses = self._of_supplies, self._of_losses
         for event in events:
             if event.kind not in _ORDERS:
                 raise ValueError(f"`{event.kind.value}` is none of our own orders")
@@ -199,7 +233,8 @@ class History:
                 record.first_ready_at = event.at
             record.unready_since = None
             self._proven_at[record.supply] = event.at
-            self._forget(record.supply)
+            if record.supply in self._failures:
+                _outdate(self._of_supplies, record.supply)
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
         elif kind is EventKind.DRAINING:
@@ -216,16 +251,12 @@ class History:
                 self._fail(record, event)
             if kind is EventKind.GONE:
                 insort(self._losses.setdefault(record.location, []), event.at)
-                self._forget(record.location)
+                _outdate(self._of_losses, record.location)
             record.closed = kind
             record.closed_at = event.at
 
-    def _forget(self, supply: str) -> None:
-        self._of_supply.pop(supply, None)
-        self._of_all.clear()
-
     def _fail(self, record: Record, event: Event) -> None:
-        self._forget(record.supply)
+        _outdate(self._of_supplies, record.supply)
         cause = event.detail.split(":")[0].split(" ")[0] or "error"
         failures = self._failures.setdefault(record.supply, [])
         insort(failures, Failure(event.at, cause), key=lambda failure: failure.at)
@@ -261,27 +292,29 @@ class History:
         """Return when a replica from there last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
 
-    def of_places(self, work_out: Callable[[History, float], Lasting[T]], now: float) -> Lasting[T]:
-        """Return what follows from failures, proofs and losses; worked out anew when it may differ.
+    def of_supplies(
+        self, work_out: Callable[[History, str, float], Lasting[T | None]], now: float
+    ) -> Mapping[str, T]:
+        """Return what follows from the failures and proofs of each supply; None is left out.
 
         Args:
-            work_out: Pure, and looks at nothing else of a history.
+            work_out: Pure, and looks at nothing else of a history. It is asked again only when
+                it may say something else.
             now: Seconds since the epoch.
         """
-        known = self._of_all.get(work_out)
-        if known is None or not known.since <= now < known.until:
-            known = self._of_all[work_out] = work_out(self, now)
-        return known
+        digest = self._of_supplies.get(work_out)
+        if digest is None:
+            digest = self._of_supplies[work_out] = Digest(set(self._failures))
+        return digest.at(now, lambda supply: work_out(self, supply, now))
 
-    def of_supply(
-        self, work_out: Callable[[History, str, float], Lasting[T]], supply: str, now: float
-    ) -> Lasting[T]:
-        """Return what follows from those of one supply or location alone; likewise."""
-        memory = self._of_supply.setdefault(supply, {})
-        known = memory.get(work_out)
-        if known is None or not known.since <= now < known.until:
-            known = memory[work_out] = work_out(self, supply, now)
-        return known
+    def of_losses(
+        self, work_out: Callable[[History, str, float], Lasting[T | None]], now: float
+    ) -> Mapping[str, T]:
+        """Return what follows from the losses at each location; likewise."""
+        digest = self._of_losses.get(work_out)
+        if digest is None:
+            digest = self._of_losses[work_out] = Digest(set(self._losses))
+        return digest.at(now, lambda location: work_out(self, location, now))
 
     @property
     def losses(self) -> Mapping[str, list[float]]:

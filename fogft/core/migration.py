@@ -19,6 +19,7 @@ Not here: carrying it out, which is a replacement like any other (`needs`, `buyi
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -79,8 +80,9 @@ def _would_move(buyer: Buyer, standing: Standing) -> bool:
     if kind is not None and kind != placement.spot:
         return False
     market = buyer.whole_market(home(buyer.groups, standing.slot), kind)
-    choice = market.choose(buyer.places(standing), budget_usd_per_hour=buyer.budget)
-    return _is_better(buyer, standing, choice) is not None
+    count = crowding(buyer.places(standing))
+    choice = market.choose(count, budget_usd_per_hour=buyer.budget)
+    return _is_better(buyer, standing, choice, count) is not None
 
 
 def mover(buyer: Buyer, now: float) -> Move | None:
@@ -100,7 +102,7 @@ def _returns(buyer: Buyer, now: float) -> Iterator[Move]:
         group = home(buyer.groups, standing.slot)
         if not buyer.kind(group, standing):  # on demand by right, or it does not matter
             continue
-        choice = _best(buyer, standing)
+        choice = _best(buyer, standing, crowding(buyer.places(standing)))
         if choice.offer is not None and not choice.rank[0]:
             why = f"spot can be had again at {choice.offer.placement.location}"
             yield Move(standing, why, (-1.0,))
@@ -118,18 +120,21 @@ def _moves(buyer: Buyer, now: float) -> Iterator[Move]:
         kind = buyer.kind(home(buyer.groups, standing.slot), standing)
         if kind is not None and kind != placement.spot:  # `_returns` decides about those
             continue
-        move = _is_better(buyer, standing, _best(buyer, standing, at_leisure=True))
+        count = crowding(buyer.places(standing))
+        choice = _best(buyer, standing, count, at_leisure=True)
+        move = _is_better(buyer, standing, choice, count)
         if move is not None:
             yield move
 
 
-def _is_better(buyer: Buyer, standing: Standing, choice: Choice) -> Move | None:
+def _is_better(
+    buyer: Buyer, standing: Standing, choice: Choice, count: Counter[str]
+) -> Move | None:
     """Return the move to a place if that is so much better."""
     rules, placement = buyer.spec.migration, standing.judged.machine.placement
     offer, (avoided, *there) = choice.offer, choice.rank
     if rules is None or offer is None or avoided or offer.placement == placement:
         return None
-    count = crowding(buyer.places(standing))
     here = [count[domain] for domain in domains(placement)]
     if there < here:
         why = f"moves to {offer.placement.location}: better spread"
@@ -141,10 +146,12 @@ def _is_better(buyer: Buyer, standing: Standing, choice: Choice) -> Move | None:
     return None
 
 
-def _best(buyer: Buyer, standing: Standing, *, at_leisure: bool = False) -> Choice:
+def _best(
+    buyer: Buyer, standing: Standing, count: Counter[str], *, at_leisure: bool = False
+) -> Choice:
     group = home(buyer.groups, standing.slot)
     market = buyer.market(group, buyer.kind(group, standing), at_leisure=at_leisure)
-    return market.choose(buyer.places(standing), budget_usd_per_hour=buyer.budget)
+    return market.choose(count, budget_usd_per_hour=buyer.budget)
 
 
 def _score(buyer: Buyer, standing: Standing) -> float:

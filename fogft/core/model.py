@@ -38,6 +38,9 @@ class ReplicaId:
     def __str__(self) -> str:
         return f"{self.pool_uid}-{self.slot}.{self.generation}"
 
+    def __hash__(self) -> int:
+        return self.slot << 32 ^ self.generation  # nearly all are of one pool
+
 
 @dataclass(frozen=True, order=True)
 class Placement:

@@ -92,7 +92,7 @@ class Market:
 
     def choose(
         self,
-        taken: Iterable[Placement],
+        taken: Iterable[Placement] | Counter[str],
         *,
         avoid: Collection[str] = (),
         budget_usd_per_hour: float | None = None,
@@ -100,13 +100,13 @@ class Market:
         """Choose an offer, given where our other replicas are.
 
         Args:
-            taken: Where the replicas that stay are.
+            taken: Where the replicas that stay are, or how many are where.
             avoid: More locations to avoid.
             budget_usd_per_hour: The most that the new machine may cost; None for no limit.
         """
         if self._nothing:
             return Choice(None, self._nothing)
-        count = crowding(taken)
+        count = taken if isinstance(taken, Counter) else crowding(taken)
         avoided = self._avoid.union(avoid)
         limit = math.inf if budget_usd_per_hour is None else budget_usd_per_hour + EPSILON_USD
         ideal = (False, min(count[cloud] for cloud in self._clouds), 0, 0)

@@ -240,8 +240,10 @@ def _within_cap(sized: Size, census: Census) -> tuple[Sequence[int], list[str]]:
     The last group gives first, one at a time, and one replica always stays.
     """
     cap, counts, groups = sized.max_usd_per_hour, list(sized.counts), sized.groups
+    if cap is None or len(census.good) < 2:
+        return counts, []
     cost = sum(s.usd_per_hour for s in census.good)
-    if cap is None or cost <= cap + EPSILON_USD or len(census.good) < 2:
+    if cost <= cap + EPSILON_USD:
         return counts, []
     if census.replaced or census.ending or len(census.good) > sum(counts):
         return counts, []  # it shrinks already

@@ -64,38 +64,31 @@ def resting(history: History, now: float) -> Mapping[str, Backoff]:
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """
-    return history.of_places(_resting, now).value
+    rests = history.of_supplies(_rest, now)
+    everywhere = _everywhere(history, now)
+    return rests if everywhere is None else {**rests, EVERYWHERE: everywhere}
 
 
-def _resting(history: History, now: float) -> Lasting[Mapping[str, Backoff]]:
-    out: dict[str, Backoff] = {}
-    setup_failures: list[Failure] = []
-    until = NEVER
-    for supply in history.failures:
-        found = history.of_supply(_rest, supply, now)
-        until = min(until, found.until)
-        rest, setup = found.value
-        setup_failures += setup
-        if rest is not None:
-            out[supply] = rest
-    if setup_failures:
-        proven_at = max(history.proven_at(place) for place in history.failures)
-        everywhere = backoff([f for f in setup_failures if f.at > proven_at], now)
-        if everywhere is not None:
-            out[EVERYWHERE] = everywhere
-            until = min(until, everywhere.until)
-    return Lasting(out, now, until)
-
-
-def _rest(
-    history: History, supply: str, now: float
-) -> Lasting[tuple[Backoff | None, Sequence[Failure]]]:
-    """Return a supply's rest, and its failures of late that are the pool file's."""
+def _rest(history: History, supply: str, now: float) -> Lasting[Backoff | None]:
+    """Return a supply's rest, whatever was the pool file's fault left out."""
     lately, until = _lately(history.failures[supply], now)
-    setup = [f for f in lately if f.cause == "setup"]
     proven_at = history.proven_at(supply)
     rest = backoff([f for f in lately if f.cause != "setup" and f.at > proven_at], now)
-    return Lasting((rest, setup), now, until if rest is None else min(until, rest.until))
+    return Lasting(rest, now, until if rest is None else min(until, rest.until))
+
+
+def _everywhere(history: History, now: float) -> Backoff | None:
+    setup = [f for found in history.of_supplies(_setup, now).values() for f in found]
+    if not setup:
+        return None
+    proven_at = max(history.proven_at(place) for place in history.failures)
+    return backoff([f for f in setup if f.at > proven_at], now)
+
+
+def _setup(history: History, supply: str, now: float) -> Lasting[Sequence[Failure] | None]:
+    """Return the failures of late that are the pool file's fault."""
+    lately, until = _lately(history.failures[supply], now)
+    return Lasting([f for f in lately if f.cause == "setup"] or None, now, until)
 
 
 def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | None:
@@ -112,18 +105,7 @@ def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | 
 
 def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
     """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
-    return history.of_places(_disappointing, now).value
-
-
-def _disappointing(history: History, now: float) -> Lasting[Mapping[str, Backoff]]:
-    out: dict[str, Backoff] = {}
-    until = NEVER
-    for supply in history.failures:
-        found = history.of_supply(_disappointment, supply, now)
-        until = min(until, found.until)
-        if found.value is not None:
-            out[supply] = found.value
-    return Lasting(out, now, until)
+    return history.of_supplies(_disappointment, now)
 
 
 def _disappointment(history: History, supply: str, now: float) -> Lasting[Backoff | None]:
@@ -170,32 +152,22 @@ def rest_s(failures: int) -> float:
 
 def avoided(history: History, now: float) -> Mapping[str, float]:
     """Return the locations to use only when no other is left, and until when."""
-    return history.of_places(_avoided, now).value
+    return history.of_losses(_avoidance, now)
 
 
-def _avoided(history: History, now: float) -> Lasting[Mapping[str, float]]:
-    out: dict[str, float] = {}
-    until = NEVER
-    for location in history.losses:
-        found = history.of_supply(_avoidance, location, now)
-        until = min(until, found.until)
-        if found.value > now:
-            out[location] = found.value
-    return Lasting(out, now, until)
-
-
-def _avoidance(history: History, location: str, now: float) -> Lasting[float]:
-    """Return until when a location is avoided; a time that is over if it is not."""
+def _avoidance(history: History, location: str, now: float) -> Lasting[float | None]:
+    """Return until when a location is avoided; None if it is not."""
     losses = history.losses[location]
     first = bisect_right(losses, now - AVOID_MEMORY_S)
     end = bisect_right(losses, now, lo=first)
     holds = losses[end] if end < len(losses) else NEVER
     if first == end:
-        return Lasting(-NEVER, now, holds)
+        return Lasting(None, now, holds)
     until = losses[end - 1] + min(AVOID_S * 2.0 ** min(end - first - 1, 16), AVOID_LIMIT_S)
-    if until > now:
-        holds = min(holds, until)
-    return Lasting(until, now, min(holds, losses[first] + AVOID_MEMORY_S))
+    holds = min(holds, losses[first] + AVOID_MEMORY_S)
+    if until <= now:
+        return Lasting(None, now, holds)
+    return Lasting(until, now, min(holds, until))
 
 
 def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:

@@ -125,7 +125,8 @@ class Managed:
         self.store.compact(now)
         before = self.store.published
         tick = self._reconciler.tick()
-        if _ids(self.store.published) - _ids(before):  # its next look sees links to them
+        after = self.store.published
+        if after is not before and _ids(after) - _ids(before):  # its next look sees links to them
             return now + TICK_S
         return min(now + LOOK_EVERY_S, self._next_timer(tick))
 

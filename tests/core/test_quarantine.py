@@ -6,7 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.core.history import Event, EventKind, Failure, History
-from fogft.core.quarantine import BASE_S, EVERYWHERE, FORGIVE_S, LIMIT_S, backoff, resting
+from fogft.core.quarantine import (
+    BASE_S,
+    EVERYWHERE,
+    FORGIVE_S,
+    LIMIT_S,
+    avoided,
+    backoff,
+    disappointing,
+    resting,
+)
 
 PLACE, OTHER = "c/r/a", "c/r/b"
 
@@ -81,3 +90,36 @@ def test_an_ended_replica_is_no_failure() -> None:
     ]
     assert not resting(History(events), 3)
     assert OTHER not in resting(History(events), 3)
+
+
+HAPPENINGS = st.lists(
+    st.tuples(
+        st.sampled_from(["capacity: full", "quota: 8", "setup: exit 1", "ready", "gone", "look"]),
+        st.sampled_from([PLACE, OTHER]),
+        st.booleans(),
+        st.sampled_from([0, 1, 5, 60, 299, 600, 3599, 3600, 14_400]) | st.integers(-9_000, 9_000),
+    ),
+    max_size=25,
+)
+
+
+@given(HAPPENINGS)
+def test_what_is_remembered_of_places_is_what_follows_from_all_events(happenings):
+    """However often it was asked before, in whatever order, and with a clock that jumps back."""
+    events: list[Event] = []
+    now, asked = 100_000.0, History()
+    for generation, (what, place, on_demand, later_s) in enumerate(happenings, 1):
+        now += later_s
+        happened = [Event(now, EventKind.LAUNCH, 0, generation, place, on_demand=on_demand)]
+        if what == "look":
+            happened = []
+        elif what in ("ready", "gone"):
+            happened.append(Event(now, EventKind(what), 0, generation))
+        else:
+            happened.append(Event(now, EventKind.REFUSED, 0, generation, "", what))
+        events += happened
+        for event in happened:
+            asked.add(event)
+        anew = History(events)
+        for question in (resting, disappointing, avoided):
+            assert question(asked, now) == question(anew, now)
