@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 CACHE_AFTER_S = 0.2
 _LOOK_AFTER_OWN_EVERY_S = 5.0
-_BACKOFF_S = 0.4
+_BACKOFF_S = 0.25
 _END_WAIT_S = 2.0
 
 

@@ -23,7 +23,7 @@ from fogft.wire.record_exchange import SILENCE_S, Connection
 from fogft.wire.rendezvous_server import PURPOSE, binding_of
 from fogft.wire.signing import Signer
 
-ATTEMPT_EVERY_S = 0.4
+ATTEMPT_EVERY_S = 0.25
 _ATTEMPT_TIMEOUT_S = 3.0
 _GREETING_TIMEOUT_S = 5.0
 

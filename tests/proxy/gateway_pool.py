@@ -196,17 +196,21 @@ class ServerProxy:
 
     Args:
         pool: Whose.
-        slot: Its slot; the launch is the first.
+        slot: Its slot.
         extra: Further lines of its configuration.
+        generation: Its launch.
     """
 
-    def __init__(self, pool: GatewayPool, slot: int, extra: str = "") -> None:
+    def __init__(
+        self, pool: GatewayPool, slot: int, extra: str = "", *, generation: int = 1
+    ) -> None:
         self.endpoint = f"127.0.0.1:{free_port()}"
-        self._log = pool.folder / f"replica{slot}.log"
-        self._config = pool.folder / f"replica{slot}.yaml"
-        files = pool.authority.replica(slot)
+        stem = f"replica{slot}.{generation}"
+        self._log = pool.folder / f"{stem}.log"
+        self._config = pool.folder / f"{stem}.yaml"
+        files = pool.authority.replica(slot, generation)
         self._config.write_text(
-            f'pool: p\npool_uid: "{POOL_UID}"\nslot: {slot}\ngeneration: 1\n'
+            f'pool: p\npool_uid: "{POOL_UID}"\nslot: {slot}\ngeneration: {generation}\n'
             f"listen: {self.endpoint}\nadvertise: {self.endpoint}\nnotice: none\n"
             f"services: [{{name: {SERVICE}, type: {TYPE}}}]\nrun: 0 {pool.folder / 'ran'}\n{extra}"
             f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
