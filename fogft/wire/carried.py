@@ -13,6 +13,7 @@ from statistics import median_high
 
 SPAN_S = 0.5
 ENOUGH = 4  # spans, before anybody is turned away: longer than any pause that is no loss
+_MORE = 4  # times; less may be a step
 KEPT_S = 10.0  # then a link is measured anew
 
 
@@ -43,11 +44,11 @@ class Carried:
             queued: Whether more than that waited the whole time.
         """
         self._still_s += lasted_s
-        steady = self.steady_bytes_per_s
-        if steady is not None and moved > 2 * steady * self._still_s:
-            self.steady_bytes_per_s = None  # it carries more by now
         if not queued:
             self._open, self._before = False, None
+            steady = self.steady_bytes_per_s
+            if steady is not None and moved > _MORE * steady * self._still_s:
+                self.steady_bytes_per_s = None  # it carries more by now
         elif moved:
             self._step(moved, self._still_s, now)
         if moved:

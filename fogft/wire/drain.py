@@ -30,12 +30,14 @@ class Flow:
         received: Bytes that came from the peer so far.
         outstanding: Bytes handed to the kernel that are not acknowledged.
         round_trip_s: The smoothed time to an acknowledgement, with four times its variation.
+        unsent: Bytes among the outstanding ones that have not left: the path takes no more now.
     """
 
     acknowledged: int
     received: int
     outstanding: int
     round_trip_s: float = 0.0
+    unsent: int = 0
 
 
 class Drain:
@@ -81,9 +83,10 @@ class Drain:
         moved = flow.acknowledged - last.acknowledged
         sending = sending_for_s >= since_s
         queued = sending or last.outstanding >= BULK_BYTES
-        full = sending or (queued and flow.outstanding >= BULK_BYTES)
+        # On a long path much is on its way without any queue.
+        full = sending or (last.unsent > 0 and flow.unsent > 0)
         self.carried.look(moved, since_s, now, queued=full)
-        if full:
+        if sending or (queued and flow.outstanding >= BULK_BYTES):
             self._measured(moved / since_s)
         if (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES:
             waited_s, self._waited_s = self._waited_s, 0.0

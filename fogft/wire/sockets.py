@@ -23,9 +23,10 @@ Address = tuple[str, int]
 
 _DESCRIPTORS = Path("/proc/self/fd")
 # struct tcp_info of linux/tcp.h: eight bytes of state, then 32 and 64 bit counts.
-_INFO_BYTES = 136
+_INFO_BYTES, _WITH_UNSENT_BYTES = 136, 148
 _RTT, _RTT_VARIATION = (struct.Struct("@I"), 68), (struct.Struct("@I"), 72)
 _ACKNOWLEDGED, _RECEIVED = (struct.Struct("@Q"), 120), (struct.Struct("@Q"), 128)
+_UNSENT = struct.Struct("@I"), 144
 _COUNT = struct.Struct("@i")
 _TCP_NOTSENT_LOWAT = 25
 _UNSENT_BYTES = 16 << 10
@@ -122,7 +123,7 @@ def _ends(connection: socket.socket) -> tuple[Address, Address] | None:
 def flow(connection: socket.socket) -> Flow | None:
     """Return what the kernel counted on a connection; None where it does not tell."""
     try:
-        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _WITH_UNSENT_BYTES)
         waiting = fcntl.ioctl(connection, termios.TIOCOUTQ, bytes(_COUNT.size))
     except OSError:
         return None
@@ -132,11 +133,14 @@ def flow(connection: socket.socket) -> Flow | None:
         form.unpack_from(info, at)[0]
         for form, at in (_RTT, _RTT_VARIATION, _ACKNOWLEDGED, _RECEIVED)
     )
+    form, at = _UNSENT
+    tells_unsent = len(info) >= _WITH_UNSENT_BYTES  # since Linux 4.6
     return Flow(
         acknowledged=acknowledged,
         received=received,
         outstanding=max(0, _COUNT.unpack(waiting)[0]),
         round_trip_s=(rtt_us + 4 * variation_us) / 1e6,
+        unsent=form.unpack_from(info, at)[0] if tells_unsent else 0,
     )
 
 

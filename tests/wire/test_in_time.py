@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from fogft.wire.carried import KEPT_S, Carried
 from fogft.wire.compression import Compression
 from fogft.wire.config import LinkSettings
+from fogft.wire.drain import BULK_BYTES, Drain, Flow
 from fogft.wire.in_time import InTime
 from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
@@ -84,6 +85,17 @@ def test_what_was_thin_and_is_so_no_more_is_found_out():
     assert carried.steady_bytes_per_s is not None
     carried.look(100_000, LOOK_S, now + LOOK_S, queued=False)
     assert carried.steady_bytes_per_s is None
+
+
+@given(rates, st.integers(BULK_BYTES, 10**7), st.booleans())
+def test_much_on_its_way_is_no_queue(rate, on_its_way, waits):
+    """A long path holds a lot; only where some of it cannot leave the link carries no more."""
+    drain, now = Drain(), 50.0
+    for look in range(40):
+        unsent = on_its_way // 2 if waits else 0
+        drain.look(Flow(round(rate * LOOK_S * look), 0, on_its_way, unsent=unsent), now)
+        now += LOOK_S
+    assert (drain.carried.bytes_per_s(now) is not None) == waits
 
 
 @dataclass
