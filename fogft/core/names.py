@@ -38,8 +38,18 @@ def slot_prefix(pool_uid: str, slot: int) -> str:
 
 
 def service_key(pool_uid: str, slot: int, service: str, type_name: str) -> str:
-    """Return the Zenoh key at which a slot answers a service."""
+    """Return the Zenoh key at which a slot hears requests of a service."""
     return f"{slot_prefix(pool_uid, slot)}/s/{connection_id(pool_uid, slot, service, type_name)}"
+
+
+def services_key(pool_uid: str, slot: int) -> str:
+    """Return the key expression of all of a slot's services."""
+    return f"{slot_prefix(pool_uid, slot)}/s/*"
+
+
+def answers_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot is asked for a connection's answers to come."""
+    return f"{slot_prefix(pool_uid, slot)}/answers"
 
 
 def probe_key(pool_uid: str, slot: int) -> str:

@@ -52,8 +52,8 @@ class LinkSettings:
             than `wait_before_close_s`, or healthy links stall for seconds.
         wait_before_close_s: How long the sending of one message may take before Zenoh gives
             the session up.
-        reply_wait_s: The same for what a replica sends. Shorter: a robot that goes while much is
-            on its way to it can hold up all else on that replica for up to twice as long.
+        reply_wait_s: The same for what a replica sends. Shorter: nobody waits for a robot that
+            goes while much is on its way to it.
         open_timeout_s: The most that opening a session takes; see `long_open_timeout_s`.
         long_open_timeout_s: The same for every third try in a row that takes so long: through a
             full uplink, or on a busy machine, a handshake needs more.
@@ -75,6 +75,7 @@ class LinkSettings:
             raise ValueError("wait_before_close_s must be shorter than lease_s")
 
 
+_DECLARED = ("declare_queryable", "declare_subscriber")
 _WAIT = "transport/link/tx/queue/congestion_control/block/wait_before_close"  # microseconds
 
 
@@ -107,8 +108,8 @@ def robot_settings(
         # tests/wire/test_trust.py::test_nothing_is_sent_to_an_impostor_after_a_reconnect.
         "access_control": _access(
             [
-                ("ask", "egress", ["query"], keys),
-                ("hear", "ingress", ["reply", "declare_queryable"], keys),
+                ("ask", "egress", ["query", "put"], keys),
+                ("hear", "ingress", ["reply", *_DECLARED], keys),
             ],
             {"cert_common_names": [peer.certificate_name]},
         ),
@@ -140,8 +141,8 @@ def replica_settings(
         # Any name: the handshake has proved that the CA made its holder a robot.
         "access_control": _access(
             [
-                ("hear", "ingress", ["query"], keys),
-                ("answer", "egress", ["reply", "declare_queryable"], keys),
+                ("hear", "ingress", ["query", "put"], keys),
+                ("answer", "egress", ["reply", *_DECLARED], keys),
             ],
             {},
         ),

@@ -21,7 +21,7 @@ from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.service_form import LONGEST_S
 from fogft.wire.port import Behind, Probe, ProbeAnswer
 
-VERSION = 1
+VERSION = 2
 # Beside the version, only towards peers that have said that they know them.
 _PACKED = 0x80  # the payload is compressed
 _MAY_PACK = 0x40  # the answer may be

@@ -3,10 +3,11 @@
 A reply to a frozen robot blocks until Zenoh gives that robot's session up. So each
 connection has its own thread; it ends when it has had nothing to do for a while.
 
-Ending a query sends something too, so it is done by the same thread. And it must not be done
-while Zenoh's own thread still holds that query: then the last to let go would be Zenoh's thread,
-which would wait for room that only it can make, and with it every link of this process would
-stand still. So a query is ended when that thread has come to the next one (`turns`).
+Answers to requests are replies to one query of the connection, which stays open (`streams`). A
+probe's query is ended. That sends something too, so it is done by the same thread. And it must not
+be done while Zenoh's own thread still holds that query: then the last to let go would be Zenoh's
+thread, which would wait for room that only it can make, and with it every link of this process
+would stand still. So a query is ended when that thread has come to the next one (`turns`).
 
 Owns: the order and the bounds of replies. Not here: what is replied.
 """
@@ -73,10 +74,10 @@ class QueryTurns:
 
 
 class Reply:
-    """What one query gets: a payload, or a refusal where that is not empty.
+    """What is sent as a reply to a query: a payload, or a refusal where that is not empty.
 
     Attributes:
-        turn: When its query came, by `QueryTurns`.
+        turn: When its query came, by `QueryTurns`; None where it stays open.
         ends_only: It was replied to elsewhere, and is only to be ended.
     """
 
@@ -89,7 +90,7 @@ class Reply:
         payload: bytes,
         refusal: str,
         *,
-        turn: int = 0,
+        turn: int | None = None,
         may_pack: bool = False,
         ends_only: bool = False,
     ) -> None:
@@ -124,7 +125,7 @@ class Reply:
     def end(self) -> None:
         """End the query, or the robot waits for more. May block as `send` does."""
         query, self.query = self.query, None
-        if query is not None:
+        if query is not None and self.turn is not None:
             query.drop()  # type: ignore[no-untyped-call]
 
 
@@ -140,7 +141,7 @@ class _Unended:
 
     def add(self, reply: Reply) -> None:
         """End a query now, or as soon as it may be."""
-        if self._turns.over(reply.turn):
+        if reply.turn is None or self._turns.over(reply.turn):
             reply.end()
         else:
             self._replies.append((time.monotonic(), reply))
@@ -149,7 +150,8 @@ class _Unended:
         """End what may be ended by now."""
         waiting, self._replies = self._replies, []
         for since, reply in waiting:
-            if self._turns.over(reply.turn) or time.monotonic() - since > _END_ANYWAY_S:
+            over = self._turns.over(reply.turn or 0)
+            if over or time.monotonic() - since > _END_ANYWAY_S:
                 reply.end()
             else:
                 self._replies.append((since, reply))

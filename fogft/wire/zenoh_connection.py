@@ -1,6 +1,11 @@
 """One Zenoh session of a robot towards one replica, used once and thrown away.
 
-Everything of Zenoh's that can block (`get`, `close`) is called by the connection's own
+A request is published at its service's key; the answers to all of them come as the replies to
+one query, which stays open for as long as the connection. A query for each request would cost
+a third more (its state, two timers and its end, at both ends), and its time-out at the replica
+would be sent by the one thread that all else there needs, too.
+
+Everything of Zenoh's that can block (`put`, `close`) is called by the connection's own
 sender thread, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's
 threads.
 
@@ -36,10 +41,10 @@ from fogft.wire.port import Answer, Peer, Refusal
 from fogft.wire.recalls import WORTH_S, Recalls
 from fogft.wire.send_queue import SendQueue
 from fogft.wire.sockets import address
-from fogft.wire.timer_budget import TimerBudget
 from fogft.wire.turns import LARGE_BYTES, Turns
+from fogft.wire.unanswered import Unanswered
 from fogft.wire.ways import PLAIN_WAYS, Ways
-from fogft.wire.zenoh_attempt import OpenAttempt, ran_in_vain, read_reply
+from fogft.wire.zenoh_attempt import OpenAttempt, read_reply
 
 log = logging.getLogger(__name__)
 
@@ -50,13 +55,12 @@ _AT_ONCE = zenoh.ConsolidationMode.NONE
 # Attempts that wait for the sender, forgotten ones included: those have freed their room in the
 # window, so without a bound of its own the queue of a sender that is stuck would grow.
 _QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
-# A `get` that took this long was stuck behind a full queue: see whether the session survived.
+# A `put` that took this long was stuck behind a full queue: see whether the session survived.
 _STUCK_S = 0.1
 # How long the keeper looks often after the last large request began to leave.
 _WATCH_S = 5.0
-# How long Zenoh keeps a cancellation; nobody answers it.
-_TELL_TIMEOUT_S = 1.0
-_NOBODY = handlers.Callback(lambda _: None, indirect=False)
+# For as long as the connection: Zenoh ends the query when the session closes.
+_ANSWERS_TIMEOUT_S = 1e9
 
 
 _REFUSED = {
@@ -70,7 +74,7 @@ _TELL_RECORDS_TIMEOUT_S = 5.0
 
 
 # In the queue, in place of an attempt: tell the replica of what was forgotten.
-_TELL = OpenAttempt("", zenoh.KeyExpr("tell"), b"", b"", offered=0.0, remaining_s=0.0)
+_TELL = OpenAttempt("", b"", b"", offered=0.0, remaining_s=0.0)
 
 
 class Connection:
@@ -123,8 +127,8 @@ class Connection:
         self._late = late
         self._on_lost = lost
         self._room = room
-        self._keys = {name: zenoh.KeyExpr(key) for name, key in keys.items()}
-        self._timers = {name: TimerBudget() for name in keys}
+        self._begun = False
+        self._unanswered = Unanswered()
         self._token = secrets.token_bytes(frame.TOKEN_BYTES)
         self._origin = frame.origin(robot, self._token)
         self.certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
@@ -136,6 +140,7 @@ class Connection:
         self.packs_answers = False  # whether it finds out by itself when to compress answers
         self._credit = Credit()
         self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
+        self._answers_key = names.answers_key(peer.id.pool_uid, peer.id.slot)
         self._recalls = recalls
         self._telling = False
         self.window: LinkWindow[OpenAttempt] = LinkWindow()
@@ -147,6 +152,12 @@ class Connection:
                 handlers.Callback(self._link_event, indirect=False)
             )
             self.flow = self._check_peer(peer)
+            self._publishers = {
+                name: self._session.declare_publisher(
+                    key, congestion_control=zenoh.CongestionControl.BLOCK
+                )
+                for name, key in keys.items()
+            }
         except BaseException:
             _close_aside(self._session, peer)
             raise
@@ -165,17 +176,40 @@ class Connection:
             raise WireError(wrong_name(name, peer), "another machine has this address now")
         return FlowWatch(address(links[0].src), address(links[0].dst))
 
+    def begin(self) -> bool:
+        """Ask for the answers to come, once the replica has let us in; return whether it hears.
+
+        What is published before Zenoh knows that it is heard there would be lost.
+
+        Raises:
+            zenoh.ZError: It could not be asked.
+        """
+        if self._begun:
+            return True
+        for publisher in self._publishers.values():
+            if not publisher.matching_status.matching:  # type: ignore[attr-defined]
+                return False
+        self._session.get(
+            self._answers_key,
+            handlers.Callback(
+                self._heard, lambda: self._lose("the replica ended our answers"), indirect=False
+            ),
+            attachment=frame.encode_greeting(frame.Greeting(self._token)),
+            timeout=_ANSWERS_TIMEOUT_S,
+            target=_ALL,
+            consolidation=_AT_ONCE,
+        )
+        self._begun = True
+        return True
+
     # -- requests (any thread) ------------------------------------------------------------
 
     def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
         """Take an attempt, or return False. Never blocks."""
-        key = self._keys.get(service)
-        if key is None or self._queue.qsize() >= _QUEUE_LIMIT:
+        if service not in self._publishers or self._queue.qsize() >= _QUEUE_LIMIT:
             return False
         now = time.monotonic()
-        attempt = OpenAttempt(
-            service, key, request_id, payload, offered=now, remaining_s=remaining_s
-        )
+        attempt = OpenAttempt(service, request_id, payload, offered=now, remaining_s=remaining_s)
         if not self._in_time.may_arrive(attempt, remaining_s, now, partial(self._before, service)):
             return False
         if not self.window.admit(attempt) and not self._displace(attempt):
@@ -252,13 +286,10 @@ class Connection:
         if not ids:
             return
         try:
-            self._session.get(
+            self._session.put(
                 self._cancel_key,
-                _NOBODY,
-                payload=frame.encode_cancel(ids),
-                timeout=_TELL_TIMEOUT_S,
-                target=_ALL,
-                consolidation=_AT_ONCE,
+                frame.encode_cancel(ids),
+                congestion_control=zenoh.CongestionControl.BLOCK,
             )
         except zenoh.ZError as error:
             self._lose(f"sending failed: {error}")
@@ -289,7 +320,7 @@ class Connection:
             self._large_since = self._sending_since = began
             self._sends_large()
         try:
-            self._get(attempt, payload, remaining_s)
+            self._publish(attempt, payload, remaining_s)
         finally:
             self._sending_since = None
             self._turns.give(turn)
@@ -302,18 +333,14 @@ class Connection:
             self.watched = True
             self._on_large()
 
-    def _get(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
+    def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
         compression = self._compression(attempt.service)
         packed = None
         if compression is not None:
             packed = compression.pack(payload, self.flow.bytes_per_s)
-        self._session.get(
-            attempt.key,
-            # No callback at the end of the query: it would cost every answer a second turn with
-            # the interpreter lock (20 us). Each query gets a reply: the listener refuses what
-            # its owner forgets, Zenoh tells of a time-out, and `sweep` finds the rest.
-            handlers.Callback(partial(self._replied, attempt), indirect=False),
-            payload=payload if packed is None else packed,
+        self._unanswered.add(attempt)
+        self._publishers[attempt.service].put(
+            payload if packed is None else packed,
             attachment=frame.encode_request(
                 attempt.request_id,
                 remaining_s,
@@ -322,28 +349,28 @@ class Connection:
                 may_pack=self.flow.thin and compression is not None,
                 reads_packed=self.packs_answers and compression is not None,
             ),
-            timeout=self._timers[attempt.service].timeout_s(remaining_s, time.monotonic()),
-            target=_ALL,
-            consolidation=_AT_ONCE,
         )
 
     # -- Zenoh's threads ------------------------------------------------------------------
 
-    def _replied(self, attempt: OpenAttempt, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            self._credit.heard(attempt.mark)  # requests of one connection arrive in order
-        if not self.window.holds(attempt):
-            if self._recalls is not None:  # it was forgotten, or has ended
-                self._recalls.answered(attempt.request_id)
-            if reply.ok is not None or ran_in_vain(reply):
-                self._late(attempt.service, attempt.request_id)
-            return
+    def _heard(self, reply: zenoh.Reply) -> None:
         try:
-            payload, refusal = read_reply(reply, attempt.request_id)
+            answer = read_reply(reply)
         except frame.FrameError as error:
-            log.warning("answer_malformed request=%s reason=%r", attempt.request_id.hex(), error)
-            payload, refusal = None, Refusal.MALFORMED
-        self._end(attempt, payload, refusal)
+            self._lose(f"its answers cannot be read: {error}")
+            return
+        attempt = self._unanswered.answered(answer.request_id)
+        if attempt is None:
+            return  # it was answered before
+        if answer.payload is not None:
+            self._credit.heard(attempt.mark)  # requests of one connection arrive in order
+        if self.window.holds(attempt):
+            self._end(attempt, answer.payload, answer.refusal)
+            return
+        if self._recalls is not None:  # it was forgotten, or has ended
+            self._recalls.answered(answer.request_id)
+        if answer.payload is not None or answer.refusal == Refusal.LATE:
+            self._late(attempt.service, answer.request_id)
 
     def _link_event(self, event: zenoh.LinkEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
@@ -427,6 +454,8 @@ class Connection:
             attachment=frame.encode_greeting(frame.Greeting(self._token)),
             timeout=_TELL_RECORDS_TIMEOUT_S,
             congestion_control=zenoh.CongestionControl.DROP,
+            # Not that of the answers: its end at the replica must not wait for room among them.
+            priority=zenoh.Priority.DATA_LOW,
             target=_ALL,
             consolidation=_AT_ONCE,
         )

@@ -320,6 +320,8 @@ class ZenohLink:
                 up = self._listen(connection) or up
             except WireError as error:
                 connection.lost_because = error.message
+            except zenoh.ZError as error:
+                connection.lost_because = f"sending failed: {error}"
         return up
 
     def _flows(self, connection: Connection, now: float) -> bool:
@@ -402,7 +404,7 @@ class ZenohLink:
                 heard = self._heard.get_nowait()
             except Empty:
                 return up
-            if heard.connection is connection:
+            if heard.connection is connection and connection.begin():
                 self._take(connection, heard)
                 up = True
 

@@ -1,5 +1,8 @@
 """A replica's end over Zenoh: hear requests and probes, queue the answers of each robot apart.
 
+Requests are published to us; a connection's answers are the replies to one query of its own,
+which it asks once we have let it in, and which stays open.
+
 Zenoh's threads only decode and hand over. Replies leave through one thread for each
 connection of a robot, because replying to a frozen robot can block; probes are answered by
 one more thread, ahead of all replies.
@@ -37,6 +40,7 @@ from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
 from fogft.wire.reply_queue import Counters, QueryTurns, Reply, ReplyQueues
 from fogft.wire.signing import LazyVerifier
 from fogft.wire.sockets import Address, address
+from fogft.wire.streams import Streams
 
 log = logging.getLogger(__name__)
 
@@ -49,9 +53,7 @@ _STRANGERS = b""  # in place of a token: replies to whose connection is not know
 class ZenohIncoming:
     """A request that came over Zenoh; see `port.Incoming`."""
 
-    __slots__ = (
-        *("_chores", "_header", "_payload", "_queries", "_queues", "_service", "_thin", "_turn"),
-    )
+    __slots__ = ("_chores", "_header", "_payload", "_queues", "_service", "_streams", "_thin")
 
     def __init__(
         self,
@@ -59,18 +61,16 @@ class ZenohIncoming:
         header: frame.RequestHeader,
         payload: bytes,
         *,
-        query: zenoh.Query,
+        stream: zenoh.Query,
         queues: ReplyQueues,
         chores: SimpleQueue[Callable[[], None] | None],
-        turn: int,
         thin: Callable[[bytes], bool],
     ) -> None:
         self._thin = thin
         self._service = service
-        self._turn = turn
         self._header = header
         self._payload = payload
-        self._queries = [query]  # taken by the first answer; list.pop is atomic
+        self._streams = [stream]  # taken by the first answer; list.pop is atomic
         self._queues = queues
         self._chores = chores
 
@@ -109,13 +109,13 @@ class ZenohIncoming:
 
     def _send(self, payload: bytes, refusal: str) -> None:
         try:
-            query = self._queries.pop()
+            stream = self._streams.pop()
         except IndexError:
             return  # answered before
         self._payload = b""
         header = self._header
         packs = header.may_pack or (header.reads_packed and self._thin(header.token))
-        reply = Reply(query, header.request_id, payload, refusal, turn=self._turn, may_pack=packs)
+        reply = Reply(stream, header.request_id, payload, refusal, may_pack=packs)
         self._queues.put(header.token, header.robot, reply)
 
     def __del__(self) -> None:
@@ -124,9 +124,8 @@ class ZenohIncoming:
         The collector may call this anywhere, even while a lock of ours is held; a
         `SimpleQueue` may be put into from here.
         """
-        if self._queries:
-            query, id = self._queries.pop(), self._header.request_id
-            forgotten = Reply(query, id, b"", Refusal.LOST, turn=self._turn)
+        if self._streams:
+            forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)
             self._chores.put(
                 partial(self._queues.put, self._header.token, self._header.robot, forgotten)
             )
@@ -174,8 +173,9 @@ class ZenohListener:
         self._queues = ReplyQueues(self._counters, self._turns)
         self._chores: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._session: zenoh.Session | None = None
-        self._queryables: list[object] = []
-        self._on_request: Callable[[Incoming], None] | None = None
+        self._declared: list[object] = []
+        self._streams = Streams()
+        self._services: dict[str, str] = {}  # key -> service
 
     @property
     def endpoint(self) -> str:
@@ -210,23 +210,18 @@ class ZenohListener:
             also=self._count_handshakes,
             stuck_after_s=self._settings.stuck_after_s,
         )
-        self._on_request = on_request
         self.add(services)
-        cancel_key = names.cancel_key(self._id.pool_uid, self._id.slot)
-        self._declare(session, cancel_key, partial(self._cancel, on_cancel))
-        records_key = names.records_key(self._id.pool_uid, self._id.slot)
-        self._declare(session, records_key, self._heard_records)
+        place = self._id.pool_uid, self._id.slot
+        self._hear(session, names.services_key(*place), partial(self._request, on_request))
+        self._hear(session, names.cancel_key(*place), partial(self._cancel, on_cancel))
+        self._declare(session, names.answers_key(*place), self._open_answers)
+        self._declare(session, names.records_key(*place), self._heard_records)
         # Last: who is told that this replica is ready finds every service.
-        probe_key = names.probe_key(self._id.pool_uid, self._id.slot)
-        self._declare(session, probe_key, partial(self._probe, on_probe))
+        self._declare(session, names.probe_key(*place), partial(self._probe, on_probe))
 
     def add(self, services: Mapping[str, str]) -> None:
         """Hear requests for further services too (name -> key)."""
-        session, on_request = self._session, self._on_request
-        if session is None or on_request is None:
-            return  # it is closed
-        for name, key in services.items():
-            self._declare(session, key, partial(self._request, name, on_request))
+        self._services.update((key, name) for name, key in services.items())
 
     def _peers(self) -> dict[Address, str]:
         session = self._session
@@ -256,36 +251,78 @@ class ZenohListener:
                 log.exception("query_not_taken key=%s", key)
 
         callback = handlers.Callback(guarded, indirect=False)
-        self._queryables.append(session.declare_queryable(key, callback, complete=True))
+        self._declared.append(session.declare_queryable(key, callback, complete=True))
+
+    def _hear(
+        self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Sample], None]
+    ) -> None:
+        def guarded(sample: zenoh.Sample) -> None:
+            try:
+                heard(sample)
+            except Exception:  # in Zenoh's thread nobody else would tell of it
+                self._counters.add("failed")
+                log.exception("message_not_taken key=%s", key)
+
+        callback = handlers.Callback(guarded, indirect=False)
+        self._declared.append(session.declare_subscriber(key, callback))
 
     # -- Zenoh's threads ------------------------------------------------------------------
 
-    def _request(
-        self, service: str, on_request: Callable[[Incoming], None], query: zenoh.Query, turn: int
-    ) -> None:
+    def _request(self, on_request: Callable[[Incoming], None], sample: zenoh.Sample) -> None:
         self._counters.add("requests")
-        attachment = query.attachment
+        attachment = sample.attachment
         try:
             header = frame.decode_request(attachment.to_bytes() if attachment else b"")
         except frame.FrameError as error:
-            self._malformed(error, query, turn)
+            self._count("malformed", "request_malformed", error)
             return
-        if not self._guests.admits(header.token):
-            refused = Reply(query, header.request_id, b"", Refusal.NOT_ADMITTED, turn=turn)
-            self._turn_away(refused, "it did not greet")
+        stream = self._streams.of(header.token)
+        if stream is None or not self._guests.admits(header.token):
+            self._count("not_admitted", "robot_not_admitted", "it did not greet")
+            if stream is not None:
+                self._refuse(header, stream, Refusal.NOT_ADMITTED)
             return
-        payload = query.payload.to_bytes() if query.payload is not None else b""
+        service = self._services.get(str(sample.key_expr))
+        if service is None:
+            self._refuse(header, stream, Refusal.NOT_READY)
+            return
+        payload = sample.payload.to_bytes()
         if header.packed:
             try:
                 payload = unpack(payload)
             except ValueError as error:
-                self._malformed(error, query, turn)
+                self._count("malformed", "request_malformed", error)
+                self._refuse(header, stream, Refusal.MALFORMED)
                 return
-        incoming = ZenohIncoming(
-            service, header, payload,
-            query=query, queues=self._queues, chores=self._chores, turn=turn, thin=self._thin,
-        )  # fmt: skip
-        on_request(incoming)
+        on_request(
+            ZenohIncoming(
+                service,
+                header,
+                payload,
+                stream=stream,
+                queues=self._queues,
+                chores=self._chores,
+                thin=self._thin,
+            )
+        )
+
+    def _refuse(self, header: frame.RequestHeader, stream: zenoh.Query, reason: str) -> None:
+        self._queues.put(header.token, header.robot, Reply(stream, header.request_id, b"", reason))
+
+    def _open_answers(self, query: zenoh.Query, turn: int) -> None:
+        attachment = query.attachment
+        try:
+            greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
+        except frame.FrameError as error:
+            self._malformed(error, query, turn)
+            return
+        if not self._guests.admits(greeting.token):
+            refused = Reply(query, _NO_REQUEST, b"", Refusal.NOT_ADMITTED, turn=turn)
+            self._turn_away(refused, "it did not greet")
+            return
+        for token, ended in self._streams.opened(greeting.token, query):
+            reply = Reply(ended, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
+            self._queues.put(token, "gone", reply)
 
     def _probe(
         self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query, turn: int
@@ -311,23 +348,16 @@ class ZenohListener:
         self._queues.put(_STRANGERS, "strangers", ended)
 
     def _turn_away(self, refused: Reply, why: str) -> None:
-        count = self._counters.add("not_admitted")
-        if count & (count - 1) == 0:
-            log.warning("robot_not_admitted reason=%r count=%d", why, count)
+        self._count("not_admitted", "robot_not_admitted", why)
         self._queues.put(_STRANGERS, "strangers", refused)
 
-    def _cancel(
-        self, on_cancel: Callable[[Sequence[bytes]], None], query: zenoh.Query, turn: int
-    ) -> None:
+    def _cancel(self, on_cancel: Callable[[Sequence[bytes]], None], sample: zenoh.Sample) -> None:
         self._counters.add("cancellations")
         try:
-            ids = frame.decode_cancel(query.payload.to_bytes() if query.payload else b"")
+            ids = frame.decode_cancel(sample.payload.to_bytes())
         except frame.FrameError as error:
-            self._malformed(error, query, turn)
+            self._count("malformed", "request_malformed", error)
             return
-        # Nobody awaits an answer.
-        ended = Reply(query, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
-        self._queues.put(_STRANGERS, "strangers", ended)
         if self._chores.qsize() < _CHORES_LIMIT:
             self._chores.put(partial(on_cancel, ids))
 
@@ -343,11 +373,14 @@ class ZenohListener:
         self._do_later(partial(self._take_records, greeting, offered, query, turn), query, turn)
 
     def _malformed(self, error: ValueError, query: zenoh.Query, turn: int) -> None:
-        count = self._counters.add("malformed")
-        if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
-            log.warning("request_malformed reason=%r count=%d", str(error), count)
+        self._count("malformed", "request_malformed", error)
         refused = Reply(query, _NO_REQUEST, b"", Refusal.MALFORMED, turn=turn)
         self._queues.put(_STRANGERS, "strangers", refused)
+
+    def _count(self, event: str, message: str, reason: object) -> None:
+        count = self._counters.add(event)
+        if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
+            log.warning("%s reason=%r count=%d", message, str(reason), count)
 
     # -- the probe thread -----------------------------------------------------------------
 
@@ -425,7 +458,8 @@ class ZenohListener:
         session, self._session = self._session, None
         if session is None:
             return
-        self._queryables.clear()
+        self._declared.clear()
+        self._streams.clear()
         if self._doorkeeper is not None:
             self._doorkeeper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)

@@ -28,7 +28,7 @@ from fogft.wire.signing import Signer
 from tests.proxy.gateway_pool import GatewayPool
 from tests.wire import hostile
 from tests.wire.rendezvous_pool import free_port, manager_files
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, Files, wait_for
+from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, Files, hears, wait_for
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -151,12 +151,13 @@ def test_garbage_after_the_handshake_at_a_gateways_port(scene):
 
 def test_frames_that_cannot_be_read_at_a_gateways_port(scene):
     """On every key that a gateway has; not one gets any further."""
-    sent = list(hostile.queries(SLOT, names.service_key(POOL_UID, SLOT, SERVICE, TYPE)))
+    key = names.service_key(POOL_UID, SLOT, SERVICE, TYPE)
+    messages = list(hostile.messages(SLOT, key))
     ran = scene.pool.ran()
     with scene.unchanged(), scene.session(scene.authority.robot("eve")) as session:
-        with scene.counts("malformed", len(sent)):
-            # Held, not read: whether a reply comes early or late does not matter here.
-            _ = [session.get(k, payload=p, attachment=a, timeout=LIMIT_S) for k, p, a in sent]
+        hears(session, key)
+        with scene.counts("malformed", len(messages)):
+            _ = [send(session, payload, attachment) for send, payload, attachment in messages]
         assert scene.pool.ran() == ran
 
 

@@ -11,6 +11,8 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import zenoh
+
 from fogft.core import names
 from fogft.core.model import ReplicaId
 from fogft.core.records import Record as Statement
@@ -20,7 +22,7 @@ from fogft.wire import frame
 from fogft.wire import record_frames as frames
 from fogft.wire.dial_in import PURPOSE
 from fogft.wire.signing import Signer
-from tests.wire.wire_pool import POOL_UID, Authority, Files, request_id
+from tests.wire.wire_pool import LIMIT_S, POOL_UID, Authority, Files, request_id
 
 HELLO = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"  # how a TLS handshake begins
 JUNK: dict[str, Callable[[random.Random], bytes]] = {
@@ -82,22 +84,40 @@ def is_turned_away(endpoint: str, context: ssl.SSLContext) -> None:
 # -- from a robot in wrong hands ----------------------------------------------------------------
 
 
-def queries(slot: int, service_key: str) -> Iterator[tuple[str, bytes, bytes | None]]:
-    """Return key, payload and attachment of queries that cannot be read, on every key there is."""
-    probe, cancel = names.probe_key(POOL_UID, slot), names.cancel_key(POOL_UID, slot)
+Send = Callable[[zenoh.Session, bytes, "bytes | None"], object]
+
+
+def _published(key: str) -> Send:
+    return lambda session, payload, attachment: session.put(key, payload, attachment=attachment)
+
+
+def _asked(key: str) -> Send:
+    # Not read: whether a reply comes early or late does not matter here.
+    return lambda session, payload, attachment: session.get(
+        key, payload=payload, attachment=attachment, timeout=LIMIT_S
+    )
+
+
+def messages(slot: int, service_key: str) -> Iterator[tuple[Send, bytes, bytes | None]]:
+    """Return how, payload and attachment of what cannot be read, on every key there is."""
+    probe, cancel = _asked(names.probe_key(POOL_UID, slot)), names.cancel_key(POOL_UID, slot)
+    records = _asked(names.records_key(POOL_UID, slot))
     header = frame.encode_request(request_id(1), 5.0, frame.origin("eve", bytes(8)))
     greeting = frame.encode_greeting(frame.Greeting(bytes(8), b"c" * 500, b"s" * 70))
     for content in (header[:10], header + bytes(100), b"\x07" + header[1:], os.urandom(40)):
-        yield service_key, b"x", content
+        yield _published(service_key), b"x", content
+    yield _published(service_key), b"x", None
     for content in (None, greeting[:5], b"\x07" + greeting[1:], bytes(5000)):
-        yield probe, b'{"v":1,"robot":"eve","manager_age_s":null}', content
+        yield probe, b'{"v":2,"robot":"eve","manager_age_s":null}', content
     for payload in (b"", b"{}", b"[" * 5000, b'{"v":9,"robot":"eve"}', bytes(100_000)):
         yield probe, payload, greeting
+    for content in (None, b"", greeting[:5], b"\x07" + greeting[1:], bytes(5000)):
+        yield _asked(names.answers_key(POOL_UID, slot)), b"", content
     for payload in (b"", b"\x07", bytes(100_000)):
-        yield cancel, payload, None
+        yield _published(cancel), payload, None
     token = frame.encode_greeting(frame.Greeting(bytes(8)))
     for payload in (b"", b"{}", b'{"v":9,"records":[]}', b'{"v":1,"records":[7]}', bytes(300_000)):
-        yield names.records_key(POOL_UID, slot), payload, token
+        yield records, payload, token
 
 
 def signed(files: Files, statement: Statement) -> SignedRecord:

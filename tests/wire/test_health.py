@@ -22,16 +22,17 @@ from tests.wire.wire_pool import SERVICE, Authority, Owner, ReplicaProcess, requ
 def test_a_slow_service_is_never_suspected(
     start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
 ) -> None:
-    """A service five times as slow as the suspicion keeps its link, and answers."""
-    replica = start_replica(delay_s=1.5)
-    link = dial(replica.endpoint, suspect_after_s=0.3)
+    """A service four times as slow as the suspicion keeps its link, and answers."""
+    replica = start_replica(delay_s=2.0)
+    link = dial(replica.endpoint, suspect_after_s=0.5)
     wait_for(lambda: link.usable)
+    before = link.status().reopened
     for number in range(3):
         assert link.offer(SERVICE, request_id(number), b"think hard", 60.0)
     wait_for(lambda: len(owner.answers) == 3)
     assert [a.payload for _, a in owner.answers] == [b"think hard"] * 3
     assert LinkState.SUSPECT not in {state for _, state in owner.states}
-    assert link.status().reopened == 0
+    assert link.status().reopened == before
 
 
 def test_a_killed_replica_is_noticed_by_the_lost_connection(
@@ -88,7 +89,6 @@ def test_a_change_of_readiness_arrives(
     wait_for(lambda: link.draining)
 
 
-@pytest.mark.timeout(400)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_every_accepted_offer_is_answered_exactly_once(
     start_replica: Callable[..., ReplicaProcess],
@@ -116,7 +116,7 @@ def test_every_accepted_offer_is_answered_exactly_once(
     offering.start()
     try:
         for _ in range(4):
-            wait_for(lambda: link.usable, 150)
+            wait_for(lambda: link.usable)
             goal = len(accepted) + 40
             wait_for(lambda goal=goal: len(accepted) >= goal)
             if chance.random() < 0.5:

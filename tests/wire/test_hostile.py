@@ -20,12 +20,12 @@ from fogft.wire.port import Refusal
 from fogft.wire.zenoh_link import ZenohLink
 from tests.wire import hostile
 from tests.wire.wire_pool import (
-    LIMIT_S,
     POOL_UID,
     SERVICE,
     Authority,
     Owner,
     ReplicaProcess,
+    hears,
     keys,
     peer,
     request_id,
@@ -159,11 +159,11 @@ def test_frames_that_cannot_be_read_are_counted_one_by_one(
     wait_for(lambda: link.usable)
     settings = config.robot_settings(peer(replica.endpoint), authority.robot("eve"), LinkSettings())
     session = zenoh.open(config.to_zenoh(settings))
-    queries = list(hostile.queries(0, keys(0)[SERVICE]))
+    messages = list(hostile.messages(0, keys(0)[SERVICE]))
     try:
-        for sent, (key, payload, attachment) in enumerate(queries, 1):
-            # Not read: whether a reply comes early or late does not matter here.
-            _ = session.get(key, payload=payload, attachment=attachment, timeout=LIMIT_S)
+        hears(session, keys(0)[SERVICE])
+        for sent, (send, payload, attachment) in enumerate(messages, 1):
+            _ = send(session, payload, attachment)
             wait_for(lambda sent=sent: replica.count("malformed") == sent)  # type: ignore[misc]
     finally:
         session.close()
@@ -180,15 +180,12 @@ def test_who_did_not_greet_is_refused_and_counted(
     session = zenoh.open(config.to_zenoh(settings))
     ada = authority.robot("ada").certificate.read_bytes()
     forged = frame.Greeting(bytes(8), ssl.PEM_cert_to_DER_cert(ada.decode()), b"s" * 70)
-    probe = b'{"v":1,"robot":"ada","manager_age_s":null}'
+    bare = frame.encode_greeting(frame.Greeting(bytes(8)))
+    probe = b'{"v":2,"robot":"ada","manager_age_s":null}'
     tries = [
         (names.probe_key(POOL_UID, 0), probe, frame.encode_greeting(forged)),
-        (names.probe_key(POOL_UID, 0), probe, frame.encode_greeting(frame.Greeting(bytes(8)))),
-        (
-            keys(0)[SERVICE],
-            b"x",
-            frame.encode_request(request_id(1), 5.0, frame.origin("ada", bytes(8))),
-        ),
+        (names.probe_key(POOL_UID, 0), probe, bare),
+        (names.answers_key(POOL_UID, 0), b"", bare),
     ]
     try:
         for sent, (key, payload, attachment) in enumerate(tries, 1):
@@ -198,5 +195,10 @@ def test_who_did_not_greet_is_refused_and_counted(
             said = frame.decode_refusal(replies[0].err.payload.to_bytes())[1]
             assert said == Refusal.NOT_ADMITTED
             assert replica.count("not_admitted") == sent
+        request = frame.encode_request(request_id(1), 5.0, frame.origin("ada", bytes(8)))
+        hears(session, keys(0)[SERVICE])
+        session.put(keys(0)[SERVICE], b"x", attachment=request)
+        wait_for(lambda: replica.count("not_admitted") == len(tries) + 1)
     finally:
         session.close()
+    assert replica.count("replies") == 0

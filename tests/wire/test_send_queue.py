@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import threading
 
-import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.wire.send_queue import SendQueue
 from fogft.wire.zenoh_attempt import OpenAttempt
 
-KEY = zenoh.KeyExpr("k")
-
 
 def attempt(service: str, born: float, number: int = 0) -> OpenAttempt:
     id = number.to_bytes(16, "big")
-    return OpenAttempt(service, KEY, id, b"payload", offered=born, remaining_s=10.0)
+    return OpenAttempt(service, id, b"payload", offered=born, remaining_s=10.0)
 
 
 def taken(queue: SendQueue) -> list[OpenAttempt]:

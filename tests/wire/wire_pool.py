@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import zenoh
+
 from fogft.core import names
 from fogft.core.model import LinkState, ReplicaId
 from fogft.pool import credentials
@@ -73,6 +75,13 @@ def keys(slot: int) -> dict[str, str]:
 def peer(endpoint: str, slot: int = 0, generation: int = 1) -> Peer:
     id = ReplicaId(POOL_UID, slot, generation)
     return Peer(id, endpoint, names.replica_certificate_name(id))
+
+
+def hears(session: zenoh.Session, key: str) -> None:
+    """Wait until a session knows that the replica hears what is published at a key."""
+    publisher = session.declare_publisher(key)
+    wait_for(lambda: publisher.matching_status.matching)  # type: ignore[attr-defined]
+    publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
 def request_id(number: int) -> bytes:

@@ -1,0 +1,105 @@
+"""Where a connection's answers come from: one open query, and what is still awaited on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.core.model import ReplicaId
+from fogft.wire.port import Incoming, Probe, ProbeAnswer
+from fogft.wire.streams import Streams
+from fogft.wire.unanswered import Unanswered
+from fogft.wire.zenoh_attempt import OpenAttempt
+from fogft.wire.zenoh_link import ZenohLink
+from fogft.wire.zenoh_listener import ZenohListener
+from tests.wire.wire_pool import (
+    POOL_UID,
+    SERVICE,
+    Authority,
+    Owner,
+    ReplicaProcess,
+    keys,
+    request_id,
+    wait_for,
+)
+
+
+@given(st.lists(st.integers(0, 9)), st.integers(1, 5))
+def test_every_query_is_either_open_or_ended_once(tokens: list[int], limit: int) -> None:
+    """The last of each of the youngest tokens stays; all others are given back to be ended."""
+    streams, ended, opened = Streams(limit), [], []
+    for number, token in enumerate(tokens):
+        query: Any = (token, number)
+        opened.append(query)
+        ended += streams.opened(bytes([token]), query)
+    kept = [streams.of(bytes([token])) for token in range(10)]
+    kept = [query for query in kept if query is not None]
+    youngest = sorted(dict(opened).items(), key=lambda item: item[1])[-limit:]
+    assert sorted(kept) == sorted(youngest)
+    assert sorted([query for _, query in ended] + kept) == sorted(opened)
+    assert all(token == bytes([query[0]]) for token, query in ended)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 20))), st.integers(8, 12))
+def test_an_answer_finds_its_request_once(steps: list[tuple[bool, int]], limit: int) -> None:
+    """Beyond the bound it is the oldest that are not found."""
+    unanswered, sent = Unanswered(limit), {}
+    for sends, number in steps:
+        if sends:
+            attempt = OpenAttempt("/s", request_id(number), b"", offered=0.0, remaining_s=1.0)
+            unanswered.add(attempt)
+            sent[number] = attempt
+        else:
+            found = unanswered.answered(request_id(number))
+            assert found in (None, sent.pop(number, None))
+        assert len(unanswered) <= limit
+        if sends:
+            assert unanswered.answered(request_id(number)) is attempt
+            unanswered.add(attempt)
+
+
+def test_many_connections_one_after_another_leave_little_behind(
+    start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """Each hears its own answers only, though the replica keeps the queries of those before it."""
+    replica = start_replica()
+    for number in range(30):
+        link = dial(replica.endpoint)
+        wait_for(lambda link=link: link.usable)  # type: ignore[misc]
+        assert link.offer(SERVICE, request_id(number), b"%d" % number, 20.0)
+        wait_for(lambda number=number: owner.of(number))  # type: ignore[misc]
+        link.close()
+    assert [a.payload for _, a in owner.answers] == [b"%d" % n for n in range(30)]
+    assert replica.count("failed") == 0
+
+
+def test_a_connection_whose_answers_have_ended_is_replaced(
+    authority: Authority, dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """What is under way there is lost, and told so; what is asked next is answered."""
+    held: list[Incoming] = []
+    listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
+
+    def answer_probe(probe: Probe) -> ProbeAnswer:
+        return ProbeAnswer(0, 1, "here", frozenset({SERVICE}))
+
+    listener.serve(keys(0), held.append, answer_probe)
+    try:
+        link = dial(listener.endpoint)
+        wait_for(lambda: link.usable)
+        assert link.offer(SERVICE, request_id(1), b"first", 60.0)
+        wait_for(lambda: len(held) == 1)
+        held.clear()
+        listener._streams.clear()
+        wait_for(lambda: owner.of(1))
+        wait_for(lambda: link.usable and link.status().reopened == 1)
+        assert link.offer(SERVICE, request_id(2), b"second", 60.0)
+        wait_for(lambda: len(held) == 1)
+        held[0].reply(held[0].payload)
+        wait_for(lambda: owner.of(2))
+        assert owner.of(2)[0].payload == b"second"
+    finally:
+        listener.close()
