@@ -158,3 +158,13 @@ def test_a_file_that_stays_bad_is_logged_once(tmp_path, caplog):
     client_process._apply(lambda: None, tmp_path / "x")
     client_process._apply(fail, tmp_path / "x")
     assert caplog.text.count("no space left") == 2
+
+
+def test_a_replica_that_cannot_know_its_address_is_told(tmp_path: Path) -> None:
+    """`fogft serve --advertise` comes before the file; what is no endpoint is an error."""
+    path = tmp_path / "replica.yaml"
+    path.write_text(f"{REPLICA}advertise: 10.0.0.1:7447\n")
+    assert read_server(path).advertise == "10.0.0.1:7447"
+    assert read_server(path, advertise="vm.example.org:30001").advertise == "vm.example.org:30001"
+    with pytest.raises(FogftError, match="not `host:port`"):
+        read_server(path, advertise="vm.example.org")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import random
 import socket
 import threading
 from collections import Counter
@@ -189,6 +190,24 @@ def test_noise_replays_and_hoarding_are_turned_away(authority, door, dial_out, s
     wait_for(lambda: link.usable)
     for one in (*hoard, odd):
         one.close()
+
+
+def test_a_stranger_at_the_loopback_port_gets_no_further_than_the_replicas_tls(
+    door, dial_out, start_replica, dial, owner
+):
+    """Somebody else on the robot's machine; what he sends is counted at the replica."""
+    replica = start_replica()
+    dial_out(replica.endpoint, door.endpoint)
+    link = dial(door.local(ID))
+    wait_for(lambda: link.usable)
+    dice = random.Random(3)
+    for number, make in enumerate(hostile.JUNK.values(), 1):
+        wait_for(lambda: door.waiting().get(ID))  # else he would be sent away at the door
+        hostile.throw(door.local(ID), make(dice))
+        wait_for(lambda number=number: replica.count("handshakes_refused") == number)
+    assert link.offer(SERVICE, request_id(1), b"x", 20.0)
+    wait_for(lambda: owner.of(1))
+    assert owner.of(1)[0].payload == b"x"
 
 
 def test_a_replica_that_takes_no_part_after_greeting_is_dropped(authority, door):

@@ -1,0 +1,109 @@
+"""What a replica says of itself at the rendezvous, and how often, on a clock of the test's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fogft.core.model import ReplicaId
+from fogft.core.records import Record, RecordKind
+from fogft.core.roster import slot_state
+from fogft.proxy.announcing import LOAD_EVERY_S, Announcer, doors
+from fogft.wire.rendezvous_client import Known
+
+UID = "0123456789abcdef"
+
+
+class Records:
+    """Remembers what is published, and is seen at a host that a test sets."""
+
+    def __init__(self) -> None:
+        self.known = Known()
+        self.said: list[dict[str, Any]] = []
+        self.keys: set[tuple[RecordKind, str, int]] = set()
+
+    def publish(
+        self, kind: RecordKind, subject: str, generation: int, content: dict[str, Any]
+    ) -> None:
+        slot_state(Record(UID, kind, subject, generation, 1, content))  # it can be read
+        self.keys.add((kind, subject, generation))
+        self.said.append(content)
+
+
+class Scene:
+    def __init__(self, **given: Any) -> None:
+        self.now = 0.0
+        self.records = Records()
+        how: dict[str, Any] = {"endpoint": "", "port": 7447, "dials_out": False, **given}
+        self._announcer = Announcer(
+            ReplicaId(UID, 1000, 3), self.records, clock=lambda: self.now, **how
+        )
+
+    def look(self, *ready: str, draining: bool = False, in_flight: int = 0) -> bool:
+        return self._announcer.look(frozenset(ready), draining=draining, in_flight=in_flight)
+
+
+def test_it_writes_its_own_slot_and_launch_and_no_other():
+    scene = Scene()
+    for step in range(5):
+        scene.now += LOAD_EVERY_S
+        scene.look("/plan", in_flight=step)
+    assert scene.records.keys == {(RecordKind.SLOT, "1000", 3)}
+
+
+def test_endpoint_services_state_and_load_are_said_as_they_change():
+    scene = Scene()
+    assert scene.look()
+    assert scene.look("/plan")
+    assert scene.look("/plan", draining=True)
+    scene.now += LOAD_EVERY_S
+    assert scene.look("/plan", draining=True, in_flight=7)
+    said = scene.records.said
+    assert [one["services"] for one in said] == [[], ["/plan"], ["/plan"], ["/plan"]]
+    assert [one["draining"] for one in said] == [False, False, True, True]
+    assert [one["in_flight"] for one in said] == [0, 0, 0, 7]
+
+
+def test_nothing_is_said_twice_and_the_load_alone_only_now_and_then():
+    scene = Scene()
+    scene.look("/plan")
+    assert not scene.look("/plan")
+    scene.now += LOAD_EVERY_S / 2
+    assert not scene.look("/plan", in_flight=9)
+    scene.now += LOAD_EVERY_S / 2
+    assert scene.look("/plan", in_flight=9)
+    assert len(scene.records.said) == 2
+
+
+@pytest.mark.parametrize(("host", "seen"), [("10.0.0.7", "10.0.0.7"), ("fd00::7", "[fd00::7]")])
+def test_an_address_that_it_cannot_know_is_told_or_seen(host, seen):
+    """As it was told it, first; as a rendezvous sees it, the port being its own."""
+    scene = Scene(endpoint="vm.example.org:30001")
+    scene.look()
+    scene.records.known = Known(seen_host=host)
+    assert scene.look()
+    assert scene.records.said[0]["observed_endpoint"] == ""
+    assert scene.records.said[1]["endpoint"] == "vm.example.org:30001"
+    assert scene.records.said[1]["observed_endpoint"] == f"{seen}:7447"
+
+
+def test_one_that_cannot_be_reached_says_so():
+    scene = Scene(dials_out=True)
+    scene.look()
+    assert scene.records.said[0]["dials_out"] is True
+
+
+def test_doors_of_robots_and_gateways_are_found_and_odd_ones_passed_over():
+    def record(kind: RecordKind, name: str, door: object) -> Record:
+        return Record(UID, kind, name, 1, 1, {"dial_in": door})
+
+    known = Known(
+        (
+            record(RecordKind.ROBOT, "ada", "ada.example:7460"),
+            record(RecordKind.ROBOT, "bob", ""),
+            record(RecordKind.ROBOT, "eve", ["x"]),
+            record(RecordKind.GATEWAY, "edge", "edge.example:7460"),
+        )
+    )
+    assert doors(known) == ["edge.example:7460", "ada.example:7460"]
