@@ -111,6 +111,7 @@ class Standing:
         heard: How many orders of whom it obeys have come: it grows while that one lives.
         joined: Whether it applies requests, and takes those that are handed in.
         robot: Whom it obeys.
+        begun: Whether it knows that the service has begun: its first members are committed.
     """
 
     promised: int
@@ -119,20 +120,23 @@ class Standing:
     member: int
     members: tuple[int, ...] = ()
     robot: str = ""
+    begun: bool = False
 
     def encode(self) -> bytes:
         """Return it as bytes."""
-        head = _STANDING.pack(self.promised, self.heard, self.joined, self.member)
+        flags = self.joined | self.begun << 1
+        head = _STANDING.pack(self.promised, self.heard, flags, self.member)
         words = _words(self.members)
         return head + _LENGTH.pack(len(words)) + words + self.robot.encode()
 
 
 def decode_standing(payload: bytes) -> Standing:
     """Read what `Standing.encode` wrote. Raises OrderError."""
-    (promised, heard, joined, member), rest = _split(_STANDING, payload)
+    (promised, heard, flags, member), rest = _split(_STANDING, payload)
     (size,), rest = _split(_LENGTH, rest)
     robot = rest[size:].decode(errors="replace")
-    return Standing(promised, heard, bool(joined), member, _read_words(rest[:size]), robot)
+    members = _read_words(rest[:size])
+    return Standing(promised, heard, bool(flags & 1), member, members, robot, bool(flags & 2))
 
 
 @dataclass(frozen=True)

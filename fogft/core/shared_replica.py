@@ -51,6 +51,7 @@ class SharedReplica(OrderedReplica[T]):
         self._whole = True
         self._heard = 0
         self._committed = 0  # by what the present term said; of no meaning before it is joined
+        self._begun = False
         self._listener: T | None = None
         self._handed: OrderedDict[RequestId, _HandedIn[T]] = OrderedDict()
         self._entry = Entry()
@@ -117,7 +118,7 @@ class SharedReplica(OrderedReplica[T]):
     def _standing(self) -> Standing:
         return Standing(
             self.promised, self._heard, self.joined and self.serving, self.member,
-            self.book.members, self.robot,
+            self.book.members, self.robot, self._begun,
         )  # fmt: skip
 
     # -- what robots hand in --------------------------------------------------------------
@@ -165,6 +166,7 @@ class SharedReplica(OrderedReplica[T]):
             self._tell_again()
         out = self._stop_listening()
         self._committed = max(self._committed, committed)
+        self._begun = self._begun or committed > 0
         self._listener = to
         return [*out, *self._settle(), *self._tell_listener()]
 

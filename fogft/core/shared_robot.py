@@ -32,6 +32,9 @@ REFUSED_RETRY_S = 0.05
 # A robot has at most so many requests beyond the oldest that is not answered: replicas keep the
 # answers to all of them.
 AHEAD = 256
+# The mark of a robot that has seen the service begun, and was answered nothing: after the state
+# in which a service starts, before all that a term ever gave a number.
+BEGUN = Position(0, 1)
 
 
 OrderId = tuple[Op, int, int]  # operation, term (or session), index: as `ordering.decode` gives it
@@ -67,7 +70,7 @@ class SharedRobot:
         new_epoch: Returns a term above another one that was never used.
         chance: Returns a number between 0 and 1 by chance.
         founders: With so many replicas a service may begin that never began.
-        mark: The position of the last answer that this robot returned.
+        mark: The position of the last answer that this robot returned, or `BEGUN`.
         log_entries: Requests kept at most in a term of its own.
     """
 
@@ -91,7 +94,6 @@ class SharedRobot:
         self._requests: dict[int, _Request] = {}
         self._next_seq = 1
         self._began = False
-        self._founded = mark != START
         self._highest = 0
         self._replicas: list[int] = []
         self._versions: Mapping[int, str] = {}
@@ -108,6 +110,11 @@ class SharedRobot:
         self._answered: list[Answered] = []
 
     # -- requests -------------------------------------------------------------------------
+
+    @property
+    def _founded(self) -> bool:
+        """Whether the service has begun, at some time: then it never begins anew."""
+        return self.mark != START
 
     @property
     def _floor(self) -> int:
@@ -221,7 +228,9 @@ class SharedRobot:
             return f"{here} of {wanted} replicas are here; to begin, all must be"
         members = self.term.members if self.term is not None else ()
         count = len(members) or self.members
-        return f"most of the {count} replicas that have the state are not here" if count else ""
+        if not count:
+            return "no replica that can be reached holds the state; see docs/design/state.md"
+        return f"most of the {count} replicas that have the state are not here"
 
     def take(self) -> list[Outgoing]:
         """Return the orders to send, in this order, and forget them."""
@@ -285,8 +294,8 @@ class SharedRobot:
             return
         for answered in term.take_answers():
             self._take(answered)
-        if term.members:
-            self._founded = True
+        if term.members and term.committed >= 1:
+            self.mark = max(self.mark, BEGUN)
         if term.deposed_by is not None:
             self._highest = max(self._highest, term.deposed_by)
             self.term, self._patience, self._quiet_from = None, self._chance(), now
@@ -341,7 +350,6 @@ class SharedRobot:
             self._saw(replica, shared_orders.decode_standing(payload), now)
         elif op is Op.HAND_IN:
             at, answer = shared_orders.decode_answer(payload)
-            self._founded = True
             if epoch == self.session:
                 self._take(Answered(index, at, answer))
         elif self.term is not None and epoch == self.term.epoch:
@@ -359,7 +367,8 @@ class SharedRobot:
         changed_at = before.changed_at if before is not None and same else now
         self._seen[replica] = _Seen(standing, now, changed_at)
         self._highest = max(self._highest, standing.promised)
-        self._founded = self._founded or bool(standing.members)
+        if standing.begun:
+            self.mark = max(self.mark, BEGUN)
 
     def refused(self, replica: int, order: OrderId, reason: str, now: float) -> None:
         """Take a refusal, or the loss of an order: the replica may or may not have obeyed it."""

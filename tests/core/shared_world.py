@@ -189,8 +189,9 @@ class SharedWorld:
                 self.history.append(Call(asked.began, asked.asked))
 
     def take_answers(self, robot: Robot) -> None:
-        for answered in robot.brain.take_answers():
-            self.marks[robot.name] = robot.brain.mark
+        answers = robot.brain.take_answers()
+        self.marks[robot.name] = robot.brain.mark
+        for answered in answers:
             asked = robot.pending.pop(answered.seq)
             answer = eval(answered.answer.decode())
             self.history.append(Call(asked.began, asked.asked, self.now, answer))

@@ -225,17 +225,21 @@ def test_a_majority_lost_at_once_is_said_and_never_answered_from_an_older_state(
     assert any("most of the 3 replicas that have the state" in trouble for trouble in troubles)
 
 
-def test_new_replicas_alone_do_not_begin_anew_for_a_robot_that_was_answered():
-    world = begun(robots=1)
+def test_new_replicas_alone_do_not_begin_anew():
+    """Neither for a robot that was answered, nor for one that only saw that the service began."""
+    world = begun()
     world.ask("r0", 0, ("add", 5))
     assert world.settle(2000)
     for replica in list(world.hosts):
         world.kill_process(replica)
-    world.kill_robot("r0")
-    world.start_robot("r0")
-    world.ask("r0", 0, ("get", 0))
+    for name in ("r0", "r1"):
+        world.kill_robot(name)
+        world.start_robot(name)
+        world.ask(name, 0, ("get", 0))
     assert not world.settle(2000)
     assert answers(world) == [5]
+    troubles = {robot.brain.trouble for robot in world.robots.values()}
+    assert {"no replica that can be reached" in trouble for trouble in troubles} == {True}
 
 
 def test_a_service_begins_only_with_all_replicas_that_the_pool_has():
