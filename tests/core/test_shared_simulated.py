@@ -230,6 +230,7 @@ def test_new_replicas_alone_do_not_begin_anew():
     world = begun()
     world.ask("r0", 0, ("add", 5))
     assert world.settle(2000)
+    world.settle(300, lambda: False)  # all have looked
     for replica in list(world.hosts):
         world.kill_process(replica)
     for name in ("r0", "r1"):
