@@ -141,7 +141,7 @@ class SharedRobot:
         if term is not None and term.base is not None:
             fresh = not term.under_way(id)
             known = term.number(id, self._floor, request.body, wanted=True)
-            request.next_at = now + RETRY_S
+            request.next_at = now + (RETRY_S if known else REFUSED_RETRY_S)
             if not known or not fresh or term.under_way(id):
                 return  # if it is committed without an answer, a replica has it: ask there
         replica = self._choose(request, now)
@@ -313,7 +313,7 @@ class SharedRobot:
         self._look_at = now + LOOK_EVERY_S
         for replica in self._replicas:
             self._serial += 1
-            self._out.append(Outgoing(0, Order(replica, Op.LOOK, self._serial)))
+            self._out.append(Outgoing(self.session, Order(replica, Op.LOOK, self._serial)))
 
     def _is_silent(self, now: float) -> bool:
         """Whether most of the members answer us, and have not heard of a sequencer for long."""
