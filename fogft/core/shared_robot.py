@@ -20,11 +20,8 @@ from fogft.core.ordered_peer import Order
 from fogft.core.ordering import START, Op, Position
 from fogft.core.shared_orders import RequestId, Standing
 from fogft.core.shared_sequencer import Answered, SharedSequencer
+from fogft.core.shared_watch import Watch
 
-LOOK_EVERY_S = 0.25
-STALE_S = 1.5
-SILENCE_S = 2.0
-FIRST_SILENCE_S = 0.2
 TROUBLE_AFTER_S = 10.0
 RETRY_S = 1.0
 RETRY_LIMIT_S = 8.0
@@ -53,13 +50,6 @@ class _Request:
     next_at: float
     tries: int = 0
     asked: set[int] = field(default_factory=set)  # where it was handed in and is not ended
-
-
-@dataclass
-class _Seen:
-    standing: Standing
-    seen_at: float
-    changed_at: float
 
 
 class SharedRobot:
@@ -94,15 +84,11 @@ class SharedRobot:
         self._requests: dict[int, _Request] = {}
         self._next_seq = 1
         self._began = False
-        self._highest = 0
         self._replicas: list[int] = []
         self._versions: Mapping[int, str] = {}
         self._leaving: tuple[int, ...] = ()
         self._listed = 0
-        self._seen: dict[int, _Seen] = {}
-        self._look_at = 0.0
-        self._patience = chance()
-        self._quiet_from = 0.0
+        self._watch = Watch(chance())
         self._now = 0.0
         self._ready_at: float | None = None
         self._serial = 0
@@ -156,16 +142,9 @@ class SharedRobot:
 
     def _choose(self, request: _Request, now: float) -> int | None:
         """Return where to hand a request in: in the latest term, and not always the same."""
-        fresh = {r: s for r, s in self._seen.items() if now - s.seen_at < STALE_S}
-        joined = [
-            (-seen.standing.promised, replica)
-            for replica, seen in fresh.items()
-            if seen.standing.joined and replica not in request.asked
-        ]
-        if self.term is not None:
-            joined = [(0, r) for r in self.term.joined if r not in request.asked]
-        latest = sorted(r for promised, r in joined if promised == min(joined)[0])
-        return latest[request.tries % len(latest)] if latest else None
+        places = self._watch.places(now) if self.term is None else self.term.joined
+        left = [replica for replica in places if replica not in request.asked]
+        return left[request.tries % len(left)] if left else None
 
     def take_answers(self) -> list[Answered]:
         """Return the answers that have come, and forget them. First write down `mark`."""
@@ -182,15 +161,7 @@ class SharedRobot:
     @property
     def ready(self) -> bool:
         """Whether a request taken now will be answered, as far as is known."""
-        if self.term is not None:
-            return self.term.ready
-        living = [
-            s.standing
-            for s in self._seen.values()
-            if s.changed_at + SILENCE_S > s.seen_at and s.standing.joined
-        ]
-        members = _latest(living)
-        return 2 * len({s.member for s in living} & set(members)) > len(members)
+        return self._watch.lives if self.term is None else self.term.ready
 
     @property
     def sends(self) -> bool:
@@ -200,14 +171,12 @@ class SharedRobot:
     @property
     def sequencer(self) -> str:
         """The robot that replicas obey, as far as is seen; empty for this one, or nobody."""
-        if self.term is not None or not self._seen:
-            return ""
-        return max((s.standing for s in self._seen.values()), key=lambda s: s.promised).robot
+        return "" if self.term is not None else self._watch.sequencer
 
     @property
     def members(self) -> int:
         """How many members the service has, as far as is seen."""
-        return len(_latest([seen.standing for seen in self._seen.values()]))
+        return self._watch.members
 
     @property
     def held_bytes(self) -> int:
@@ -260,7 +229,7 @@ class SharedRobot:
         self._replicas = list(replicas)
         self._versions, self._leaving = versions or {}, tuple(leaving)
         self._listed = max(listed, len(self._replicas))
-        self._seen = {r: seen for r, seen in self._seen.items() if r in self._replicas}
+        self._watch.keep(self._replicas)
         self._reach_term(now)
 
     def _reach_term(self, now: float) -> None:
@@ -283,7 +252,9 @@ class SharedRobot:
             self._look_after_term(now)
         if self.term is None:
             self._look(now)
-            if self._is_silent(now):
+            begins = not self._founded and len(self._replicas) == self._listed
+            founders = self.founders if begins else None
+            if self._watch.is_silent(self._replicas, now, founders=founders):
                 self._claim(now)
         for seq in [s for s, request in self._requests.items() if request.next_at <= now]:
             self._pass_on(seq, now)
@@ -297,9 +268,9 @@ class SharedRobot:
         if term.members and term.committed >= 1:
             self.mark = max(self.mark, BEGUN)
         if term.deposed_by is not None:
-            self._highest = max(self._highest, term.deposed_by)
-            self.term, self._patience, self._quiet_from = None, self._chance(), now
-            self._look_at = now
+            self._watch.highest = max(self._watch.highest, term.deposed_by)
+            self._watch.begin(now, self._chance())
+            self.term = None
         elif term.base is not None and not self._began:
             self._began = True
         else:
@@ -308,32 +279,14 @@ class SharedRobot:
             request.next_at = now
 
     def _look(self, now: float) -> None:
-        if now < self._look_at:
+        if not self._watch.is_due(now):
             return
-        self._look_at = now + LOOK_EVERY_S
         for replica in self._replicas:
             self._serial += 1
             self._out.append(Outgoing(self.session, Order(replica, Op.LOOK, self._serial)))
 
-    def _is_silent(self, now: float) -> bool:
-        """Whether most of the members answer us, and have not heard of a sequencer for long."""
-        fresh = [s for s in self._seen.values() if now - s.seen_at < STALE_S]
-        members = _latest([s.standing for s in fresh])
-        first = not any(s.standing.promised for s in fresh)
-        wait_s = (FIRST_SILENCE_S if first else SILENCE_S) * (1 + self._patience)
-        silent = {
-            s.standing.member
-            for s in fresh
-            if now - max(s.changed_at, self._quiet_from) >= wait_s
-        }  # fmt: skip
-        if members:
-            return 2 * len(silent & set(members)) > len(members)
-        founds = not self._founded and len(self._replicas) == self._listed
-        return founds and len(silent) == len(self._replicas) >= self.founders
-
     def _claim(self, now: float) -> None:
-        epoch = self._new_epoch(self._highest)
-        self._highest = epoch
+        epoch = self._watch.highest = self._new_epoch(self._watch.highest)
         self._began = False
         self.term = SharedSequencer(
             epoch, mark=self.mark, founders=self.founders, may_found=not self._founded,
@@ -359,14 +312,7 @@ class SharedRobot:
     def _saw(self, replica: int, standing: Standing, now: float) -> None:
         if replica not in self._replicas:
             return
-        before = self._seen.get(replica)
-        same = before is not None and (
-            (before.standing.promised, before.standing.heard, before.standing.member)
-            == (standing.promised, standing.heard, standing.member)
-        )
-        changed_at = before.changed_at if before is not None and same else now
-        self._seen[replica] = _Seen(standing, now, changed_at)
-        self._highest = max(self._highest, standing.promised)
+        self._watch.saw(replica, standing, now)
         if standing.begun:
             self.mark = max(self.mark, BEGUN)
 
@@ -390,9 +336,3 @@ class SharedRobot:
             self.refused(replica, order, "", now)
         elif self.term and epoch == self.term.epoch:
             self.term.declined(replica, op, index, now)
-
-
-def _latest(standings: list[Standing]) -> tuple[int, ...]:
-    """Return the members as those know them who obey the latest term."""
-    knowing = [s for s in standings if s.members]
-    return max(knowing, key=lambda s: s.promised).members if knowing else ()

@@ -259,8 +259,9 @@ class SharedSequencer(OrderedTerm):
         """Replicas know who asked what: here it only saves numbers."""
         log = self.log
         if log is not None and len(self._numbered) > 2 * self._bounds[0]:
-            self._numbered = {id: n for id, n in self._numbered.items() if n > log.start}
-            self._own = {n: seq for n, seq in self._own.items() if n > log.start}
+            old = min(log.start, self.committed)
+            self._numbered = {id: n for id, n in self._numbered.items() if n > old}
+            self._own = {n: seq for n, seq in self._own.items() if n > old}
 
     def _listen(self, now: float) -> None:
         """Let every replica that obeys know that we live, and what is committed."""

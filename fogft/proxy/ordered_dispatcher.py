@@ -27,7 +27,9 @@ from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.dispatcher import key_of
 from fogft.proxy.mark import MarkFile
 from fogft.proxy.outcomes import Outcomes
-from fogft.proxy.service_order import Numbered, OrderId, OwnOrder, ServiceOrder, SharedOrder
+from fogft.proxy.own_order import OwnOrder
+from fogft.proxy.service_order import Numbered, OrderId, ServiceOrder
+from fogft.proxy.shared_order import SharedOrder
 from fogft.wire.port import Answer, Link, Refusal
 
 log = logging.getLogger(__name__)
