@@ -247,9 +247,7 @@ class PoolSpec:
 def _run_by_replica(service: ServiceSpec) -> tuple[str, ...]:
     """Return what of a service concerns its replicas; no more than was always there if unset."""
     policy = (str(service.concurrency), service.cancel)
-    state: tuple[str, ...] = ()
-    if service.state is not None:
-        state = (str(service.state), *(["shared"] if service.state.shared else []))
+    state = () if service.state is None else (str(service.state),)
     return (service.name, service.type, *(policy if policy != ("0", "") else ()), *state)
 
 

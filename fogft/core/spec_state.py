@@ -49,6 +49,9 @@ class StateSpec:
     shared: bool = field(default=False, repr=False)
     founders: int = field(default=0, repr=False, compare=False)
 
+    def __str__(self) -> str:
+        return f"{self!r}, shared" if self.shared else repr(self)
+
     def to_plain(self) -> dict[str, Any]:
         """Return it as a configuration file has it."""
         ends = {"snapshot": vars(self.snapshot).copy(), "restore": vars(self.restore).copy()}
