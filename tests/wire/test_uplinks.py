@@ -38,7 +38,7 @@ class Owner:
 class Scene:
     def __init__(self, policy: str, uplinks: int = 2) -> None:
         self.owner, inner = Owner(), FakeDialer()
-        dialer = UplinkDialer(inner)
+        dialer = self.dialer = UplinkDialer(inner)
         dialer.use(
             [f"if{i}" for i in range(uplinks)],
             [ServiceSpec("/s", "t/srv/T", uplinks=UplinkPolicy(policy))],
@@ -81,6 +81,17 @@ def test_all_sends_on_each_and_takes_the_first_answer():
     one = scene.uplinks[0]
     one.events.late(one, "/s", ID)
     assert scene.owner.too_late == []  # the replica ran it once: nothing was in vain
+
+
+def test_each_service_has_its_own_policy():
+    """Over the same links at the same time."""
+    scene = Scene("all")
+    policies = [("/s", UplinkPolicy.ALL), ("/t", UplinkPolicy.PREFER)]
+    scene.dialer.use(["if0", "if1"], [ServiceSpec(n, "t/srv/T", uplinks=p) for n, p in policies])
+    assert scene.offer()
+    assert scene.counts() == [1, 1]
+    assert scene.link.offer("/t", b"t" * 16, b"payload", 5.0)
+    assert scene.counts() == [2, 1]
 
 
 def test_prefer_goes_back_and_failover_does_not():
