@@ -16,6 +16,7 @@ Three servers, all inside a network namespace of the test's own:
 from __future__ import annotations
 
 import base64
+import contextlib
 import itertools
 import json
 import logging
@@ -108,7 +109,8 @@ class World:
         subprocess.run(
             ["ip", "link", "set", f"vf{id[-8:]}", "down"], check=False, capture_output=True
         )
-        os.killpg(vm.pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # it has shut itself down
+            os.killpg(vm.pid, signal.SIGKILL)
         vm.wait()
         name = "f" + id[-8:]
         subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
