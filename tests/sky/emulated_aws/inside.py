@@ -31,15 +31,27 @@ def main() -> int:
         aws = subprocess.Popen(
             [sys.executable, HERE / "aws.py"], env=environ, stdout=log, stderr=log
         )
+    servers = [aws]
     try:
         wait_for(environ["EMULATED_AWS"] + "/instances", aws)
+        if (EMULATION / "container").is_dir():
+            servers.append(registry(environ))
         return subprocess.run(
             sys.argv[1:], env=environ, cwd=HERE.parents[2], check=False
         ).returncode
     finally:
         subprocess.run(["sky", "api", "stop"], env=environ, check=False, capture_output=True)
-        aws.send_signal(signal.SIGTERM)
-        aws.wait(30)
+        for server in servers:
+            server.send_signal(signal.SIGTERM)
+            server.wait(30)
+
+
+def registry(environ: dict[str, str]) -> subprocess.Popen[bytes]:
+    """Start the registry that has the one image that was baked."""
+    words = [sys.executable, HERE / "registry.py", EMULATION / "container", "10.66.0.1", "5000"]
+    started = subprocess.Popen(words, env=environ, stderr=subprocess.DEVNULL)
+    wait_for("http://10.66.0.1:5000/v2/", started)
+    return started
 
 
 def wait_for(url: str, process: subprocess.Popen[bytes]) -> None:

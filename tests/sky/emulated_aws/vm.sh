@@ -31,6 +31,12 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
     for folder in "$@"; do [ ! -d ".$folder" ] || mount -t tmpfs tmpfs ".$folder"; done
     chmod 1777 tmp dev/shm
     mkdir -p run/sshd
+    if [ -d "$image/cgroup" ]; then  # it has Docker
+      mount -t sysfs sysfs sys
+      mount --rbind "$image/cgroup" sys/fs/cgroup
+      mkdir -p var/lib/docker
+      mount -t tmpfs tmpfs var/lib/docker  # an overlay cannot lie on another one
+    fi
     hostname "ip-${address//./-}"
     echo "127.0.0.1 localhost ip-${address//./-}" >etc/hosts
     : >etc/resolv.conf
@@ -39,6 +45,9 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
     chown -R --reference="home/$user" "home/$user/.ssh"
     path=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
     env -i PATH="$path" chroot . sh -c "$first" >/dev/null 2>&1 || echo "a first command failed"
+    [ ! -d "$image/cgroup" ] || env -i PATH="$path" chroot . dockerd --iptables=false --bridge=none \
+      --add-runtime here=/usr/local/sbin/runc-here --default-runtime here \
+      --insecure-registry 10.66.0.1:5000 --cgroup-parent "/${image##*/}" >var/log/dockerd.log 2>&1 &
     exec env -i PATH="$path" \
       chroot . /usr/sbin/sshd -D -e -o UsePAM=no -o PidFile=/run/sshd.pid \
       -o SetEnv=AWS_ENDPOINT_URL=http://10.66.0.1:5566  # where a VM that ends itself finds AWS

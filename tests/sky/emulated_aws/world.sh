@@ -4,7 +4,8 @@
 # usage (as root): world.sh VENV RESULTS COMMAND...
 #   VENV     with skypilot[aws], moto[ec2,server], uv and fogft
 #   RESULTS  the one folder that outlives the world
-# `IMAGE_CACHE=FILE.tar` keeps the baked image for the next time.
+# `IMAGE_CACHE=FILE.tar` keeps the baked image for the next time. With `CONTAINERS=1` the VMs have
+# Docker, and there is a registry with an image that has ROS 2.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 if [ "${1:-}" != --inside ]; then
@@ -14,15 +15,23 @@ shift
 venv=$1 results=$2
 shift 2
 image=$(mktemp -d /tmp/fogft-world.XXXXXX)
-trap 'umount -l "$image"; rmdir "$image"' EXIT
+gone() {
+  umount -l "$image"
+  rmdir "$image"
+  # What is left of containers that were killed with their VM.
+  find /sys/fs/cgroup -depth -type d -path "*/${image##*/}*" -exec rmdir {} \; 2>/dev/null || :
+}
+trap gone EXIT
 mount -t tmpfs -o size=14g tmpfs "$image"  # overlays need a file system other than the root's
 start=$SECONDS
-if [ -n "${IMAGE_CACHE:-}" ] && [ -f "$IMAGE_CACHE" ]; then
-  tar -C "$image" --xattrs --xattrs-include='*' -xf "$IMAGE_CACHE"
+cache=${IMAGE_CACHE:+$IMAGE_CACHE${CONTAINERS:+.containers}}
+if [ -n "$cache" ] && [ -f "$cache" ]; then
+  tar -C "$image" --xattrs --xattrs-include='*' -xf "$cache"
 else
   "$here/bake.sh" "$image" "$venv"
-  [ -z "${IMAGE_CACHE:-}" ] ||
-    tar -C "$image" --xattrs --xattrs-include='*' -cf "$IMAGE_CACHE" layer robot
+  [ -z "${CONTAINERS:-}" ] || "$here/bake_container.sh" "$image" "$venv"
+  [ -z "$cache" ] || tar -C "$image" --xattrs --xattrs-include='*' -cf "$cache" \
+    layer robot ${CONTAINERS:+container}
 fi
 echo "world: image ready after $((SECONDS - start)) s, $(du -sh "$image/layer" | cut -f1)" >&2
 
@@ -40,6 +49,10 @@ mount --bind "$image" "$root$image"
 mount --bind "$image/host" "$root$image/host"
 mount --bind "$results" "$root$results"
 cp -r "$image/robot/." "$root/robot/"
+if [ -n "${CONTAINERS:-}" ]; then
+  mkdir "$image/cgroup"
+  mount --rbind /sys/fs/cgroup "$root$image/cgroup"
+fi
 
 unshare --net --pid --ipc --uts --fork --kill-child bash -euc '
   root=$1 here=$2 venv=$3 image=$4 results=$5

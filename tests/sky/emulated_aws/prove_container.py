@@ -1,0 +1,92 @@
+"""A replica in a container of the user's own image, on unmodified SkyPilot and a real Docker daemon.
+
+Runs inside a world (`world.sh`, with `CONTAINERS=1`). The image has ROS 2 at /opt/ros and no fogft;
+SkyPilot pulls it from a registry, starts it with the machine's own network and goes into it over
+ssh. There the replica answers, hears its machine's preemption notice, and, when its manager is
+ended for good, has its machine ended. To wait for minutes and not for hours, the five idle minutes
+are made one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+from tests.e2e.pool import Client
+from tests.sky.emulated_aws.emulation import Steps, control, disk_of, running, until
+from tests.sky.emulated_aws.pool import HOME, Pool, kill_server, machine_of, open_ports, processes
+
+TEMPLATE = Path(__file__).resolve().parents[3] / "templates" / "sky_task.yaml"
+BOXED = """\
+name: boxed
+resources:
+  cpus: 2
+  use_spot: true
+  infra: aws/us-east-1
+  image_id: docker:10.66.0.1:5000/ros:1
+workdir: .
+envs: {GREETING: hello}
+secrets: {TOKEN: t0p-secret}
+setup: test -f /.dockerenv && echo "$GREETING $TOKEN" > ~/setup-ran
+run: |
+  set -e
+  test -f /.dockerenv
+  grep -qx "hello t0p-secret" ~/setup-ran
+  exec python3 plan_service.py
+fogft:
+  replicas: 1
+  orphan_after_s: 60
+  services:
+    - {name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}
+"""
+step = Steps()
+
+
+def main() -> int:
+    text = TEMPLATE.read_text()
+    assert "idle_minutes: 5" in text
+    TEMPLATE.write_text(text.replace("idle_minutes: 5", "idle_minutes: 1"))
+    pool = Pool(BOXED)
+    pool.sky_api("start")
+    try:
+        with step("`up` in a container with ROS 2, until it answers"):
+            print(pool.fogft("up", str(pool.file), "--yes"))
+        client = Client(pool.environ, 3600.0, 5.0, 15.0)
+        (name,) = pool.replicas()
+        machine = machine_of(name)
+        cluster = f"fogft-{pool.status()['uid']}-{name.replace('.', '-')}"
+        assert open_ports(machine["region"], f"sky-sg-{cluster}") == {22, 7447}
+        home = disk_of(machine) / "home/ubuntu"
+        assert not (home / "setup-ran").exists(), "the set-up ran beside the container"
+        assert not (home / ".fogft").exists(), "fogft is beside the container"
+        with step("preemption notice: until its replacement is launched"):
+            control(f"/notice?id={machine['id']}&in_s=3600")
+            until("it is being replaced", lambda: pool.others(name), 120)
+        with step("... until whole, in another container, the one that was warned ended"):
+            until("the pool is whole", lambda: pool.whole(1) and name not in pool.replicas())
+        result = client.finish()
+        print(result)
+        assert result["answered"] == result["requests"] > 10, result
+        assert result["failed"] == result["wrong"] == result["twice"] == 0, result
+        os.kill(pool.pid("manager"), signal.SIGKILL)
+        kill_server()
+        with step("manager and API server are gone: until the orphan has ended its machine"):
+            until("it is gone", lambda: not running())
+        pool.sky_api("start")
+        with step("`down`, which finds nothing"):
+            print(pool.fogft("down", pool.name))
+    finally:
+        pool.keep_log()
+    assert not list((HOME / "pools").glob("*"))
+    pool.sky_api("stop")
+    until("nothing of it runs here", lambda: not processes(), 60)
+    table = "".join(f"{end - begin:7.1f} s  {name}\n" for name, begin, end in step.done)
+    Path(os.environ["RESULTS"], "container.txt").write_text(table)
+    print("every step passed")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
