@@ -1,4 +1,4 @@
-"""A replica in a container of the user's own image, on unmodified SkyPilot and a real Docker daemon.
+"""A replica in a container of the user's own image: unmodified SkyPilot and a real Docker daemon.
 
 Runs inside a world (`world.sh`, with `CONTAINERS=1`). The image has ROS 2 at /opt/ros and no fogft;
 SkyPilot pulls it from a registry, starts it with the machine's own network and goes into it over
