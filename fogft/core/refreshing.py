@@ -21,6 +21,7 @@ from fogft.core.model import LinkReport, LinkState, MachinePhase, Observed, Repl
 
 FIRST_PAUSE_S = 4.0
 LONGEST_PAUSE_S = 60.0
+DOUBTED_PAUSE_S = 15.0  # whoever is lost after a doubt is asked about at once again
 NEVER_HEARD_PAUSE_S = 30.0
 FALSE_ALARM_REMEMBERED_S = 600.0
 """A link that often hesitates and then answers costs a question now and then, no more."""
@@ -71,7 +72,8 @@ class Silent:
 def _first(silence: _Silence, now: float) -> _Asked:
     if silence is _Silence.NEVER_HEARD:
         return _Asked(silence, now + NEVER_HEARD_PAUSE_S, NEVER_HEARD_PAUSE_S)
-    return _Asked(silence, now, FIRST_PAUSE_S)
+    doubted = silence is _Silence.DOUBTED
+    return _Asked(silence, now, DOUBTED_PAUSE_S if doubted else FIRST_PAUSE_S)
 
 
 def _is_remembered(asked: _Asked, now: float) -> bool:
