@@ -44,10 +44,17 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
     echo "$key" >"home/$user/.ssh/authorized_keys"
     chown -R --reference="home/$user" "home/$user/.ssh"
     path=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
+    docker=
+    [ ! -d "$image/cgroup" ] || docker="--cgroup-parent=/${image##*/}"
+    mkdir -p .old
+    pivot_root . .old  # as in `world.sh`
+    umount -l .old
     env -i PATH="$path" chroot . sh -c "$first" >/dev/null 2>&1 || echo "a first command failed"
-    [ ! -d "$image/cgroup" ] || env -i PATH="$path" chroot . dockerd --iptables=false --bridge=none \
-      --add-runtime here=/usr/local/sbin/runc-here --default-runtime here \
-      --insecure-registry 10.66.0.1:5000 --cgroup-parent "/${image##*/}" >var/log/dockerd.log 2>&1 &
+    if [ -n "$docker" ]; then
+      env -i PATH="$path" chroot . dockerd --iptables=false --bridge=none "$docker" \
+        --add-runtime here=/usr/local/sbin/runc-here --default-runtime here \
+        --insecure-registry 10.66.0.1:5000 >var/log/dockerd.log 2>&1 &
+    fi
     exec env -i PATH="$path" \
       chroot . /usr/sbin/sshd -D -e -o UsePAM=no -o PidFile=/run/sshd.pid \
       -o SetEnv=AWS_ENDPOINT_URL=http://10.66.0.1:5566  # where a VM that ends itself finds AWS

@@ -54,7 +54,7 @@ if [ -n "${CONTAINERS:-}" ]; then
   mount --rbind /sys/fs/cgroup "$root$image/cgroup"
 fi
 
-unshare --net --pid --ipc --uts --fork --kill-child bash -euc '
+unshare --mount --net --pid --ipc --uts --fork --kill-child bash -euc '
   root=$1 here=$2 venv=$3 image=$4 results=$5
   shift 5
   ip link set lo up
@@ -63,7 +63,12 @@ unshare --net --pid --ipc --uts --fork --kill-child bash -euc '
   ip addr add 169.254.169.254/32 dev br0  # where a VM asks for its metadata
   ip link set br0 up
   mount -t proc proc "$root/proc"
-  exec chroot "$root" env -i HOME=/robot PATH="$venv/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \
+  # A root of its own, and not only a chroot: what enters a mount namespace begins at its root.
+  cd "$root"
+  mkdir -p .old
+  pivot_root . .old
+  umount -l .old
+  exec chroot . env -i HOME=/robot PATH="$venv/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \
     LANG=C.UTF-8 PYTHONPATH= RESULTS="$results" EMULATION="$image" HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
     "$venv/bin/python" "$here/inside.py" "$@"
 ' world "$root" "$here" "$venv" "$image" "$results" "$@"
