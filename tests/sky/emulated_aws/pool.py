@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from tests.e2e.pool import NODES
-from tests.sky.emulated_aws.emulation import running
+from tests.sky.emulated_aws.emulation import running, until
 
 ROBOT = Path("/robot")
 HOME = ROBOT / "fogft"
@@ -59,6 +59,20 @@ class Pool:
         )  # fmt: skip
         assert done.returncode == status, f"fogft {' '.join(words)}\n{done.stdout}"
         return done.stdout
+
+    def down(self) -> None:
+        """End it; again where SkyPilot's server, just started, does not answer in time."""
+
+        def ended() -> bool:
+            try:
+                print(self.fogft("down", self.name))
+            except AssertionError as error:
+                assert "run `fogft down" in str(error), error
+                print(error)
+                return False
+            return True
+
+        until("`down` has ended it", ended, UP_WITHIN_S)
 
     @property
     def state(self) -> Path:

@@ -178,7 +178,7 @@ def main() -> int:
     alone.sky_api("start")
     for pool in (alone, hangs, unborn):
         with step(f"`down` of `{pool.name}`, which finds nothing"):
-            print(pool.fogft("down", pool.name))
+            pool.down()
     assert not list((HOME / "pools").glob("*"))
     alone.sky_api("stop")
     until("nothing of it runs here", lambda: not processes(), 60)

@@ -76,7 +76,7 @@ def main() -> int:
             until("it is gone", lambda: not running())
         pool.sky_api("start")
         with step("`down`, which finds nothing"):
-            print(pool.fogft("down", pool.name))
+            pool.down()
     finally:
         pool.keep_log()
     assert not list((HOME / "pools").glob("*"))
