@@ -45,10 +45,12 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
     chown -R --reference="home/$user" "home/$user/.ssh"
     path=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
     docker=
-    [ ! -d "$image/cgroup" ] || docker="--cgroup-parent=/${image##*/}"
-    mkdir -p .old
-    pivot_root . .old  # as in `world.sh`
-    umount -l .old
+    if [ -d "$image/cgroup" ]; then
+      docker="--cgroup-parent=/${image##*/}"
+      mkdir -p .old
+      pivot_root . .old  # as in `world.sh`
+      umount -l .old
+    fi
     env -i PATH="$path" chroot . sh -c "$first" >/dev/null 2>&1 || echo "a first command failed"
     if [ -n "$docker" ]; then
       env -i PATH="$path" chroot . dockerd --iptables=false --bridge=none "$docker" \

@@ -63,11 +63,13 @@ unshare --mount --net --pid --ipc --uts --fork --kill-child bash -euc '
   ip addr add 169.254.169.254/32 dev br0  # where a VM asks for its metadata
   ip link set br0 up
   mount -t proc proc "$root/proc"
-  # A root of its own, and not only a chroot: what enters a mount namespace begins at its root.
   cd "$root"
-  mkdir -p .old
-  pivot_root . .old
-  umount -l .old
+  # For Docker a root of its own: what enters a container begins at the root of all mounts.
+  if [ -d "$image/cgroup" ]; then
+    mkdir -p .old
+    pivot_root . .old
+    umount -l .old
+  fi
   exec chroot . env -i HOME=/robot PATH="$venv/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \
     LANG=C.UTF-8 PYTHONPATH= RESULTS="$results" EMULATION="$image" HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
     "$venv/bin/python" "$here/inside.py" "$@"
