@@ -1,6 +1,8 @@
 """A registry of container images that has one, made of a folder: `docker pull` and no more.
 
-usage: registry.py FOLDER ADDRESS PORT      (FOLDER: the image's root)
+usage: registry.py FOLDER ADDRESS PORT [NAME=VALUE...]
+    FOLDER      the image's root
+    NAME=VALUE  environment of whatever runs in it
 
 The image is `ADDRESS:PORT/ros:1`. Its one layer is a plain tar.
 """
@@ -37,7 +39,7 @@ def read(path: Path) -> Iterator[bytes]:
 class Image:
     """What a registry answers with: each digest and the file that has it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, environ: Sequence[str]) -> None:
         beside = folder.parent
         layer = beside / "container.tar"
         subprocess.run(["tar", "-C", folder, "--numeric-owner", "-cf", layer, "."], check=True)
