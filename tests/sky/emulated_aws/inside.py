@@ -48,7 +48,10 @@ def main() -> int:
 
 def registry(environ: dict[str, str]) -> subprocess.Popen[bytes]:
     """Start the registry that has the one image that was baked."""
-    words = [sys.executable, HERE / "registry.py", EMULATION / "container", "10.66.0.1", "5000"]
+    aws = "AWS_ENDPOINT_URL=http://10.66.0.1:5566"  # where a VM that ends itself finds AWS
+    words = [
+        sys.executable, HERE / "registry.py", EMULATION / "container", "10.66.0.1", "5000", aws
+    ]  # fmt: skip
     started = subprocess.Popen(words, env=environ, stderr=subprocess.DEVNULL)
     wait_for("http://10.66.0.1:5000/v2/", started)
     return started

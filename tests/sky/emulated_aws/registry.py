@@ -13,7 +13,7 @@ import hashlib
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from typing import Any
 DOCKER = "application/vnd.docker."
 MANIFEST = f"{DOCKER}distribution.manifest.v2+json"
 CHUNK = 1 << 20
+PATH = "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
 def digest(chunks: Iterator[bytes]) -> str:
@@ -47,9 +48,7 @@ class Image:
         config = {
             "architecture": "amd64",
             "os": "linux",
-            "config": {
-                "Env": ["PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"]
-            },
+            "config": {"Env": [PATH, *environ]},
             "rootfs": {"type": "layers", "diff_ids": [layer_digest]},
         }
         self.blobs = {layer_digest: layer}
@@ -104,4 +103,4 @@ def serve(image: Image, address: str, port: int) -> None:
 
 
 if __name__ == "__main__":
-    serve(Image(Path(sys.argv[1])), sys.argv[2], int(sys.argv[3]))
+    serve(Image(Path(sys.argv[1]), sys.argv[4:]), sys.argv[2], int(sys.argv[3]))
