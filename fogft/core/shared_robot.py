@@ -12,13 +12,14 @@ Protocol and its argument: docs/design/state.md, "Several robots".
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from fogft.core import ordering, shared_orders
 from fogft.core.ordered_peer import Order
 from fogft.core.ordering import START, Op, Position
 from fogft.core.shared_orders import RequestId, Standing
+from fogft.core.shared_places import Places
 from fogft.core.shared_sequencer import Answered, SharedSequencer
 from fogft.core.shared_watch import Watch
 
@@ -49,7 +50,6 @@ class _Request:
     body: bytes
     next_at: float
     tries: int = 0
-    asked: set[int] = field(default_factory=set)  # where it was handed in and is not ended
 
 
 class SharedRobot:
@@ -89,6 +89,7 @@ class SharedRobot:
         self._leaving: tuple[int, ...] = ()
         self._listed = 0
         self._watch = Watch(chance())
+        self._places = Places()
         self._now = 0.0
         self._ready_at: float | None = None
         self._serial = 0
@@ -130,21 +131,16 @@ class SharedRobot:
             request.next_at = now + (RETRY_S if known else REFUSED_RETRY_S)
             if not known or not fresh or term.under_way(id):
                 return  # if it is committed without an answer, a replica has it: ask there
-        replica = self._choose(request, now)
+        joined = self._watch.places(now) if term is None else term.joined
+        replica = self._places.choose(joined, seq, request.tries)
         if replica is None:
             request.next_at = now + REFUSED_RETRY_S
             return
-        request.asked.add(replica)
+        self._places.begin(replica, seq, len(request.body))
         request.next_at = now + min(RETRY_S * 2**request.tries, RETRY_LIMIT_S)
         request.tries += 1
         payload = shared_orders.encode_word(self._floor, request.body)
         self._out.append(Outgoing(self.session, Order(replica, Op.HAND_IN, seq, payload)))
-
-    def _choose(self, request: _Request, now: float) -> int | None:
-        """Return where to hand a request in: in the latest term, and not always the same."""
-        places = self._watch.places(now) if self.term is None else self.term.joined
-        left = [replica for replica in places if replica not in request.asked]
-        return left[request.tries % len(left)] if left else None
 
     def take_answers(self) -> list[Answered]:
         """Return the answers that have come, and forget them. First write down `mark`."""
@@ -282,8 +278,9 @@ class SharedRobot:
         if not self._watch.is_due(now):
             return
         for replica in self._replicas:
-            self._serial += 1
-            self._out.append(Outgoing(self.session, Order(replica, Op.LOOK, self._serial)))
+            if self._watch.looks_at(replica):
+                self._serial += 1
+                self._out.append(Outgoing(self.session, Order(replica, Op.LOOK, self._serial)))
 
     def _claim(self, now: float) -> None:
         epoch = self._watch.highest = self._new_epoch(self._watch.highest)
@@ -300,10 +297,12 @@ class SharedRobot:
         """Take a reply. Raises OrderError."""
         op, epoch, index = order
         if op is Op.LOOK:
+            self._watch.looked(replica)
             self._saw(replica, shared_orders.decode_standing(payload), now)
         elif op is Op.HAND_IN:
             at, answer = shared_orders.decode_answer(payload)
             if epoch == self.session:
+                self._places.end(replica, index)
                 self._take(Answered(index, at, answer))
         elif self.term is not None and epoch == self.term.epoch:
             self.term.replied(replica, op, index, payload)
@@ -319,13 +318,15 @@ class SharedRobot:
     def refused(self, replica: int, order: OrderId, reason: str, now: float) -> None:
         """Take a refusal, or the loss of an order: the replica may or may not have obeyed it."""
         op, epoch, index = order
-        if op is Op.HAND_IN and epoch == self.session:
+        if op is Op.LOOK:
+            self._watch.looked(replica)
+        elif op is Op.HAND_IN and epoch == self.session:
+            self._places.end(replica, index)
             request = self._requests.get(index)
             if request is not None:
-                request.asked.discard(replica)
                 final = reason == ordering.MALFORMED
                 request.next_at = float("inf") if final else now + REFUSED_RETRY_S
-        elif op not in (Op.LOOK, Op.HAND_IN) and self.term and epoch == self.term.epoch:
+        elif op is not Op.HAND_IN and self.term and epoch == self.term.epoch:
             self.term.refused(replica, op, index, reason, now)
             self._look_after_term(now)
 

@@ -8,6 +8,7 @@ Owns: what was seen, and when it is time to claim. Not here: claiming (`shared_r
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ LOOK_EVERY_S = 0.25
 STALE_S = 1.5
 SILENCE_S = 2.0
 FIRST_SILENCE_S = 0.2
+LOOKS_LIMIT = 4
 
 
 @dataclass
@@ -39,6 +41,7 @@ class Watch:
         self._quiet_from = 0.0
         self._look_at = 0.0
         self._seen: dict[int, _Seen] = {}
+        self._looks: Counter[int] = Counter()  # on their way
 
     def keep(self, replicas: Collection[int]) -> None:
         """Forget all replicas but these."""
@@ -54,6 +57,17 @@ class Watch:
             return False
         self._look_at = now + LOOK_EVERY_S
         return True
+
+    def looks_at(self, replica: int) -> bool:
+        """Whether to look at a replica: not where several looks are on their way."""
+        if self._looks[replica] >= LOOKS_LIMIT:
+            return False
+        self._looks[replica] += 1
+        return True
+
+    def looked(self, replica: int) -> None:
+        """A look has ended, well or not."""
+        self._looks[replica] -= 1
 
     def saw(self, replica: int, standing: Standing, now: float) -> None:
         """Take what a replica told."""

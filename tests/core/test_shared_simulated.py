@@ -7,12 +7,14 @@ import random
 import pytest
 
 from fogft.core import lag, ordered_term
+from fogft.core.shared_places import PLACE_BYTES, PLACE_LIMIT, Places
 from fogft.core.shared_robot import AHEAD, SharedRobot
 from tests.core.shared_world import SharedWorld
 from tests.core.test_ordering_simulated import ask_counter, ask_key_value
 from tests.linearizability import counter, key_value, linearizable
 
 CLIENTS = 2
+ALL_KINDS = "SSRCPMXXHHG"  # see `fault`
 
 
 def drive(world: SharedWorld, questions, steps: int, faults: float, kinds: str) -> None:
@@ -100,7 +102,7 @@ def test_histories_are_linearizable_under_faults(seed, questions, step, start):
     )  # fmt: skip
     world.settle(2000)
     faults = source.choice([0.0, 0.003, 0.01])
-    drive(world, questions, 1500, faults, kinds="SSRCPMXXHHG")
+    drive(world, questions, 1500, faults, kinds=ALL_KINDS)
     world.heal()
     world.settle(3000)
     check(world, step, start)
@@ -263,3 +265,20 @@ def test_a_robot_that_waits_for_much_is_given_no_more_numbers():
     assert brain.submit(b"", 0.0) is None
     brain.abandon(1)
     assert brain.submit(b"", 0.0) is not None
+
+
+def test_what_lies_unanswered_at_a_replica_is_bounded():
+    """Callers have given up; the links have still room for looks, and a caller of now is served."""
+    places = Places()
+    for seq in range(PLACE_LIMIT):
+        assert places.choose([0], seq, 0) == 0
+        places.begin(0, seq, 10)
+    assert places.choose([0], PLACE_LIMIT, 0) is None
+    assert places.choose([0, 1], PLACE_LIMIT, 0) == 1
+    places.begin(1, 7, PLACE_BYTES)
+    assert places.choose([0, 1], PLACE_LIMIT, 0) is None
+    places.end(0, 3)
+    assert places.choose([0, 1], PLACE_LIMIT, 0) == 0
+    assert places.choose([0, 1], 4, 0) is None, "it lies there"
+    places.end(1, 7)
+    assert places.choose([0, 1], 4, 0) == 1
