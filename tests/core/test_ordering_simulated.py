@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from fogft.core import lag, ordered_term
-from fogft.core.ordered_term import WINDOW
+from fogft.core import catching_up, lag
+from fogft.core.catching_up import WINDOW
 from tests.core.ordering_world import World
 from tests.linearizability import Call, counter, key_value, linearizable
 
@@ -76,7 +76,7 @@ def limits(request, monkeypatch) -> None:
     """With narrow limits replicas fall too far behind all the time."""
     if request.param == "narrow":
         monkeypatch.setattr(lag, "LIMIT", 3)
-        monkeypatch.setattr(ordered_term, "WINDOW", 2)
+        monkeypatch.setattr(catching_up, "WINDOW", 2)
 
 
 @pytest.mark.usefixtures("limits")

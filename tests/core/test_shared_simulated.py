@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from fogft.core import lag, ordered_term
+from fogft.core import catching_up, lag
 from fogft.core.shared_places import PLACE_BYTES, PLACE_LIMIT, Places
 from fogft.core.shared_robot import AHEAD, SharedRobot
 from tests.core.shared_world import SharedWorld
@@ -83,7 +83,7 @@ def limits(request, monkeypatch) -> None:
     """With narrow limits replicas fall too far behind all the time."""
     if request.param == "narrow":
         monkeypatch.setattr(lag, "LIMIT", 3)
-        monkeypatch.setattr(ordered_term, "WINDOW", 2)
+        monkeypatch.setattr(catching_up, "WINDOW", 2)
 
 
 @pytest.mark.usefixtures("limits")
