@@ -190,7 +190,7 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     if machine.notice:
         return Verdict.LEAVING, "preemption notice"
     if machine.phase is MachinePhase.PROVISIONING:
-        if now - machine.launched_at > health.start_limit_s:
+        if now - _accepted_at(machine, record, now) > health.start_limit_s:
             return Verdict.FAILED, f"timeout: not running after {health.start_limit_s:.0f} s"
         return Verdict.GOOD, ""
     # A mark of our own comes back in the report: it is not the replica's wish.
@@ -216,6 +216,18 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     if away_s > health.start_limit_s and context.ready_somewhere:
         return Verdict.STUCK, f"its service has been away for {away_s:.0f} s"
     return Verdict.GOOD, ""
+
+
+def _accepted_at(machine: Machine, record: Record | None, now: float) -> float:
+    """Return since when a launch is under way.
+
+    The cloud's word does not move along when our clock is set, and what is remembered does.
+    """
+    if record is None:
+        return machine.launched_at
+    if machine.launched_at > now:
+        return record.launched_at
+    return max(machine.launched_at, record.launched_at)
 
 
 def _has_settled(record: Record | None, now: float) -> bool:

@@ -15,8 +15,9 @@ from bisect import insort
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+from fogft.core.digest import Digest, Lasting, outdate
 from fogft.core.errors import StateError
 from fogft.core.model import supply
 
@@ -36,8 +37,11 @@ class EventKind(str, Enum):
     ENDING = "ending"  # written before the cloud is asked to end it
     ENDED = "ended"  # gone, as asked
     GONE = "gone"  # gone, unasked: preempted, crashed or ended by someone else
+    CLOCK = "clock"  # of no replica: the clock on the wall was set
+    SLEPT = "slept"  # of no replica: the manager's machine slept
 
 
+MOVING = frozenset({EventKind.CLOCK, EventKind.SLEPT})
 CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
 _ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
 
@@ -52,6 +56,7 @@ class Event:
         on_demand: Of a launch: not bought on the spot market.
         detail: Why, in words. For REFUSED and FAILED the first word is the cause:
             ``capacity``, ``quota``, ``setup``, ``timeout`` or ``error``.
+        by_s: Of CLOCK and SLEPT: so much later is all that was remembered before.
     """
 
     at: float
@@ -61,6 +66,7 @@ class Event:
     location: str = ""
     detail: str = ""
     on_demand: bool = False
+    by_s: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
         """Return the event as a JSON object."""
@@ -76,6 +82,8 @@ class Event:
             out["detail"] = self.detail
         if self.on_demand:
             out["on_demand"] = True
+        if self.by_s:
+            out["by_s"] = self.by_s
         return out
 
     @classmethod
@@ -94,6 +102,7 @@ class Event:
                 location=str(value.get("location", "")),
                 detail=str(value.get("detail", "")),
                 on_demand=bool(value.get("on_demand", False)),
+                by_s=float(value.get("by_s", 0.0)),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise StateError(f"not an event: `{value!r:.120}`") from error
@@ -116,6 +125,17 @@ class Record:
     closed_at: float = 0.0
     on_demand: bool = False
 
+    def move(self, by_s: float) -> None:
+        """Let all of it be later."""
+        self.launched_at += by_s
+        self.closed_at += by_s
+        if self.first_ready_at is not None:
+            self.first_ready_at += by_s
+        if self.unready_since is not None:
+            self.unready_since += by_s
+        if self.draining_since is not None:
+            self.draining_since += by_s
+
     @property
     def supply(self) -> str:
         """What it was bought from; see `Placement.supply`."""
@@ -129,49 +149,6 @@ class Failure(NamedTuple):
     cause: str
 
 
-@dataclass
-class Lasting(Generic[T]):
-    """Something that is so from `since` until before `until`, unless something happens."""
-
-    value: T
-    since: float
-    until: float
-
-
-class Digest(Generic[T]):
-    """What follows from the events of each of several places, kept as long as it is so.
-
-    Args:
-        outdated: Places to be worked out when next asked for.
-    """
-
-    def __init__(self, outdated: set[str]) -> None:
-        self.outdated = outdated
-        self._known: dict[str, Lasting[T | None]] = {}
-        self._values: dict[str, T] = {}
-        self._since, self._until = float("-inf"), float("inf")
-
-    def at(self, now: float, work_out: Callable[[str], Lasting[T | None]]) -> Mapping[str, T]:
-        """Return what is so at a time, by place; None is left out."""
-        if not self._since <= now < self._until:
-            self.outdated.update(
-                place for place, one in self._known.items() if not one.since <= now < one.until
-            )
-        if self.outdated:
-            for place in self.outdated:
-                self._known[place] = work_out(place)
-            self.outdated.clear()
-            self._values = {p: one.value for p, one in self._known.items() if one.value is not None}
-            self._since = max(one.since for one in self._known.values())
-            self._until = min(one.until for one in self._known.values())
-        return self._values
-
-
-def _outdate(digests: Mapping[Any, Digest[Any]], place: str) -> None:
-    for digest in digests.values():
-        digest.outdated.add(place)
-
-
 class History:
     """Events folded into facts. `add` is the only change; planner and placement only read."""
 
@@ -182,6 +159,7 @@ class History:
         self._failures: dict[str, list[Failure]] = {}
         self._proven_at: dict[str, float] = {}
         self._losses: dict[str, list[float]] = {}
+        self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
         self.version = 0  # of all facts: counts events
         # What follows from failures and proofs of each supply, and from losses at each location.
         self._of_supplies: dict[Callable[..., Any], Digest[Any]] = {}
@@ -192,6 +170,9 @@ class History:
     def add(self, event: Event) -> None:
         """Take one more event into account. Events come in the order they happened."""
         self.version += 1
+        if event.kind in MOVING:
+            self._move(event)
+            return
         key = (event.slot, event.generation)
         latest = self._generations.get(event.slot, 0)
         self._generations[event.slot] = max(latest, event.generation)
@@ -207,6 +188,27 @@ class History:
             self._open[key] = record
         else:
             self._open.pop(key, None)
+
+    def _move(self, event: Event) -> None:
+        """Let all that is remembered be later, so that durations stay what they were."""
+        by_s = event.by_s
+        if event.kind is EventKind.CLOCK:
+            self._set.append((event.at - by_s, by_s))
+        for record in self._records.values():
+            record.move(by_s)
+        self._failures = {
+            supply: [Failure(f.at + by_s, f.cause) for f in failures]
+            for supply, failures in self._failures.items()
+        }
+        self._losses = {p: [at + by_s for at in losses] for p, losses in self._losses.items()}
+        self._proven_at = {supply: at + by_s for supply, at in self._proven_at.items()}
+        self._of_supplies, self._of_losses = {}, {}
+
+    def by_clock(self, instant: float) -> float:
+        """Return a time that was written down as the clock tells it now, if it was set since."""
+        for old, by_s in self._set:
+            instant += by_s if instant <= old else 0.0
+        return instant
 
     def followed_by(self, events: Iterable[Event]) -> History:
         """Return this history with launches and marks added; it stays as it is itself."""
@@ -234,7 +236,7 @@ class History:
             record.unready_since = None
             self._proven_at[record.supply] = event.at
             if record.supply in self._failures:
-                _outdate(self._of_supplies, record.supply)
+                outdate(self._of_supplies, record.supply)
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
         elif kind is EventKind.DRAINING:
@@ -251,12 +253,12 @@ class History:
                 self._fail(record, event)
             if kind is EventKind.GONE:
                 insort(self._losses.setdefault(record.location, []), event.at)
-                _outdate(self._of_losses, record.location)
+                outdate(self._of_losses, record.location)
             record.closed = kind
             record.closed_at = event.at
 
     def _fail(self, record: Record, event: Event) -> None:
-        _outdate(self._of_supplies, record.supply)
+        outdate(self._of_supplies, record.supply)
         cause = event.detail.split(":")[0].split(" ")[0] or "error"
         failures = self._failures.setdefault(record.supply, [])
         insort(failures, Failure(event.at, cause), key=lambda failure: failure.at)
@@ -335,12 +337,18 @@ def compacted(events: Iterable[Event], now: float, keep_s: float = 86_400.0) -> 
 
     Kept whole: launches that are open, or to which something happened within `keep_s`.
     Kept in part: the latest launch of each slot, so that generations stay used. Of a
-    kept launch's comings and goings of readiness the first READY and the last two stay.
+    kept launch's comings and goings of readiness the first READY and the last two stay. That the
+    clock was set is never forgotten, that the machine slept only with all that was before.
     """
     events = list(events)
     history = History(events)
     kept = {(r.slot, r.generation) for r in history.open()}
-    kept |= {(e.slot, e.generation) for e in events if now - e.at < keep_s}
+    later_s = 0.0
+    for event in reversed(events):
+        if event.kind in MOVING:
+            later_s += event.by_s
+        elif now - (event.at + later_s) < keep_s:
+            kept.add((event.slot, event.generation))
     flapping: dict[tuple[int, int], list[int]] = {}
     for index, event in enumerate(events):
         if event.kind in (EventKind.READY, EventKind.UNREADY):
@@ -349,13 +357,14 @@ def compacted(events: Iterable[Event], now: float, keep_s: float = 86_400.0) -> 
     for indices in flapping.values():
         first_ready = [i for i in indices if events[i].kind is EventKind.READY][:1]
         dropped |= set(indices) - {*first_ready, *indices[-2:]}
-    return [
-        e
-        for index, e in enumerate(events)
-        if index not in dropped
-        and (
-            (e.slot, e.generation) in kept
-            or (e.kind is EventKind.LAUNCH and history.generation(e.slot) == e.generation)
-            or (e.kind in CLOSING and history.generation(e.slot) == e.generation)
-        )
-    ]
+    out: list[Event] = []
+    for index, e in enumerate(events):
+        is_last = e.generation == history.generation(e.slot)
+        if (
+            e.kind is EventKind.CLOCK
+            or (e.kind is EventKind.SLEPT and out)
+            or (e.kind not in MOVING and index not in dropped and (e.slot, e.generation) in kept)
+            or (is_last and (e.kind is EventKind.LAUNCH or e.kind in CLOSING))
+        ):
+            out.append(e)
+    return out

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from fogft.core.history import History
 from fogft.core.intent import Intent
 from fogft.core.spec import PoolSpec
 
@@ -15,33 +16,36 @@ HOUR_S = 3600.0
 SOON_S = 600.0
 
 
-def ends_at(spec: PoolSpec, intent: Intent, created_at: float) -> float | None:
-    """Return when a pool ends by itself, in seconds since the epoch; None for never.
+def begun_at(intent: Intent, created_at: float, history: History) -> float:
+    """Return when a pool's hours began, as the clock that may have been set since tells it.
 
     Args:
-        spec: The pool file.
         intent: Says whether its hours began anew after its creation.
         created_at: When it was created.
+        history: Knows when the clock was set.
     """
-    if spec.max_hours is None:
-        return None
-    return (intent.began_at or created_at) + spec.max_hours * HOUR_S
+    return history.by_clock(intent.began_at or created_at)
 
 
-def is_over(spec: PoolSpec, intent: Intent, created_at: float, now: float) -> bool:
+def ends_at(spec: PoolSpec, begun_at: float) -> float | None:
+    """Return when a pool ends by itself, in seconds since the epoch; None for never."""
+    return None if spec.max_hours is None else begun_at + spec.max_hours * HOUR_S
+
+
+def is_over(spec: PoolSpec, begun_at: float, now: float) -> bool:
     """Whether a pool's hours are used up."""
-    end = ends_at(spec, intent, created_at)
+    end = ends_at(spec, begun_at)
     return end is not None and now >= end
 
 
-def revived(spec: PoolSpec, intent: Intent, created_at: float, now: float) -> Intent:
+def revived(spec: PoolSpec, intent: Intent, begun_at: float, now: float) -> Intent:
     """Return the intent with which an `up` goes on: hours that are used up begin anew."""
-    return replace(intent, began_at=now) if is_over(spec, intent, created_at, now) else intent
+    return replace(intent, began_at=now) if is_over(spec, begun_at, now) else intent
 
 
-def notes(spec: PoolSpec, intent: Intent, created_at: float, now: float) -> list[str]:
+def notes(spec: PoolSpec, begun_at: float, now: float) -> list[str]:
     """Return what to say about the end: nothing, that it is near, or that it has come."""
-    end = ends_at(spec, intent, created_at)
+    end = ends_at(spec, begun_at)
     if end is None or now < end - SOON_S:
         return []
     if now < end:

@@ -221,6 +221,7 @@ class Observed:
         offers: What can be bought now, in any order.
         ending: Machines that were already asked to end, and may still be listed.
         rtt_s: ``cloud/region`` -> round trip from the robot in seconds, where it is known.
+        doubt_s: By so much the clock was set just now: the time of day goes without it.
     """
 
     now: float
@@ -229,6 +230,7 @@ class Observed:
     offers: tuple[Offer, ...] = ()
     ending: frozenset[ReplicaId] = frozenset()
     rtt_s: Mapping[str, float] = field(default_factory=dict)
+    doubt_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from fogft.core.history import Failure, History, Lasting
+from fogft.core.digest import Lasting
+from fogft.core.history import Failure, History
 
 BASE_S = 5.0
 LIMIT_S = 600.0

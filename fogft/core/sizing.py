@@ -62,7 +62,8 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
     """
     groups = groups_of(spec)
     usual, notes = Wish(spec.replicas, spec.max_usd_per_hour), []
-    now = usual if spec.schedule is None else wish(spec.schedule, observed.now, usual)
+    clock = observed.now - observed.doubt_s
+    now = usual if spec.schedule is None else wish(spec.schedule, clock, usual)
     if now.ahead:
         notes.append("launching ahead of the schedule's next window")
     total = now.replicas

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from fogft.cloud.port import Cloud
 from fogft.core.errors import CloudError, FogftError
+from fogft.core.history import MOVING
 from fogft.core.model import ReplicaId
 from fogft.pool.store import PoolStore
 
@@ -29,7 +30,7 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
         FogftError: There is no log of that slot (the hint lists those there are).
     """
     uid = store.identity().uid
-    launched = {(event.slot, event.generation) for event in store.recent(EVENTS)}
+    launched = {(e.slot, e.generation) for e in store.recent(EVENTS) if e.kind not in MOVING}
     with contextlib.suppress(CloudError):
         launched |= {(m.id.slot, m.id.generation) for m in cloud.machines(uid)}
     found = []

@@ -25,7 +25,7 @@ from fogft.cloud.port import Cloud
 from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.core.model import LinkReport
-from fogft.pool import configuration, farewell, measures, proxy_report, shutdown, status
+from fogft.pool import clocks, configuration, farewell, measures, proxy_report, shutdown, status
 from fogft.pool.announcing import ManagerRecords
 from fogft.pool.discovered import Discovery
 from fogft.pool.latency import Distances, Latencies
@@ -96,6 +96,7 @@ class Manager:
             cloud,
             store,
             clock=time.time,
+            reading=clocks.read,
             links=self._links,
             build_order=lambda *order: configuration.build_order(self._paths, *order),
             submit=on_thread,
@@ -198,7 +199,8 @@ class Manager:
             self._certified_at, self._revoked = now, revoked
         configuration.write_proxy_config(self._paths, self._identity, self._store.spec())
         intent = self._store.intent()
-        over = lifetime.is_over(self._store.spec(), intent, self._identity.created_at, time.time())
+        begun_at = lifetime.begun_at(intent, self._identity.created_at, self._store.history())
+        over = lifetime.is_over(self._store.spec(), begun_at, time.time())
         if not intent.stopping and not over:
             self._proxy.look()
 

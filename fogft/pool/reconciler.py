@@ -18,6 +18,7 @@ from typing import Any
 
 from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.core import lifetime
+from fogft.core.clock import Reading
 from fogft.core.errors import CloudError, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.core.groups import replica_hash, sales, task_at
 from fogft.core.health import judge
@@ -42,6 +43,7 @@ from fogft.pool import offers
 from fogft.pool.operations import Operations, Submit
 from fogft.pool.remembering import Remembering
 from fogft.pool.store import Identity, Store
+from fogft.pool.timekeeping import Timekeeping
 from fogft.pool.updating import Updating
 
 log = logging.getLogger(__name__)
@@ -96,6 +98,7 @@ class Reconciler:
         cloud: Where its machines run.
         store: What it remembers.
         clock: Seconds since the epoch.
+        reading: Tells in place of `clock` what it is, and whether it was set; see `core.clock`.
         links: ``links(pool_uid, now)``: a fresh report of the client proxy, or None.
         build_order: Makes the order of a planned launch, files included.
         submit: Runs a long cloud call, now or on another thread.
@@ -113,6 +116,7 @@ class Reconciler:
         store: Store,
         *,
         clock: Callable[[], float],
+        reading: Callable[[], Reading] | None = None,
         links: Links,
         build_order: BuildOrder = bare_order,
         submit: Submit = lambda run: run(),
@@ -127,7 +131,6 @@ class Reconciler:
         self._refreshing = cloud if isinstance(cloud, Refreshing) else None
         self._distances = distances
         self._store = store
-        self._clock = clock
         self._links = links
         self._build_order = build_order
         self._epoch = epoch
@@ -140,8 +143,9 @@ class Reconciler:
         self._silent = Silent()
         self._offers: tuple[Offer, ...] = ()
         self._offers_for: tuple[str, float] | None = None
-        self._remember = Remembering(store, clock)
         self._updating = Updating(store)
+        self._time = Timekeeping(store, self._updating, clock, reading)
+        self._remember = Remembering(store, lambda: self._time.now)
         self._membership: Membership | None = store.membership()
         self._published_for: tuple[Any, ...] | None = None  # what it follows from
 
@@ -153,6 +157,8 @@ class Reconciler:
         """
         identity, spec, intent = self._store.identity(), self._store.spec(), self._store.intent()
         history = self._store.history()
+        if self._time.look():
+            self._silent = Silent()
         self._settle_outcomes()
         observed, trouble = self._observe(identity, spec)
         asked, (spec, trial) = spec, self._updating.look(identity.uid, observed, history)
@@ -166,9 +172,9 @@ class Reconciler:
             self._remember.health(health, history, observed.now)
         if history.version != judged_at:  # it remembers more now: judge by all of it
             health = None
-        hours = (spec, intent, identity.created_at, observed.now)
-        trouble += lifetime.notes(*hours)
-        over = lifetime.is_over(*hours)
+        begun_at = lifetime.begun_at(intent, identity.created_at, history)
+        trouble += [*lifetime.notes(spec, begun_at, observed.now), *self._time.notes]
+        over = lifetime.is_over(spec, begun_at, observed.now)
         if over:
             intent = replace(intent, stopping=True)
         decided = plan(identity.uid, spec, intent, observed, history, health=health)
@@ -212,7 +218,7 @@ class Reconciler:
     def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[str]]:
         trouble: list[str] = []
         busy = self._operations.busy()  # before the cloud is asked: see `operations`
-        now = self._clock()
+        now = self._time.now
         machines: tuple[Machine, ...] | None = None
         try:
             listed = {m.id: m for m in self._cloud.machines(identity.uid)}
@@ -227,7 +233,7 @@ class Reconciler:
         ending = frozenset(id for id, order in busy.items() if order is None)
         links = self._links(identity.uid, now)
         rtt_s = self._distances(spec, sold, machines or (), links or ())
-        return Observed(now, machines, links, sold, ending, rtt_s), trouble
+        return Observed(now, machines, links, sold, ending, rtt_s, self._time.doubt_s), trouble
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:
         """Have the cloud asked about replicas that fell silent, where its list is from memory."""
@@ -329,7 +335,7 @@ class Reconciler:
             id=order.id,
             placement=order.placement,
             phase=MachinePhase.PROVISIONING,
-            launched_at=self._clock(),
+            launched_at=self._time.now,
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
         )

@@ -74,7 +74,8 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
         except FogftError:  # written by a version that knew other keys
             before, old_source = spec, ""
         after = intents.file_changed(store.intent(), before, spec)
-        store.write_intent(lifetime.revived(before, after, identity.created_at, time.time()))
+        begun_at = lifetime.begun_at(after, identity.created_at, store.history())
+        store.write_intent(lifetime.revived(before, after, begun_at, time.time()))
         if old_source != source:
             disk.write_whole(paths.spec, source)
         return Written(identity, created=False, changed=old_source != source)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from fogft.core.errors import StateError
-from fogft.core.history import Event, EventKind, History
+from fogft.core.history import MOVING, Event, EventKind, History
 from fogft.core.model import LinkReport, LinkState, Phase, ReplicaId
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
@@ -31,6 +31,8 @@ WORDS = {
     EventKind.ENDING: "ending",
     EventKind.ENDED: "ended",
     EventKind.GONE: "gone",
+    EventKind.CLOCK: "clock set",
+    EventKind.SLEPT: "slept",
 }
 
 
@@ -324,7 +326,7 @@ def _event(event: Event) -> dict[str, Any]:
     return {
         "at": event.at,
         "event": WORDS[event.kind],
-        "replica": f"{event.slot}.{event.generation}",
+        "replica": "" if event.kind in MOVING else f"{event.slot}.{event.generation}",
         "location": event.location,
         "detail": event.detail,
     }

@@ -57,6 +57,16 @@ class Updating:
         log.error("update_stopped file=%s reason=%r", trial.file, fault)
         return store.spec(), trial
 
+    def move(self, by_s: float) -> None:
+        """Let what is remembered be later: the clock was set.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        trial = self._store.trial()
+        if trial.began_at:
+            self._store.write_trial(replace(trial, began_at=trial.began_at + by_s))
+
     def settle(
         self,
         spec: PoolSpec,

@@ -12,6 +12,7 @@ from typing import Any
 
 from fogft.cloud.mock import MockCloud, zones
 from fogft.cloud.port import Launch
+from fogft.core.clock import Reading
 from fogft.core.model import LinkReport, LinkState, Machine, MachinePhase, ReplicaId
 from fogft.core.spec import PoolSpec, ServiceSpec
 from fogft.pool.reconciler import Reconciler, Tick
@@ -94,6 +95,7 @@ class World:
         self.told: set[ReplicaId] = set()  # of their end, by a notice that only they hear
         self.at_risk: set[ReplicaId] = set()  # their cloud recommends to move them
         self.broken: dict[str, str] = {}  # version -> what is wrong with it, see `wrong`
+        self.clock_ahead_s = 0.0  # of the robot: the cloud's is right
         self.uplink_down = False
         self.proxy_down = False
         self.echo_draining = self.random.random() < 0.5
@@ -118,6 +120,7 @@ class World:
             self.cloud,
             self.store,
             clock=lambda: self.now,
+            reading=lambda: Reading(self.now + self.clock_ahead_s, self.now, self.now),
             links=self.links,
             submit=self._queue.append if self.deferred else lambda run: run(),
             epoch=epoch,
@@ -200,6 +203,7 @@ class World:
 
     def links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...] | None:
         """Report as the client proxy does: of the published members, by what was heard."""
+        now = self.now  # its own clock is steady
         self._reported = {}
         if self.proxy_down:
             return None
