@@ -70,6 +70,20 @@ def test_machines_of_ours_are_found_in_every_region_and_nothing_else_is(account:
 
 
 @needs_moto
+def test_a_machine_that_shut_itself_down_is_found_as_long_as_its_disk_costs(account: None):
+    """One on demand is stopped by that, and not ended."""
+    import boto3
+
+    mine = launch("us-east-1", labels(replica(0)))
+    boto3.client("ec2", region_name="us-east-1").stop_instances(InstanceIds=[mine])
+    aws = Aws()
+    found = aws.instances(None, replica().pool_uid)
+    assert [i.key for i in found] == [mine]
+    aws.terminate(found)
+    assert not aws.instances(None, replica().pool_uid)
+
+
+@needs_moto
 def test_terminate_ends_these_and_is_repeatable(account: None):
     launch("us-east-1", labels(replica(0)))
     launch("us-east-1", labels(replica(1)))
