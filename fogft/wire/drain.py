@@ -99,6 +99,16 @@ class Drain:
         old = self._rate
         self._rate = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
 
+    def left_bytes(self, now: float, bytes_per_s: float) -> float:
+        """Return what of the outstanding bytes will not have arrived yet.
+
+        Args:
+            now: The clock.
+            bytes_per_s: At which they leave.
+        """
+        outstanding = self._last.outstanding if self._last is not None else 0
+        return max(0.0, outstanding - bytes_per_s * (now - self._last_at))
+
     def stuck_s(self, now: float) -> float:
         """Return since when bytes are outstanding of which none is acknowledged, in seconds."""
         return 0.0 if self._progress_at is None else max(0.0, now - self._progress_at)

@@ -42,6 +42,10 @@ class FlowWatch:
         """What it was lately seen to carry; None where that is not known."""
         return self._drain.carried.bytes_per_s(now)
 
+    def left_bytes(self, now: float, bytes_per_s: float) -> float:
+        """What is still on its way in the kernel; see `Drain.left_bytes`."""
+        return self._drain.left_bytes(now, bytes_per_s)
+
     def look(self, now: float, sending_for_s: float = 0.0) -> float:
         """Look once; return for how many of the last seconds large things moved."""
         connection = self._socket.borrow()
@@ -61,12 +65,16 @@ class FlowWatch:
         """Whether a queue stands still, as of the last look; see `Drain.stalled`."""
         return self._drain.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
 
-    def end_if_stuck(self) -> None:
-        """End the connection if a queue is left in it: Zenoh would wait ten seconds for that."""
+    def end_if_stuck(self, *, sending: bool = False) -> None:
+        """End the connection if a queue is left in it: Zenoh would wait ten seconds for that.
+
+        Args:
+            sending: More is being sent, whether or not the kernel has it already.
+        """
         connection = self._socket.borrow()
         if connection is None:
             return
         with connection:
             flow = sockets.flow(connection)
-            if flow is not None and flow.outstanding >= BULK_BYTES:
+            if sending or (flow is not None and flow.outstanding >= BULK_BYTES):
                 sockets.end(connection)

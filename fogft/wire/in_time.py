@@ -39,6 +39,7 @@ class InTime:
     Args:
         carries: Returns what the link carries, by the clock, in bytes a second; None where that is
             not known.
+        left: Returns how many bytes sent before have not arrived, by the clock and that rate.
         packs: Returns a service's compression; None where its payloads leave as they are.
 
     Attributes:
@@ -48,10 +49,12 @@ class InTime:
     def __init__(
         self,
         carries: Callable[[float], float | None],
+        left: Callable[[float, float], float],
         packs: Callable[[str], Compression | None],
     ) -> None:
         self.declined = 0
         self._carries = carries
+        self._left = left
         self._packs = packs
 
     def may_arrive(
@@ -72,7 +75,7 @@ class InTime:
         rate = self._carries(now)
         if rate is None:  # no thin link, or not known as one
             return True
-        size = sum(map(self._on_the_way, (attempt, *before())))
+        size = self._left(now, rate) + sum(map(self._on_the_way, (attempt, *before())))
         if enough(size, rate, remaining_s):
             return True
         self.declined += 1

@@ -161,7 +161,9 @@ class Connection:
         except BaseException:
             _close_aside(self._session, peer)
             raise
-        self._in_time = InTime(self.flow.carries_bytes_per_s, self._compression)
+        self._in_time = InTime(
+            self.flow.carries_bytes_per_s, self.flow.left_bytes, self._compression
+        )
         self._thread = threading.Thread(
             target=self._run, name=f"fogft-send-{peer.id.short}", daemon=True
         )
@@ -320,7 +322,8 @@ class Connection:
             self._large_since = self._sending_since = began
             self._sends_large()
         try:
-            self._publish(attempt, payload, remaining_s)
+            if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
+                self._publish(attempt, payload, remaining_s)
         finally:
             self._sending_since = None
             self._turns.give(turn)
@@ -470,7 +473,8 @@ class Connection:
     def close(self) -> None:
         """End it: what is open is lost. Returns at once; the sender thread closes the session."""
         ended = self.window.close()
-        self.flow.end_if_stuck()
+        # A large send that goes on is for nobody any more, and may block for minutes.
+        self.flow.end_if_stuck(sending=self._sending_since is not None)
         see_off(self._thread)
         self._queue.put(None)
         for attempt in ended:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -171,3 +172,26 @@ def test_a_robot_that_slept_suspects_nobody(
     wait_for(lambda: link.status().silent_for_s == 0)
     assert link.usable
     assert link.status().reopened == 0
+
+
+@pytest.mark.parametrize("settles", [False, True])
+def test_closing_in_the_midst_of_a_large_send_leaves_no_thread(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+    settles: bool,
+) -> None:
+    """More than all buffers hold, to a frozen replica: closed at once, and once it is stuck."""
+    replica = start_replica(settings=STUCK)
+    before = set(threading.enumerate())
+    link = dial(replica.endpoint, suspect_after_s=3600.0, settings=STUCK)
+    wait_for(lambda: link.usable)
+    replica.signal(signal.SIGSTOP)
+    assert link.offer(SERVICE, request_id(1), bytes(30_000_000), 600.0)
+    if settles:
+        connection = link._live
+        assert connection is not None
+        wait_for(lambda: connection._sending_since is not None)
+    link.close()
+    wait_for(lambda: owner.of(1))
+    wait_for(lambda: set(threading.enumerate()) <= before)

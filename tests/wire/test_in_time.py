@@ -106,6 +106,10 @@ class Request:
     service: str = SERVICE
 
 
+def none_left(now: float, bytes_per_s: float) -> float:
+    return 0.0
+
+
 def carry(
     requests: Iterable[Request], rate: float, *, known: float | None
 ) -> tuple[list[Request], list[Request]]:
@@ -116,7 +120,7 @@ def carry(
         rate: What the link carries, in bytes a second.
         known: What is known of that.
     """
-    judge = InTime(lambda now: known, lambda service: None)
+    judge = InTime(lambda now: known, none_left, lambda service: None)
     waiting: deque[Request] = deque()
     good: list[Request] = []
     wasted: list[Request] = []
@@ -191,12 +195,23 @@ def test_what_shrinks_is_judged_by_what_is_left_of_it(size, ratio):
     """And where that is not known yet, it is let through."""
     packs = Compression()
     packs.ratio = ratio
-    judge = InTime(lambda now: 1000.0, lambda service: packs)
+    judge = InTime(lambda now: 1000.0, none_left, lambda service: packs)
     needs_s = 0.0 if ratio is None else size * ratio / 1000.0
     assert judge.may_arrive(Request(size, 0.0, 0.0), needs_s + 1e-6, 0.0)
     if needs_s > 1e-6:
         assert not judge.may_arrive(Request(size, 0.0, 0.0), needs_s - 1e-6, 0.0)
         assert judge.declined == 1
+
+
+@given(rates, st.integers(0, 10**7), st.integers(1, 10**6), st.floats(0.0, 5.0))
+def test_what_is_still_under_way_leaves_first(rate, outstanding, size, age_s):
+    """As much of it as has not left since it was looked at."""
+    drain = Drain()
+    drain.look(Flow(0, 0, outstanding), 50.0)
+    judge = InTime(lambda now: rate, drain.left_bytes, lambda service: None)
+    needs_s = max(0.0, outstanding / rate - age_s) + size / rate
+    assert judge.may_arrive(Request(size, 0.0, 0.0), needs_s * 1.001 + 1e-6, 50.0 + age_s)
+    assert not judge.may_arrive(Request(size, 0.0, 0.0), needs_s * 0.999 - 1e-6, 50.0 + age_s)
 
 
 def test_a_request_that_cannot_arrive_is_declined_while_the_link_is_busy(
