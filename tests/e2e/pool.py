@@ -154,7 +154,7 @@ class Machine:
         )  # fmt: skip
         assert joined.returncode == 0, joined.stderr
         self.config = Path(joined.stdout.strip())
-        self.command = self.config.stem if role != "robot" else "proxy"
+        self.command = {"robot": "proxy", "replica": "serve"}.get(role, role)
         self.log = self.config.with_suffix(".log")
         self.process: subprocess.Popen[bytes] | None = None
 
