@@ -238,3 +238,46 @@ def test_regions_that_cannot_be_measured_are_told(pool, tmp_path, capsys):
     assert "response      11 ms" in captured.out
     assert main.run(["plan", str(pool), "--prices", prices, "--offline"]) == 0
     assert "measur" not in capsys.readouterr().err
+
+
+GROUPS = """
+name: planner
+resources: {cpus: 8+, use_spot: true}
+run: exec true
+fogft:
+  services:
+    - {name: /plan, type: nav_msgs/srv/GetPlan, replicas: 3}
+    - {name: /map, type: nav_msgs/srv/GetMap}
+  groups:
+    - {name: steady, replicas: 1, resources: {cpus: 2+, use_spot: false}}
+    - {name: fast, replicas: 1, resources: {cpus: 8+, use_spot: true}}
+"""
+
+
+def test_it_is_told_which_replicas_carry_which_services(pool, capsys):
+    """Each group on machines of its own kind, and one more for the critical service alone."""
+    pool.write_text(GROUPS)
+    assert main.run(["plan", str(pool)]) == 0
+    out = capsys.readouterr().out
+    assert "slot 0 (steady) carries /plan, /map" in out
+    assert "slot 100 (fast) carries /plan, /map" in out
+    assert re.search(r"slot 900 .*carries /plan\n", out)
+    assert main.run(["plan", str(pool), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)["replicas"]
+    assert [(one["slot"], one["spot"]) for one in shown] == [(0, False), (100, True), (900, True)]
+
+
+def test_distances_are_estimated_where_nothing_can_be_measured(pool, tmp_path, capsys):
+    """Along the great circle from where the robot is; what the file says goes before."""
+    place = "{robot_at: [37.87, -122.27], rtt_s: {aws/us-east-1: 0.2}}"
+    pool.write_text(POOL.replace(POOL.split("placement: ")[1].strip(), place))
+    regions = ("us-west-1", "us-east-1", "eu-central-1")
+    prices = table(tmp_path, *(f"aws,{r},{r}a,m5.2xlarge,8,32,0.5,0.3,2026-01-01" for r in regions))
+    assert main.run(["plan", str(pool), "--prices", prices, "--offline"]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"us-west-1a .* table, \d+ days old +\d+ ms", told)
+    assert "(estimated, pool file)" in told
+    assert main.run(["plan", str(pool), "--prices", prices, "--offline", "--json"]) == 0
+    offers = {o["region"]: o for o in json.loads(capsys.readouterr().out)["offers"]}
+    assert [offers[r]["rtt_source"] for r in regions] == ["estimated", "pool file", "estimated"]
+    assert offers["us-west-1"]["rtt_s"] < 0.03 < 0.1 < offers["eu-central-1"]["rtt_s"] < 0.3
