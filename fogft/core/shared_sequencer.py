@@ -51,8 +51,8 @@ class SharedSequencer(OrderedTerm):
     Args:
         epoch: This term, above every earlier one.
         mark: The position of the last answer that this robot returned.
-        founders: With so many replicas a service may begin that never began; with so many
-            living members a dead one is let go.
+        founders: With so many replicas a service may begin that never began; of more members
+            than these, one that is gone is let go.
         may_found: Whether, as far as this robot knows, the service never began.
         log_entries: Requests kept at most.
         log_bytes: Their bytes at most.
@@ -213,7 +213,7 @@ class SharedSequencer(OrderedTerm):
             self.members, self._members_at = members, index
 
     def _see_to_members(self, now: float) -> None:
-        """Take in who has caught up, and let go who is gone: one, then wait for a majority."""
+        """Let go who is gone, and take in who has caught up: one, then wait for a majority."""
         base = self.base
         if base is None or self.committed < max(self._members_at, base.index):
             return
@@ -223,16 +223,15 @@ class SharedSequencer(OrderedTerm):
             for r in self.joined
             if self._counts(r) and r not in self._leaving
         }
+        gone = [member for member in self.members if member not in here]
+        self._gone_since = {m: self._gone_since.get(m, now) for m in gone}
+        for member, since in self._gone_since.items():
+            if now - since >= GONE_AFTER_S and len(self.members) > self._founders:
+                self._change_members(tuple(m for m in self.members if m != member))
+                return
         for member in joined.keys() - set(self.members):
             if self._acks.get(member, -1) >= self.committed:
                 self._change_members((*self.members, member))
-                return
-        gone = [member for member in self.members if member not in here]
-        self._gone_since = {m: self._gone_since.get(m, now) for m in gone}
-        alive = len(joined.keys() & set(self.members))
-        for member, since in self._gone_since.items():
-            if now - since >= GONE_AFTER_S and alive >= self._founders:
-                self._change_members(tuple(m for m in self.members if m != member))
                 return
 
     # -- what robots hand in --------------------------------------------------------------

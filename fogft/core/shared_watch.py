@@ -9,7 +9,7 @@ Owns: what was seen, and when it is time to claim. Not here: claiming (`shared_r
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from fogft.core.shared_orders import Standing
@@ -87,7 +87,7 @@ class Watch:
             founders: How many replicas may begin a service without members; None for never.
         """
         fresh = self._fresh(now)
-        members = latest_members(seen.standing for seen in fresh.values())
+        known = _latest([seen.standing for seen in fresh.values()])
         first = not any(seen.standing.promised for seen in fresh.values())
         wait_s = (FIRST_SILENCE_S if first else SILENCE_S) * (1 + self._patience)
         silent = {
@@ -95,8 +95,8 @@ class Watch:
             for seen in fresh.values()
             if now - max(seen.changed_at, self._quiet_from) >= wait_s
         }
-        if members:
-            return 2 * len(silent & set(members)) > len(members)
+        if known:
+            return _are_most(silent, known)
         return founders is not None and len(silent) == len(replicas) >= founders
 
     def _fresh(self, now: float) -> dict[int, _Seen]:
@@ -116,13 +116,13 @@ class Watch:
             for seen in self._seen.values()
             if seen.changed_at + SILENCE_S > seen.seen_at and seen.standing.joined
         ]
-        members = latest_members(living)
-        return 2 * len({s.member for s in living} & set(members)) > len(members)
+        return _are_most({s.member for s in living}, _latest(living))
 
     @property
     def members(self) -> int:
         """How many members the service has, as far as is seen."""
-        return len(latest_members(seen.standing for seen in self._seen.values()))
+        known = _latest([seen.standing for seen in self._seen.values()])
+        return max(map(len, known), default=0)
 
     @property
     def sequencer(self) -> str:
@@ -131,10 +131,16 @@ class Watch:
         return max(standings, key=lambda s: s.promised).robot if standings else ""
 
 
-def latest_members(standings: Iterable[Standing]) -> tuple[int, ...]:
-    """Return the members as those know them who obey the latest term."""
+def _latest(standings: Collection[Standing]) -> list[tuple[int, ...]]:
+    """Return the members as those know them who obey the latest term: one may know of a change."""
     knowing = [s for s in standings if s.members]
-    return max(knowing, key=lambda s: s.promised).members if knowing else ()
+    latest = max((s.promised for s in knowing), default=0)
+    return [s.members for s in knowing if s.promised == latest]
+
+
+def _are_most(some: set[int], known: list[tuple[int, ...]]) -> bool:
+    """Whether these are a majority of the members, by what any of those says who know them."""
+    return any(2 * len(some & set(members)) > len(members) for members in known)
 
 
 def _heard(standing: Standing) -> tuple[int, int, int]:

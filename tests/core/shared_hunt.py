@@ -12,7 +12,7 @@ import random
 import sys
 from collections import Counter
 
-from fogft.core import catching_up, lag
+from fogft.core import catching_up, lag, shared_sequencer
 from tests.core.shared_world import SharedWorld
 from tests.core.test_ordering_simulated import ask_counter, ask_key_value
 from tests.core.test_shared_simulated import ALL_KINDS, check, drive
@@ -48,7 +48,7 @@ def run(seed: int, seen: Counter[str]) -> None:
 def main(first: int, count: int, *narrow: str) -> int:
     """Return how many runs went wrong."""
     if narrow:
-        lag.LIMIT, catching_up.WINDOW = 3, 2
+        lag.LIMIT, catching_up.WINDOW, shared_sequencer.GONE_AFTER_S = 3, 2, 0.2
     seen: Counter[str] = Counter()
     wrong = 0
     for seed in range(first, first + count):

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from fogft.core import catching_up, lag
+from fogft.core import catching_up, lag, shared_sequencer
 from fogft.core.shared_places import PLACE_BYTES, PLACE_LIMIT, Places
 from fogft.core.shared_robot import AHEAD, SharedRobot
 from tests.core.shared_world import SharedWorld
@@ -80,10 +80,11 @@ def check(world: SharedWorld, step, start) -> None:
 
 @pytest.fixture(params=["wide", "narrow"])
 def limits(request, monkeypatch) -> None:
-    """With narrow limits replicas fall too far behind all the time."""
+    """With narrow limits replicas fall too far behind, and are let go, all the time."""
     if request.param == "narrow":
         monkeypatch.setattr(lag, "LIMIT", 3)
         monkeypatch.setattr(catching_up, "WINDOW", 2)
+        monkeypatch.setattr(shared_sequencer, "GONE_AFTER_S", 0.2)
 
 
 @pytest.mark.usefixtures("limits")
