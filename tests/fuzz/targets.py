@@ -15,7 +15,16 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from fogft.core import holders, membership, ordering, records, rmw_zenoh, roster
+from fogft.core import (
+    holders,
+    membership,
+    ordering,
+    records,
+    rmw_zenoh,
+    roster,
+    shared_book,
+    shared_orders,
+)
 from fogft.core.definitions import Definition
 from fogft.core.errors import CredentialError, StateError
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
@@ -149,6 +158,15 @@ def _order(data: bytes) -> None:
         ordering.decode_promise,
         ordering.decode_index,
         ordering.decode_snapshot,
+        shared_orders.decode_entry,
+        shared_orders.decode_vote,
+        shared_orders.decode_standing,
+        shared_orders.decode_handed,
+        shared_orders.decode_joined,
+        shared_orders.decode_applied,
+        shared_orders.decode_listen,
+        shared_orders.decode_answer,
+        shared_book.decode,
     ):
         with contextlib.suppress(ordering.OrderError):
             read(data)
