@@ -57,6 +57,8 @@ _AT_ONCE = zenoh.ConsolidationMode.NONE
 _QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
 # A `put` that took this long was stuck behind a full queue: see whether the session survived.
 _STUCK_S = 0.1
+# What Zenoh itself may hold of a large request once its sending has returned: two batches.
+_ZENOH_HOLDS_BYTES = 2 * 65535
 # How long the keeper looks often after the last large request began to leave.
 _WATCH_S = 5.0
 # For as long as the connection: Zenoh ends the query when the session closes.
@@ -122,6 +124,7 @@ class Connection:
         self._on_large = large
         self._large_since = float("-inf")
         self._sending_since: float | None = None
+        self._held_by_zenoh = (0.0, 0)  # since when, so many bytes at most
         self.watched = False
         self._answered = answered
         self._late = late
@@ -161,9 +164,7 @@ class Connection:
         except BaseException:
             _close_aside(self._session, peer)
             raise
-        self._in_time = InTime(
-            self.flow.carries_bytes_per_s, self.flow.left_bytes, self._compression
-        )
+        self._in_time = InTime(self.flow.carries_bytes_per_s, self._left_bytes, self._compression)
         self._thread = threading.Thread(
             target=self._run, name=f"fogft-send-{peer.id.short}", daemon=True
         )
@@ -230,6 +231,12 @@ class Connection:
         if self._queue.overtakes(service):
             return []
         return [one for one in self.window.attempts() if one.payload is not None]
+
+    def _left_bytes(self, now: float, bytes_per_s: float) -> float:
+        """Return what was sent and has not arrived: in the kernel, and in Zenoh above it."""
+        since, held = self._held_by_zenoh
+        left = max(0.0, held - bytes_per_s * (now - since))
+        return left + self.flow.left_bytes(now, bytes_per_s)
 
     def _compression(self, service: str) -> Compression | None:
         return self._compressions.get(service) if self.packs else None
@@ -327,6 +334,8 @@ class Connection:
         finally:
             self._sending_since = None
             self._turns.give(turn)
+        if large:
+            self._held_by_zenoh = time.monotonic(), min(attempt.size, _ZENOH_HOLDS_BYTES)
         if time.monotonic() - began > _STUCK_S and not self.alive():
             self._lose("it took nothing more, and Zenoh gave the session up")
 
