@@ -187,6 +187,7 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
             times += [rest.until, *_shortened(history, supply, rest, now)]
     if restless:
         times += [rest.until for rest in disappointing(history, now).values()]
+    if waits or restless:  # a stand-in does not return to where one was just lost
         for location, until in avoided(history, now).items():
             forgotten = (at + AVOID_MEMORY_S for at in history.losses[location])
             times += [until, *(at for at in forgotten if at < until)]

@@ -7,13 +7,16 @@ from hypothesis import strategies as st
 
 from fogft.core.history import Event, EventKind, Failure, History
 from fogft.core.quarantine import (
+    AVOID_S,
     BASE_S,
+    EAGER_S,
     EVERYWHERE,
     FORGIVE_S,
     LIMIT_S,
     avoided,
     backoff,
     disappointing,
+    next_change,
     resting,
 )
 
@@ -123,3 +126,26 @@ def test_what_is_remembered_of_places_is_what_follows_from_all_events(happenings
         anew = History(events)
         for question in (resting, disappointing, avoided):
             assert question(asked, now) == question(anew, now)
+
+
+def test_who_waits_looks_again_when_a_place_is_no_longer_avoided() -> None:
+    """A stand-in returns there as soon as it may; who waits for nothing does not look at all."""
+    lost = History(
+        [
+            Event(0, EventKind.LAUNCH, 0, 1, PLACE),
+            Event(10, EventKind.READY, 0, 1),
+            Event(1000, EventKind.GONE, 0, 1),
+        ]
+    )
+    assert next_change(lost, 1001, waits=True, restless=False) == 1000 + AVOID_S
+    assert next_change(lost, 1001, waits=False, restless=True) == 1000 + AVOID_S
+    assert next_change(lost, 1001, waits=False, restless=False) == float("inf")
+
+
+def test_who_waits_looks_again_when_a_rest_ends_or_all_rest_for_long_enough() -> None:
+    """Whichever comes first: with eight refusals in a row it is the minute."""
+    events = [e for n in range(1, 9) for e in refused(n, n)]
+    few, many = History(events[:2]), History(events)
+    assert next_change(few, 2, waits=True, restless=False) == 1 + BASE_S
+    assert next_change(many, 9, waits=True, restless=False) == 8 + EAGER_S
+    assert next_change(many, 9, waits=False, restless=True) == 8 + FORGIVE_S

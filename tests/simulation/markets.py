@@ -47,7 +47,9 @@ def any_scenario(seed: int, days: float = 0.02) -> Scenario:
     )
     pool = spec(
         chance.randrange(1, 6),
-        on_demand=among([OnDemandSpec(), OnDemandSpec(base=1), OnDemandSpec(among([0, 1]), True)]),
+        on_demand=among(
+            [OnDemandSpec(), OnDemandSpec(1), OnDemandSpec(0, True), OnDemandSpec(1, True)]
+        ),
         schedule=among([None, ScheduleSpec("UTC", (window,), prelaunch_s=among([0.0, 600.0]))]),
         max_usd_per_hour=among([None, None, 0.25, 0.5]),
         max_surge=among([0, 1, 2]),
