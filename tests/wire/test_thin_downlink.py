@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import pytest
 
+from fogft.wire.config import LinkSettings
 from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_link import ZenohLink
@@ -32,6 +34,11 @@ from tests.wire.wire_pool import (
 ROBOT, REPLICA = "10.84.1.1", "10.84.1.2"
 MBIT, LONG_S = 1.0, 90.0
 NOISE, TEXT = b"noise:400000", b"text:1000000"  # 3.2 s and 8 s at 1 Mbit/s
+# A busy machine is no silence.
+PATIENT: dict[str, Any] = {
+    "suspect_after_s": LONG_S,
+    "settings": LinkSettings(stall_after_s=LONG_S, stuck_after_s=LONG_S),
+}
 needs_namespaces = pytest.mark.skipif(bool(why_not()), reason=why_not() or "they can be made")
 
 
@@ -82,7 +89,7 @@ def test_through_a_relay(
     start_replica: Callable[..., ReplicaProcess], authority: Authority, owner: Owner
 ) -> None:
     relay = ThinRelay(start_replica().endpoint, MBIT * 125_000)
-    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
     try:
         check(Asking(dialer, relay.endpoint, owner, lambda: relay.passed_bytes))
     finally:
@@ -94,7 +101,7 @@ def test_a_service_that_wants_none_gets_none(
     start_replica: Callable[..., ReplicaProcess], authority: Authority, owner: Owner
 ) -> None:
     relay = ThinRelay(start_replica().endpoint, 4 * MBIT * 125_000)
-    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
     dialer.adopt(Ways(plain=frozenset({SERVICE})))
     try:
         asking = Asking(dialer, relay.endpoint, owner, lambda: relay.passed_bytes)
@@ -113,7 +120,7 @@ def test_over_a_thin_cable(authority: Authority, net: Namespaces, owner: Owner) 
         replica = ReplicaProcess(authority.replica(), endpoint=f"{REPLICA}:7447")
     try:
         with inside(robot_at):
-            dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
+            dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
             try:
                 sent = partial(net.sent_bytes, replica_at, far)
                 check(Asking(dialer, replica.endpoint, owner, sent))

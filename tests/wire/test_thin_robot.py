@@ -79,7 +79,9 @@ def compare(
     with contextlib.ExitStack() as stack:
 
         def dial(name: str, endpoint: str, to: Owner) -> ZenohLink:
-            dialer = ZenohDialer(authority.robot(name), robot=name, pool_uid=POOL_UID)
+            dialer = ZenohDialer(
+                authority.robot(name), robot=name, pool_uid=POOL_UID, suspect_after_s=30.0
+            )  # what a busy machine does is not judged
             stack.callback(dialer.close)
             return dialer.dial(peer(endpoint), keys(0), to)
 
