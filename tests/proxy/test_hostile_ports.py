@@ -28,7 +28,7 @@ from fogft.wire.signing import Signer
 from tests.proxy.gateway_pool import GatewayPool
 from tests.wire import hostile
 from tests.wire.rendezvous_pool import free_port, manager_files
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, Files, hears, wait_for
+from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, Files, hears, knows, wait_for
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -156,6 +156,7 @@ def test_frames_that_cannot_be_read_at_a_gateways_port(scene):
     ran = scene.pool.ran()
     with scene.unchanged(), scene.session(scene.authority.robot("eve")) as session:
         hears(session, key)
+        knows(session, SLOT)
         with scene.counts("malformed", len(messages)):
             _ = [send(session, payload, attachment) for send, payload, attachment in messages]
         assert scene.pool.ran() == ran
@@ -177,6 +178,7 @@ def test_a_replayed_membership_at_a_gateways_port(scene):
     key, held = names.records_key(POOL_UID, SLOT), []
 
     with scene.unchanged(), scene.session(eve) as session:
+        knows(session, SLOT)
 
         def bring(payload: bytes) -> None:
             greeting = scene.greeting(eve)

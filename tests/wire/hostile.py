@@ -88,7 +88,10 @@ Send = Callable[[zenoh.Session, bytes, "bytes | None"], object]
 
 
 def _published(key: str) -> Send:
-    return lambda session, payload, attachment: session.put(key, payload, attachment=attachment)
+    block = zenoh.CongestionControl.BLOCK  # else a busy machine would lose some
+    return lambda session, payload, attachment: session.put(
+        key, payload, attachment=attachment, congestion_control=block
+    )
 
 
 def _asked(key: str) -> Send:

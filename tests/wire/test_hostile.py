@@ -27,6 +27,7 @@ from tests.wire.wire_pool import (
     ReplicaProcess,
     hears,
     keys,
+    knows,
     peer,
     request_id,
     wait_for,
@@ -162,6 +163,7 @@ def test_frames_that_cannot_be_read_are_counted_one_by_one(
     messages = list(hostile.messages(0, keys(0)[SERVICE]))
     try:
         hears(session, keys(0)[SERVICE])
+        knows(session, 0)
         for sent, (send, payload, attachment) in enumerate(messages, 1):
             _ = send(session, payload, attachment)
             wait_for(lambda sent=sent: replica.count("malformed") == sent)  # type: ignore[misc]
@@ -197,6 +199,7 @@ def test_who_did_not_greet_is_refused_and_counted(
             assert replica.count("not_admitted") == sent
         request = frame.encode_request(request_id(1), 5.0, frame.origin("ada", bytes(8)))
         hears(session, keys(0)[SERVICE])
+        knows(session, 0)
         session.put(keys(0)[SERVICE], b"x", attachment=request)
         wait_for(lambda: replica.count("not_admitted") == len(tries) + 1)
     finally:
