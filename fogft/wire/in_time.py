@@ -13,7 +13,7 @@ Owns: the judgement. Not here: rates, the bounds by bytes and by count (`link_wi
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
 from fogft.wire.compression import Compression
@@ -37,6 +37,7 @@ class InTime:
     """Of one connection. Any thread.
 
     Args:
+        timed: Services whose requests are of no use after their time.
         carries: Returns what the link carries, by the clock, in bytes a second; None where that is
             not known.
         left: Returns how many bytes sent before have not arrived, by the clock and that rate.
@@ -48,11 +49,13 @@ class InTime:
 
     def __init__(
         self,
+        timed: Collection[str],
         carries: Callable[[float], float | None],
         left: Callable[[float, float], float],
         packs: Callable[[str], Compression | None],
     ) -> None:
         self.declined = 0
+        self._timed = timed
         self._carries = carries
         self._left = left
         self._packs = packs
@@ -73,7 +76,7 @@ class InTime:
             before: Returns what leaves first.
         """
         rate = self._carries(now)
-        if rate is None:  # no thin link, or not known as one
+        if rate is None or attempt.service not in self._timed:
             return True
         size = self._left(now, rate) + sum(map(self._on_the_way, (attempt, *before())))
         if enough(size, rate, remaining_s):

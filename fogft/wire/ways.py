@@ -16,10 +16,13 @@ class Ways:
     Attributes:
         latest: Those of which the newest request goes first.
         plain: Those whose payloads are never compressed.
+        timed: Those whose requests nobody wants after their time. Of others, such as topics and the
+            orders of a stateful service, it only says when they are sent again.
     """
 
     latest: frozenset[str] = frozenset()
     plain: frozenset[str] = frozenset()
+    timed: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, services: Iterable[ServiceSpec]) -> Ways:
@@ -28,6 +31,7 @@ class Ways:
         return cls(
             frozenset(s.name for s in known if s.freshness is Freshness.LATEST),
             frozenset(s.name for s in known if s.compression is Compression.OFF),
+            frozenset(s.name for s in known if s.state is None),
         )
 
 

@@ -138,6 +138,7 @@ class Connection:
         greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
         self._queue = SendQueue(ways.latest)
+        self._timed = ways.timed
         self._compressions = {name: Compression() for name in keys.keys() - ways.plain}
         self.packs = False  # whether the replica reads what is compressed
         self.packs_answers = False  # whether it finds out by itself when to compress answers
@@ -164,7 +165,9 @@ class Connection:
         except BaseException:
             _close_aside(self._session, peer)
             raise
-        self._in_time = InTime(self.flow.carries_bytes_per_s, self._left_bytes, self._compression)
+        self._in_time = InTime(
+            self._timed, self.flow.carries_bytes_per_s, self._left_bytes, self._compression
+        )
         self._thread = threading.Thread(
             target=self._run, name=f"fogft-send-{peer.id.short}", daemon=True
         )

@@ -12,6 +12,7 @@ from pathlib import Path
 from unittest import mock
 
 from fogft.wire.in_time import InTime
+from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
 from tests.wire.thin_relay import ThinRelay
 from tests.wire.wire_pool import (
@@ -39,6 +40,7 @@ def answered_in_time() -> int:
         relay = ThinRelay(replica.endpoint, BYTES_PER_S)
         dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
         try:
+            dialer.adopt(Ways(timed=frozenset({SERVICE})))
             link = dialer.dial(peer(relay.endpoint), keys(0), owner)
             wait_for(lambda: link.usable)
             deadlines: list[tuple[float, int]] = []

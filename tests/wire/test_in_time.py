@@ -11,6 +11,8 @@ from itertools import count
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.core.spec import ServiceSpec
+from fogft.core.spec_state import StateService, StateSpec
 from fogft.wire.carried import KEPT_S, Carried
 from fogft.wire.compression import Compression
 from fogft.wire.config import LinkSettings
@@ -120,7 +122,7 @@ def carry(
         rate: What the link carries, in bytes a second.
         known: What is known of that.
     """
-    judge = InTime(lambda now: known, none_left, lambda service: None)
+    judge = InTime({SERVICE}, lambda now: known, none_left, lambda service: None)
     waiting: deque[Request] = deque()
     good: list[Request] = []
     wasted: list[Request] = []
@@ -195,7 +197,7 @@ def test_what_shrinks_is_judged_by_what_is_left_of_it(size, ratio):
     """And where that is not known yet, it is let through."""
     packs = Compression()
     packs.ratio = ratio
-    judge = InTime(lambda now: 1000.0, none_left, lambda service: packs)
+    judge = InTime({SERVICE}, lambda now: 1000.0, none_left, lambda service: packs)
     needs_s = 0.0 if ratio is None else size * ratio / 1000.0
     assert judge.may_arrive(Request(size, 0.0, 0.0), needs_s + 1e-6, 0.0)
     if needs_s > 1e-6:
@@ -203,12 +205,22 @@ def test_what_shrinks_is_judged_by_what_is_left_of_it(size, ratio):
         assert judge.declined == 1
 
 
+def test_what_is_wanted_whenever_it_comes_is_sent():
+    """The orders of a stateful service, and topics: their time only says when to send again."""
+    state = StateSpec(StateService("/get", "t/srv/G", "f"), StateService("/set", "t/srv/P", "f"))
+    services = [ServiceSpec("/plain", "t/srv/T"), ServiceSpec("/kept", "t/srv/T", state=state)]
+    judge = InTime(Ways.of(services).timed, lambda now: 1000.0, none_left, lambda service: None)
+    assert not judge.may_arrive(Request(5000, 0.0, 1.0, "/plain"), 1.0, 0.0)
+    assert judge.may_arrive(Request(5000, 0.0, 1.0, "/kept"), 1.0, 0.0)
+    assert judge.may_arrive(Request(5000, 0.0, 1.0, "topic /map"), 1.0, 0.0)
+
+
 @given(rates, st.integers(0, 10**7), st.integers(1, 10**6), st.floats(0.0, 5.0))
 def test_what_is_still_under_way_leaves_first(rate, outstanding, size, age_s):
     """As much of it as has not left since it was looked at."""
     drain = Drain()
     drain.look(Flow(0, 0, outstanding), 50.0)
-    judge = InTime(lambda now: rate, drain.left_bytes, lambda service: None)
+    judge = InTime({SERVICE}, lambda now: rate, drain.left_bytes, lambda service: None)
     needs_s = max(0.0, outstanding / rate - age_s) + size / rate
     assert judge.may_arrive(Request(size, 0.0, 0.0), needs_s * 1.001 + 1e-6, 50.0 + age_s)
     assert not judge.may_arrive(Request(size, 0.0, 0.0), needs_s * 0.999 - 1e-6, 50.0 + age_s)
@@ -223,7 +235,7 @@ def test_a_request_that_cannot_arrive_is_declined_while_the_link_is_busy(
         authority.robot(), robot="robot", pool_uid=POOL_UID, suspect_after_s=LONG_S,
         settings=LinkSettings(stall_after_s=LONG_S),
     )  # fmt: skip
-    dialer.adopt(Ways(plain=frozenset({SERVICE})))
+    dialer.adopt(Ways(plain=frozenset({SERVICE}), timed=frozenset({SERVICE})))
     payload = os.urandom(500_000)
     numbers = count(100)
 
