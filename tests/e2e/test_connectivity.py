@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from tests.e2e.pool import Machine, Pool
 from tests.wire.rendezvous_pool import free_port
 
-pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(600)]
 
 GATEWAYS = ("east", "west")
 
@@ -45,8 +46,13 @@ def report(pool: Pool) -> dict[str, Any]:
         return {}
 
 
-def up_of(pool: Pool, what: str) -> list[dict[str, Any]]:
-    return [one for one in report(pool).get(what, []) if one["state"] == "up" and one["ready"]]
+def up_of(seen: dict[str, Any], what: str) -> list[dict[str, Any]]:
+    return [one for one in seen.get(what, []) if one["state"] == "up" and one["ready"]]
+
+
+def ready(seen: dict[str, Any]) -> set[int]:
+    """Return the slots that a robot or a gateway could ask."""
+    return {link["slot"] for link in up_of(seen, "links")}
 
 
 def phases(status: dict[str, Any]) -> dict[int, str]:
@@ -65,6 +71,7 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
     Who is where is learned from the rendezvous alone: the pool file names no replica's address,
     and no replica has one. One more replica joins by hand, on a machine of its own.
     """
+    wait = partial(pool.wait, limit_s=180)
     meeting, at = local(), {name: local() for name in GATEWAYS}
     listed = ", ".join(f"{{name: {name}, endpoint: '{at[name]}'}}" for name in GATEWAYS)
     pool.write(
@@ -77,10 +84,11 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
         env=pool.environ, cwd=pool.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True,
     )  # fmt: skip
-    pool.wait((pool.folder / "home" / "pools" / "e2e" / "status.json").exists)
+    wait((pool.folder / "home" / "pools" / "e2e" / "status.json").exists)
     machines["meet"] = Machine(pool, "rendezvous", "meet")
     machines["meet"].configure(listen=meeting)
     machines["meet"].start()
+    wait((machines["meet"].config.parent / "status.json").exists)  # who joins asks it
     for name in GATEWAYS:
         door = local()
         machines[name] = Machine(pool, "gateway", name)
@@ -89,20 +97,21 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
     machines["lab"] = Machine(pool, "replica", "1000", ros_domains())
     machines["lab"].configure(listen=local())
     machines["lab"].start()
-    said = up.communicate(timeout=120)[0]
+    said = up.communicate(timeout=300)[0]
     assert up.returncode == 0, said
-    pool.wait(lambda: len(up_of(pool, "gateways")) == len(GATEWAYS))
-    pool.wait(lambda: {link["slot"] for link in up_of(pool, "links")} == {0, 1, 1000})
+    wait(lambda: len(up_of(report(pool), "gateways")) == len(GATEWAYS))
+    wait(lambda: all(ready(machines[name].report()) == {0, 1, 1000} for name in GATEWAYS))
+    wait(lambda: ready(report(pool)) == {0, 1, 1000})
     client = pool.client(120, 25)
-    pool.wait(lambda: sum(passed(machines[name]) for name in GATEWAYS) > 25)
+    wait(lambda: sum(passed(machines[name]) for name in GATEWAYS) > 25)
     used = max(GATEWAYS, key=lambda name: passed(machines[name]))
     (other,) = set(GATEWAYS) - {used}
     before = passed(machines[other])
     machines[used].kill()
-    pool.wait(lambda: passed(machines[other]) > before + 25)
-    pool.wait(lambda: {link["through"] for link in up_of(pool, "links")} == {other})
-    tree = pool.wait(lambda: (tree := drawn(pool)).count(" up ") == 1 and tree).splitlines()
-    pool.wait(lambda: phases(pool.status()) == {0: "ready", 1: "ready", 1000: "ready"})
+    wait(lambda: passed(machines[other]) > before + 25)
+    wait(lambda: {link["through"] for link in up_of(report(pool), "links")} == {other})
+    tree = wait(lambda: (tree := drawn(pool)).count(" up ") == 1 and tree).splitlines()
+    wait(lambda: phases(pool.status()) == {0: "ready", 1: "ready", 1000: "ready"})
     result = client.finish()
     assert result["requests"] > 50
     assert result["failed"] == result["wrong"] == result["twice"] == 0, result

@@ -22,9 +22,9 @@ from tests.proxy.gateway_pool import GatewayPool, Process, ServerProxy
 from tests.wire.rendezvous_pool import Party, Rendezvous, free_port, manager_files
 from tests.wire.wire_pool import POOL_UID, wait_for
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(480)
 
-LIMIT_S = 90.0
+LIMIT_S = 150.0
 ID = ReplicaId(POOL_UID, 0, 1)
 EVE = names.robot_certificate_name(POOL_UID, "eve")
 
