@@ -6,9 +6,12 @@ import random
 
 import pytest
 
-from fogft.core import catching_up, lag, shared_sequencer
+from fogft.core import catching_up, lag, ordering, shared_sequencer
+from fogft.core.ordering import START, Op
+from fogft.core.shared_orders import Vote
 from fogft.core.shared_places import PLACE_BYTES, PLACE_LIMIT, Places
 from fogft.core.shared_robot import AHEAD, SharedRobot
+from fogft.core.shared_sequencer import SharedSequencer
 from tests.core.shared_world import SharedWorld
 from tests.core.test_ordering_simulated import ask_counter, ask_key_value
 from tests.linearizability import counter, key_value, linearizable
@@ -283,3 +286,17 @@ def test_what_lies_unanswered_at_a_replica_is_bounded():
     assert places.choose([0, 1], 4, 0) is None, "it lies there"
     places.end(1, 7)
     assert places.choose([0, 1], 4, 0) == 1
+
+
+@pytest.mark.parametrize("seen_begun", [False, True])
+def test_a_term_founds_a_service_only_with_all_listed_replicas_and_where_none_was_seen(seen_begun):
+    term = SharedSequencer(ordering.next_epoch(0, 1), founders=2, may_found=not seen_begun)
+    term.listed = 3
+    blank = [Vote(START, True, True, member, 0) for member in (7, 8, 9)]
+    for reached in (2, 3):
+        term.reach(range(reached), 0.0)
+        for order in term.take():
+            if order.op is Op.CLAIM:
+                term.replied(order.replica, Op.CLAIM, order.index, blank[order.replica].encode())
+        assert (term.base is not None) == (reached == 3 and not seen_begun)
+    assert term.members == (() if seen_begun else (7, 8, 9))
