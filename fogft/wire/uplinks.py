@@ -270,7 +270,9 @@ class UplinkDialer:
     def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
         """Set the uplinks and what services want; whether links have to be dialled anew."""
         ways = Ways.of(services)
-        changed = (tuple(interfaces), ways) != (self.interfaces, self._ways)
+        # Not `timed`: who becomes stateful, or comes anew, has its links dialled anyway.
+        old = (self.interfaces, self._ways.latest, self._ways.plain)
+        changed = (tuple(interfaces), ways.latest, ways.plain) != old
         self.interfaces, self._ways = tuple(interfaces), ways
         self._policies = {service.name: service.uplinks for service in services}
         self.adopt(ways)

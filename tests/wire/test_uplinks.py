@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.core.model import ReplicaId
 from fogft.core.spec import ServiceSpec
+from fogft.core.spec_choices import Freshness
 from fogft.core.uplinks import UplinkPolicy, choose, is_interface
 from fogft.wire.port import Answer, Peer, Refusal
 from fogft.wire.uplinks import UplinkDialer
@@ -92,6 +95,15 @@ def test_each_service_has_its_own_policy():
     assert scene.counts() == [1, 1]
     assert scene.link.offer("/t", b"t" * 16, b"payload", 5.0)
     assert scene.counts() == [2, 1]
+
+
+def test_links_are_dialled_anew_for_other_interfaces_or_ways_only():
+    one, other = ServiceSpec("/s", "t/srv/T"), ServiceSpec("/t", "t/srv/T")
+    dialer = UplinkDialer(FakeDialer())
+    assert dialer.use(["if0"], [one])
+    assert not dialer.use(["if0"], [one, other])
+    assert dialer.use(["if0", "if1"], [one])
+    assert dialer.use(["if0", "if1"], [replace(one, freshness=Freshness.LATEST)])
 
 
 def test_prefer_goes_back_and_failover_does_not():
