@@ -191,21 +191,31 @@ class ZenohLink:
         failures = 0
         while not self._closed:
             self._silence.began(time.monotonic())
-            connection = self._open()
-            was_up = False
-            while connection is not None:
-                was_up = self._attend(connection) or was_up
-                if self._is_good(connection):  # it only makes way for one with new credentials
-                    connection = self._succeed(connection)
-                    continue
-                self._part(connection)
-                break
-            failures = 0 if was_up else failures + 1
+            failures = 0 if self._hold() else failures + 1
             self._woke_at = time.monotonic()  # opening took time, and that is silence
             self._let_go()
             if not self._closed:
                 self._pause(_BACKOFF_S[min(failures, len(_BACKOFF_S) - 1)])
         self._let_go()
+
+    def _hold(self) -> bool:
+        """Open a connection and attend to it until it is lost; return whether it was up."""
+        was_up = False
+        connection = None
+        try:
+            connection = self._open()
+            while connection is not None:
+                was_up = self._attend(connection) or was_up
+                if not self._is_good(connection):
+                    break
+                connection = self._succeed(connection)  # it makes way for one with new credentials
+        except Exception as error:  # a mistake of ours must not end the link for good
+            log.exception("link_failed replica=%s", self._peer.id.short)
+            if connection is not None:
+                connection.lost_because = f"{type(error).__name__}: {error}"
+        if connection is not None:
+            self._part(connection)
+        return was_up
 
     def _is_good(self, connection: Connection) -> bool:
         return connection is self._live and not self._closed and not connection.lost_because

@@ -55,6 +55,27 @@ def test_a_killed_replica_is_noticed_by_the_lost_connection(
     assert again.count("requests") == 1
 
 
+def test_a_mistake_while_a_link_is_kept_does_not_end_it(
+    start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """What the keeper calls fails before the link is up, and after; it is opened anew."""
+    asked = iter([None, ZeroDivisionError(), 1.0, 2.0, ZeroDivisionError()])
+
+    def manager_age() -> float | None:
+        now = next(asked, 3.0)
+        if isinstance(now, Exception):
+            raise now
+        return now
+
+    replica = start_replica()
+    link = dial(replica.endpoint, suspect_after_s=0.5, manager_age=manager_age)
+    wait_for(lambda: link.status().reopened >= 2)
+    wait_for(lambda: link.usable)
+    assert link.offer(SERVICE, request_id(1), b"still here", 20.0)
+    wait_for(lambda: owner.of(1))
+    assert owner.of(1)[0].payload == b"still here"
+
+
 def test_a_late_answer_of_an_old_connection_is_dropped(
     start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
 ) -> None:
