@@ -46,6 +46,7 @@ TRACE_NAME = "trace.jsonl"
 _TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 0.5
 _REPORT_AFTER_CHANGE_S = 0.05
+_LOOK_EVERY_S = 0.05  # at files, and what else needs no haste
 
 
 class ManagerSign:
@@ -255,10 +256,14 @@ def _loop(
     watched_certificate = Watched(config.credentials.certificate)  # written after its key
     watched_certificate.changed()
     revocations = Watched(config.revocations) if config.revocations else None
-    started = reported = time.monotonic()
+    started = reported = looked = time.monotonic()
     changed = False  # since the last report
     while not stop.is_set():
         changed = proxy.run_once() or changed
+        now = time.monotonic()
+        if now - looked < _LOOK_EVERY_S:  # requests' own deadlines are seen to by `run_once`
+            continue
+        looked = now
         memory.look()
         sign.look()
         if watched_config.changed():

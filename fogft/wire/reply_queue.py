@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 REPLIES_LIMIT = 1024
 BYTES_LIMIT = 64 << 20
 _IDLE_S = 5.0
-_END_LOOK_S = 0.02
+_END_LOOK_S = 0.2  # nobody waits for an end
 _END_ANYWAY_S = 1.0  # Zenoh's thread has long let go, though nothing came after
 
 

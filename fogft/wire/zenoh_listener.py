@@ -177,6 +177,7 @@ class ZenohListener:
         self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Sample], None]
     ) -> None:
         def guarded(sample: zenoh.Sample) -> None:
+            self._turns.came()
             try:
                 heard(sample)
             except Exception:  # in Zenoh's thread nobody else would tell of it
