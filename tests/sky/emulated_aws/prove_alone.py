@@ -181,7 +181,11 @@ def main() -> int:
             pool.down()
     assert not list((HOME / "pools").glob("*"))
     alone.sky_api("stop")
-    until("nothing of it runs here", lambda: not processes(), 60)
+    try:
+        until("nothing of it runs here", lambda: not processes(), 60)
+    except AssertionError:
+        print("still running:", *processes(), sep="\n  ")
+        raise
     table = "".join(f"{end - begin:7.1f} s  {name}\n" for name, begin, end in step.done)
     Path(os.environ["RESULTS"], "alone.txt").write_text(table)
     print("every step passed")
