@@ -7,11 +7,16 @@ import pupil_apriltags
 from tag import FAMILY
 
 
+class _Detector(pupil_apriltags.Detector):
+    def __del__(self) -> None:
+        """Free nothing: the library's own way crashes now and then, and a process needs but one."""
+
+
 class Locator:
     """The detector, on one thread."""
 
     def __init__(self) -> None:
-        self._detector = pupil_apriltags.Detector(
+        self._detector = _Detector(
             families=FAMILY, nthreads=1, quad_decimate=2.0, refine_edges=True
         )
 
