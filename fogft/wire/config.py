@@ -52,8 +52,6 @@ class LinkSettings:
             than `wait_before_close_s`, or healthy links stall for seconds.
         wait_before_close_s: How long the sending of one message may take before Zenoh gives
             the session up.
-        reply_wait_s: The same for what a replica sends. Shorter: nobody waits for a robot that
-            goes while much is on its way to it.
         open_timeout_s: The most that opening a session takes; see `long_open_timeout_s`.
         long_open_timeout_s: The same for every third try in a row that takes so long: through a
             full uplink, or on a busy machine, a handshake needs more.
@@ -64,7 +62,6 @@ class LinkSettings:
 
     lease_s: float = 150.0
     wait_before_close_s: float = 120.0
-    reply_wait_s: float = 10.0
     open_timeout_s: float = 1.5
     long_open_timeout_s: float = 4.0
     stall_after_s: float = 1.0
@@ -76,7 +73,6 @@ class LinkSettings:
 
 
 _DECLARED = ("declare_queryable", "declare_subscriber")
-_WAIT = "transport/link/tx/queue/congestion_control/block/wait_before_close"  # microseconds
 
 
 def robot_settings(
@@ -123,7 +119,6 @@ def replica_settings(
     keys = f"{names.slot_prefix(id.pool_uid, id.slot)}/**"
     return {
         **_common(settings),
-        _WAIT: round(min(settings.reply_wait_s, settings.wait_before_close_s) * 1e6),
         # Not `router`: that would carry robots' messages to each other.
         "mode": "peer",
         "connect/endpoints": [],
@@ -177,7 +172,9 @@ def _common(settings: LinkSettings) -> dict[str, Any]:
         "transport/link/tx/lease": round(settings.lease_s * 1e3),
         # So many in a lease: a peer that is out of reach leaves something unacknowledged.
         "transport/link/tx/keep_alive": max(4, round(settings.lease_s / _SIGN_OF_LIFE_EVERY_S)),
-        _WAIT: round(settings.wait_before_close_s * 1e6),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
+            settings.wait_before_close_s * 1e6
+        ),
         "transport/link/rx/max_message_size": MESSAGE_BYTES_LIMIT,
         "transport/unicast/open_timeout": round(settings.open_timeout_s * 1e3),
         "transport/unicast/accept_timeout": round(settings.long_open_timeout_s * 1e3),

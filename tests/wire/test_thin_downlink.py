@@ -97,6 +97,22 @@ def test_through_a_relay(
         relay.close()
 
 
+def test_a_response_may_take_long(
+    start_replica: Callable[..., ReplicaProcess], authority: Authority, owner: Owner
+) -> None:
+    """It arrives over the same connection, however little of it the kernel holds meanwhile."""
+    relay = ThinRelay(start_replica().endpoint, 4 * MBIT * 125_000)
+    dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
+    try:
+        asking = Asking(dialer, relay.endpoint, owner, lambda: relay.passed_bytes)
+        assert asking.ask(b"noise:700000") > 0.95  # by which the replica sees that the link is thin
+        assert asking.ask(b"noise:5600000") > 0.95  # 11.2 s
+        assert asking.link.status().reopened == 0
+    finally:
+        dialer.close()
+        relay.close()
+
+
 def test_a_service_that_wants_none_gets_none(
     start_replica: Callable[..., ReplicaProcess], authority: Authority, owner: Owner
 ) -> None:
