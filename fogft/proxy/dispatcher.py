@@ -28,6 +28,7 @@ from fogft.core.first_response import FirstResponse, Pending, Verdict
 from fogft.core.hedging import NEVER, All, Failover, Hedging
 from fogft.core.model import ReplicaId
 from fogft.core.names import REQUEST_ID_BYTES
+from fogft.core.repeats import worth_logging
 from fogft.core.spec import HedgingMode, OnTimeout, ServiceSpec
 from fogft.core.spec_choices import Freshness
 from fogft.proxy.outcomes import Outcomes
@@ -301,7 +302,7 @@ class Dispatcher:
             self._log_rarely("response_undelivered", count, error.message)
 
     def _log_rarely(self, event: str, count: int, reason: str) -> None:
-        if count & (count - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
+        if worth_logging(count):
             log.warning("%s service=%s reason=%r count=%d", event, self.spec.name, reason, count)
 
     def _close(self, request: bytes, pending: Pending[Request]) -> None:

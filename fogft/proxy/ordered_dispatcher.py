@@ -23,6 +23,7 @@ from fogft.core.hedging import NEVER
 from fogft.core.model import ReplicaId
 from fogft.core.ordered_peer import Order
 from fogft.core.ordering import Op, OrderError
+from fogft.core.repeats import worth_logging
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.dispatcher import key_of
 from fogft.proxy.mark import MarkFile
@@ -123,7 +124,7 @@ class OrderedDispatcher:
                 if bytes_over or len(self._early) >= self._max_waiting:
                     count["turned_away"] += 1
                     turned_away = count["turned_away"]
-                    if turned_away & (turned_away - 1) == 0:  # log the 1st, 2nd, 4th, ...
+                    if worth_logging(turned_away):
                         log.warning(
                             "request_turned_away service=%s reason=%r count=%d",
                             self.spec.name, "no replica takes requests", turned_away,
@@ -220,7 +221,7 @@ class OrderedDispatcher:
             with self._lock:
                 self._outcomes.count["undelivered"] += 1
                 count = self._outcomes.count["undelivered"]
-            if count & (count - 1) == 0:
+            if worth_logging(count):
                 log.warning(
                     "response_undelivered service=%s reason=%r count=%d",
                     self.spec.name, error.message, count,

@@ -17,6 +17,7 @@ from typing import Any
 from fogft.core.errors import RosError
 from fogft.core.fallback import Rescues
 from fogft.core.first_response import FirstResponse, Pending
+from fogft.core.repeats import worth_logging
 from fogft.core.spec_choices import FallbackSpec
 from fogft.proxy.outcomes import Outcomes
 from fogft.proxy.request import Request, Story
@@ -118,7 +119,7 @@ class Rescuer:
             count = self._shared.outcomes.count
             count["fallback_failed"] += 1
             failed = count["fallback_failed"]
-        if failed & (failed - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
+        if worth_logging(failed):
             log.warning(
                 "fallback_not_asked service=%s reason=%r count=%d",
                 self._shared.name, reason, failed,

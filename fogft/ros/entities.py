@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fogft.core.errors import RosError
+from fogft.core.repeats import worth_logging
 from fogft.ros.pacing import Pacer
 from fogft.ros.transfer import ClientEnd, ServiceEnd
 
@@ -33,7 +34,7 @@ class _Unreadable:
 
     def __call__(self, error: RosError) -> None:
         self._count += 1
-        if self._count & (self._count - 1) == 0:
+        if worth_logging(self._count):
             log.warning("%s: %s (%d so far)", self._name, error.message, self._count)
 
 

@@ -26,6 +26,7 @@ from fogft.core.errors import WireError
 from fogft.core.holders import Role, holder_of
 from fogft.core.model import ReplicaId
 from fogft.core.records import RecordError, Verify
+from fogft.core.repeats import worth_logging
 from fogft.wire import record_frames as frames
 from fogft.wire.reply_queue import Counters
 from fogft.wire.splice import Tunnel, hang_up, keep_alive
@@ -289,7 +290,7 @@ class DialIn:
 
     def _count(self, event: str, detail: str) -> None:
         count = self._counters.add(event)
-        if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
+        if worth_logging(count):
             log.warning("dial_in_refused event=%s count=%d detail=%r", event, count, detail[:200])
 
     def close(self) -> None:

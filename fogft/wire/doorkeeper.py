@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 
+from fogft.core.repeats import worth_logging
 from fogft.wire import sockets
 from fogft.wire.drain import Drain
 from fogft.wire.flow_watch import THIN_BYTES_PER_S
@@ -133,7 +134,7 @@ class Doorkeeper:
     def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:
         sockets.end(connection)
         count = self._counters.add(event)
-        if count & (count - 1) == 0:
+        if worth_logging(count):
             log.warning(
                 "connection_ended reason=%s peer=%s:%d name=%r count=%d", event, *peer, name, count
             )

@@ -16,6 +16,7 @@ import logging
 from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
+from fogft.core.repeats import worth_logging
 from fogft.wire.compression import Compression
 
 log = logging.getLogger(__name__)
@@ -82,7 +83,7 @@ class InTime:
         if enough(size, rate, remaining_s):
             return True
         self.declined += 1
-        if self.declined & (self.declined - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
+        if worth_logging(self.declined):
             log.warning(
                 "request_too_slow service=%s bytes=%d bytes_per_s=%d remaining_s=%.3f count=%d",
                 attempt.service, size, rate, remaining_s, self.declined,

@@ -24,6 +24,7 @@ from typing import Any
 
 from fogft.core.errors import CredentialError, WireError
 from fogft.core.records import RecordError, Verify, Writer
+from fogft.core.repeats import worth_logging
 from fogft.wire import record_frames as frames
 from fogft.wire.config import CredentialPaths
 from fogft.wire.record_exchange import Connection, Exchange
@@ -201,7 +202,7 @@ class RendezvousServer:
     def _count(self, event: str, detail: str) -> None:
         self.counts[event] += 1
         count = self.counts[event]
-        if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
+        if worth_logging(count):
             log.warning("caller_refused event=%s count=%d detail=%r", event, count, detail[:200])
 
     def report(self) -> Mapping[str, Any]:

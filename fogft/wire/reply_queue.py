@@ -24,6 +24,7 @@ from queue import Empty, SimpleQueue
 
 import zenoh
 
+from fogft.core.repeats import worth_logging
 from fogft.wire import frame
 from fogft.wire.compression import Compression
 from fogft.wire.flow_watch import THIN_BYTES_PER_S
@@ -255,7 +256,7 @@ class ReplyQueues:
             step()
         except Exception as error:
             count = self._counters.add("failed")
-            if count & (count - 1) == 0:
+            if worth_logging(count):
                 log.warning("reply_failed reason=%r count=%d", str(error), count)
 
     def close(self, timeout_s: float) -> None:

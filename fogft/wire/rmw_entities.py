@@ -21,6 +21,7 @@ from zenoh import handlers
 
 from fogft.core import rmw_zenoh
 from fogft.core.errors import RosError, Unreadable
+from fogft.core.repeats import worth_logging
 
 log = logging.getLogger(__name__)
 
@@ -257,7 +258,7 @@ class Client:
     def _replied(self, ticket: int, reply: Any) -> None:
         if reply.ok is None:
             self._errors += 1
-            if self._errors & (self._errors - 1) == 0:
+            if worth_logging(self._errors):
                 log.warning("%s: an error came for a response (%d so far)", self._name,
                             self._errors)  # fmt: skip
             return

@@ -29,6 +29,7 @@ from fogft.core.errors import WireError
 from fogft.core.model import ReplicaId
 from fogft.core.record_set import RecordSet, Verdict
 from fogft.core.records import RecordError, SignedRecord
+from fogft.core.repeats import worth_logging
 from fogft.wire import config, frame, record_frames
 from fogft.wire.compression import ACCEPTED, unpack
 from fogft.wire.config import CredentialPaths, LinkSettings
@@ -156,7 +157,7 @@ class ZenohListener:
     def _count_handshakes(self) -> None:
         for reason in self._handshakes.refusals() if self._handshakes else ():
             count = self._counters.add("handshakes_refused")
-            if count & (count - 1) == 0:
+            if worth_logging(count):
                 log.warning("handshake_refused reason=%r count=%d", reason, count)
 
     def _declare(
@@ -300,7 +301,7 @@ class ZenohListener:
 
     def _count(self, event: str, message: str, reason: object) -> None:
         count = self._counters.add(event)
-        if count & (count - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...
+        if worth_logging(count):
             log.warning("%s reason=%r count=%d", message, str(reason), count)
 
     # -- the probe thread -----------------------------------------------------------------
