@@ -20,6 +20,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from queue import SimpleQueue
+from typing import TypeVar
 
 import zenoh
 from zenoh import handlers
@@ -45,6 +46,8 @@ from fogft.wire.streams import Streams
 from fogft.wire.zenoh_incoming import ZenohIncoming
 
 log = logging.getLogger(__name__)
+
+Heard = TypeVar("Heard", zenoh.Query, zenoh.Sample)
 
 _CLOSE_WAIT_S = 1.0
 _NO_REQUEST = bytes(names.REQUEST_ID_BYTES)
@@ -156,37 +159,35 @@ class ZenohListener:
 
     def _count_handshakes(self) -> None:
         for reason in self._handshakes.refusals() if self._handshakes else ():
-            count = self._counters.add("handshakes_refused")
-            if worth_logging(count):
-                log.warning("handshake_refused reason=%r count=%d", reason, count)
+            self._count("handshakes_refused", "handshake_refused", reason)
 
     def _declare(
         self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query, int], None]
     ) -> None:
-        def guarded(query: zenoh.Query) -> None:
-            turn = self._turns.came()
-            try:
-                heard(query, turn)
-            except Exception:  # in Zenoh's thread nobody else would tell of it
-                self._counters.add("failed")
-                log.exception("query_not_taken key=%s", key)
-
-        callback = handlers.Callback(guarded, indirect=False)
+        callback = handlers.Callback(self._taken(f"query at {key}", heard), indirect=False)
         self._declared.append(session.declare_queryable(key, callback, complete=True))
 
     def _hear(
         self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Sample], None]
     ) -> None:
-        def guarded(sample: zenoh.Sample) -> None:
-            self._turns.came()
-            try:
-                heard(sample)
-            except Exception:  # in Zenoh's thread nobody else would tell of it
-                self._counters.add("failed")
-                log.exception("message_not_taken key=%s", key)
+        def told(sample: zenoh.Sample, turn: int) -> None:
+            heard(sample)
 
-        callback = handlers.Callback(guarded, indirect=False)
+        callback = handlers.Callback(self._taken(f"message at {key}", told), indirect=False)
         self._declared.append(session.declare_subscriber(key, callback))
+
+    def _taken(self, what: str, heard: Callable[[Heard, int], None]) -> Callable[[Heard], None]:
+        """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
+
+        def guarded(one: Heard) -> None:
+            turn = self._turns.came()
+            try:
+                heard(one, turn)
+            except Exception:
+                self._counters.add("failed")
+                log.exception("not_taken what=%r", what)
+
+        return guarded
 
     # -- Zenoh's threads ------------------------------------------------------------------
 
