@@ -13,11 +13,14 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 from fogft.cloud.port import Launch
 from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, SpecError
 from fogft.core.model import Machine, MachinePhase, Offer, Placement, ReplicaId
+
+_BY_ID = attrgetter("id.pool_uid", "id.slot", "id.generation")
 
 
 @dataclass
@@ -45,6 +48,31 @@ class _Vm:
     fails: str
     notice_at: float = float("inf")
     gone_at: float = float("inf")
+    shown: Machine | None = None  # as it was when last looked at
+
+    def at(self, now: float) -> Machine:
+        """Return the machine as it is; the same object for as long as nothing changes."""
+        phase = MachinePhase.PROVISIONING
+        if now >= self.runs_at:
+            phase = MachinePhase.FAILED if self.fails else MachinePhase.RUNNING
+        notice, shown = now >= self.notice_at, self.shown
+        if shown is None or (shown.phase, shown.notice) != (phase, notice):
+            self.shown = shown = self._as(phase, notice)
+        return shown
+
+    def _as(self, phase: MachinePhase, notice: bool) -> Machine:
+        order, running = self.order, phase is MachinePhase.RUNNING
+        return Machine(
+            id=order.id,
+            placement=order.placement,
+            phase=phase,
+            launched_at=self.launched_at,
+            endpoint=f"127.0.0.1:{20_000 + hash_port(order.id)}" if running else None,
+            notice=notice,
+            usd_per_hour=order.usd_per_hour,
+            spec_hash=order.spec_hash,
+            failure=f"{self.fails}: as the mock was told" if phase is MachinePhase.FAILED else "",
+        )
 
 
 @dataclass
@@ -103,7 +131,7 @@ class MockCloud:
         """List the pool's machines as they are at this moment of simulated time."""
         self._meet("machines")
         self.calls.listed += 1
-        return [self._machine(vm) for vm in self._present() if vm.order.id.pool_uid == pool_uid]
+        return [machine for machine in self.present() if machine.id.pool_uid == pool_uid]
 
     def launch(self, order: Launch) -> None:
         """Order a machine; it runs after the zone's boot time."""
@@ -111,7 +139,7 @@ class MockCloud:
         if order.id in self._vms:
             return
         zone = self.zones[order.placement.location]
-        here = sum(vm.order.placement.location == zone.placement.location for vm in self._present())
+        here = sum(m.placement.location == zone.placement.location for m in self.present())
         if zone.capacity is not None and here >= zone.capacity:
             raise NoCapacity(f"no capacity in `{zone.placement.location}`")
         now = self._clock()
@@ -133,6 +161,16 @@ class MockCloud:
 
     # -- what tests do to it ----------------------------------------------------------------
 
+    def present(self) -> list[Machine]:
+        """Return the machines of all pools, whatever `machines` is told to answer."""
+        now = self._clock()
+        return sorted((vm.at(now) for vm in self._vms.values() if now < vm.gone_at), key=_BY_ID)
+
+    def machine(self, id: ReplicaId) -> Machine | None:
+        """Return one of them, None if it is not there."""
+        vm, now = self._vms.get(id), self._clock()
+        return vm.at(now) if vm and now < vm.gone_at else None
+
     def fail_next(self, operation: str, error: CloudError) -> None:
         """Let the next call of an operation (``launch``, ``machines``, ...) raise an error."""
         self._errors.setdefault(operation, []).append(error)
@@ -149,30 +187,6 @@ class MockCloud:
             raise self._errors[operation].pop(0)
         if self.unreachable:
             raise CloudUnreachable("the mock cloud is told to be unreachable")
-
-    def _present(self) -> list[_Vm]:
-        now = self._clock()
-        present = [vm for vm in self._vms.values() if now < vm.gone_at]
-        return sorted(present, key=lambda vm: vm.order.id)
-
-    def _machine(self, vm: _Vm) -> Machine:
-        now, order = self._clock(), vm.order
-        phase = MachinePhase.PROVISIONING if now < vm.runs_at else MachinePhase.RUNNING
-        failure = ""
-        if vm.fails and now >= vm.runs_at:
-            phase, failure = MachinePhase.FAILED, f"{vm.fails}: as the mock was told"
-        running = phase is MachinePhase.RUNNING
-        return Machine(
-            id=order.id,
-            placement=order.placement,
-            phase=phase,
-            launched_at=vm.launched_at,
-            endpoint=f"127.0.0.1:{20_000 + hash_port(order.id)}" if running else None,
-            notice=now >= vm.notice_at,
-            usd_per_hour=order.usd_per_hour,
-            spec_hash=order.spec_hash,
-            failure=failure,
-        )
 
 
 def hash_port(id: ReplicaId) -> int:

@@ -210,7 +210,7 @@ class PoolSpec:
         """The services that robots are offered: the file's, or what was discovered."""
         return self.services or self.discovered
 
-    @property
+    @cached_property
     def replica_hash(self) -> str:
         """16 hexadecimal digits that change when running replicas must be replaced.
 

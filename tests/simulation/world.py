@@ -175,7 +175,7 @@ class World:
 
     def truth(self) -> list[Machine]:
         """Return the machines that exist, whatever the cloud says to the manager."""
-        return [self.cloud._machine(vm) for vm in self.cloud._present() if vm.order.id != STRANGER]
+        return self.cloud.present()
 
     def serves(self, id: ReplicaId) -> bool:
         """Whether a replica's service would answer if asked on its own machine."""
@@ -187,7 +187,8 @@ class World:
 
     def wrong(self, id: ReplicaId) -> str:
         """Return what is wrong with a replica's version: ``crashes``, ``hangs``, ``errs`` or ''."""
-        return self.broken.get(self.versions().get(id, ""), "")
+        machine = self.cloud.machine(id) if self.broken else None
+        return self.broken.get(machine.spec_hash, "") if machine else ""
 
     def versions(self) -> dict[ReplicaId, str]:
         """Return which version each machine runs."""
