@@ -47,6 +47,9 @@ class Op(IntEnum):
     LOOK = 9  # tell whom you obey; of no term
 
 
+OrderId = tuple[Op, int, int]  # operation, term (or a robot's session), index
+
+
 @dataclass(frozen=True, order=True)
 class Position:
     """A state: all requests up to `index`, in the order of the term `epoch`.
@@ -90,7 +93,7 @@ def encode(op: Op, epoch: int, index: int) -> bytes:
     return _ID.pack(epoch, op << 56 | index)
 
 
-def decode(id: bytes) -> tuple[Op, int, int]:
+def decode(id: bytes) -> OrderId:
     """Return operation, epoch and index of an order.
 
     Raises:

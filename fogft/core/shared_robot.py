@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from fogft.core import ordering, shared_orders
 from fogft.core.ordered_peer import Order
-from fogft.core.ordering import START, Op, Position
+from fogft.core.ordering import START, Op, OrderId, Position
 from fogft.core.shared_orders import RequestId, Standing
 from fogft.core.shared_places import Places
 from fogft.core.shared_sequencer import Answered, SharedSequencer
@@ -33,9 +33,6 @@ AHEAD = 256
 # The mark of a robot that has seen the service begun, and was answered nothing: after the state
 # in which a service starts, before all that a term ever gave a number.
 BEGUN = Position(0, 1)
-
-
-OrderId = tuple[Op, int, int]  # operation, term (or session), index: as `ordering.decode` gives it
 
 
 class Outgoing(NamedTuple):

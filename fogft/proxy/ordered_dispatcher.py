@@ -22,14 +22,14 @@ from fogft.core.errors import RosError
 from fogft.core.hedging import NEVER
 from fogft.core.model import ReplicaId
 from fogft.core.ordered_peer import Order
-from fogft.core.ordering import Op, OrderError
+from fogft.core.ordering import Op, OrderError, OrderId
 from fogft.core.repeats import worth_logging
 from fogft.core.spec import OnTimeout, ServiceSpec
 from fogft.proxy.dispatcher import key_of
 from fogft.proxy.mark import MarkFile
 from fogft.proxy.outcomes import Outcomes
 from fogft.proxy.own_order import OwnOrder
-from fogft.proxy.service_order import Numbered, OrderId, ServiceOrder
+from fogft.proxy.service_order import Numbered, ServiceOrder
 from fogft.proxy.shared_order import SharedOrder
 from fogft.wire.port import Answer, Link, Refusal
 

@@ -14,10 +14,8 @@ from typing import Any, NamedTuple, Protocol
 
 from fogft.core.ordered_peer import Order
 from fogft.core.ordered_term import OrderedTerm
-from fogft.core.ordering import Op
+from fogft.core.ordering import OrderId
 from fogft.core.spec_state import StateSpec
-
-OrderId = tuple[Op, int, int]  # operation, term, index: as `ordering.decode` gives it
 
 
 class Numbered(NamedTuple):

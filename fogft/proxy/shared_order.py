@@ -13,10 +13,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from fogft.core.ordered_peer import Order
+from fogft.core.ordering import OrderId
 from fogft.core.shared_robot import SharedRobot
 from fogft.core.spec_state import StateSpec
 from fogft.proxy.mark import MarkFile
-from fogft.proxy.service_order import Numbered, OrderId, report_of
+from fogft.proxy.service_order import Numbered, report_of
 
 log = logging.getLogger(__name__)
 
