@@ -16,6 +16,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from fogft.core import ordering, shared_orders
+from fogft.core.majority import is_majority
 from fogft.core.ordered_peer import Peer, Phase
 from fogft.core.ordered_term import OrderedTerm
 from fogft.core.ordering import START, Op, Position, Promise
@@ -94,7 +95,7 @@ class SharedSequencer(OrderedTerm):
     def ready(self) -> bool:
         """Whether a number given now can be committed."""
         here = {self._votes[r].member for r in self.joined if r in self._votes}
-        return _majority(here, self.members)
+        return is_majority(here, self.members)
 
     def take_answers(self) -> list[Answered]:
         """Return the answers that have come, and forget them."""
@@ -144,7 +145,7 @@ class SharedSequencer(OrderedTerm):
             furthest = max(knowing, key=lambda r: knowing[r].position)
             best = knowing[furthest]
             self.behind = best.position < self.mark
-            if _majority({v.member for v in counting.values()}, best.members) and not self.behind:
+            if is_majority({v.member for v in counting.values()}, best.members) and not self.behind:
                 self._start(best.position, best.members, self._version(furthest))
         elif self._may_found and len(counting) == len(self._peers) == max(self.listed, 1):
             versions = {self._version(r) for r in counting}
@@ -319,8 +320,3 @@ class SharedSequencer(OrderedTerm):
         super()._drop(replica)
         self._votes.pop(replica, None)
         self._listens.pop(replica, None)
-
-
-def _majority(some: set[int], members: tuple[int, ...]) -> bool:
-    """Whether these are more than half of the members. Nobody is no majority."""
-    return 2 * len(some & set(members)) > len(members)

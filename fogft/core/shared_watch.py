@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from fogft.core.majority import is_majority
 from fogft.core.shared_orders import Standing
 
 LOOK_EVERY_S = 0.25
@@ -140,7 +141,7 @@ def _latest(standings: Collection[Standing]) -> list[tuple[int, ...]]:
 
 def _are_most(some: set[int], known: list[tuple[int, ...]]) -> bool:
     """Whether these are a majority of the members, by what any of those says who know them."""
-    return any(2 * len(some & set(members)) > len(members) for members in known)
+    return any(is_majority(some, members) for members in known)
 
 
 def _heard(standing: Standing) -> tuple[int, int, int]:
