@@ -40,7 +40,6 @@ class SharedOrder:
             secrets.randbits(63) + 1, self._new_epoch, random.random,
             founders=founders, mark=mark.position,
         )  # fmt: skip
-        self._written = mark.position
 
     def _new_epoch(self, above: int) -> int:
         epoch = self._mark.new_term(secrets.randbits(32), above=above)
@@ -88,9 +87,8 @@ class SharedOrder:
 
     def _answers(self) -> Sequence[Numbered]:
         answered = self._brain.take_answers()
-        if self._written != self._brain.mark:
+        if self._mark.position != self._brain.mark:
             self._mark.write(self._brain.mark)
-            self._written = self._brain.mark
         return [Numbered(one.seq, one.answer) for one in answered]
 
     def take(self) -> list[tuple[int, Order]]:
