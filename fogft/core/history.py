@@ -304,19 +304,25 @@ class History:
                 it may say something else.
             now: Seconds since the epoch.
         """
-        digest = self._of_supplies.get(work_out)
-        if digest is None:
-            digest = self._of_supplies[work_out] = Digest(set(self._failures))
-        return digest.at(now, lambda supply: work_out(self, supply, now))
+        return self._follows(self._of_supplies, self._failures, work_out, now)
 
     def of_losses(
         self, work_out: Callable[[History, str, float], Lasting[T | None]], now: float
     ) -> Mapping[str, T]:
         """Return what follows from the losses at each location; likewise."""
-        digest = self._of_losses.get(work_out)
+        return self._follows(self._of_losses, self._losses, work_out, now)
+
+    def _follows(
+        self,
+        digests: dict[Callable[..., Any], Digest[Any]],
+        places: Iterable[str],
+        work_out: Callable[[History, str, float], Lasting[T | None]],
+        now: float,
+    ) -> Mapping[str, T]:
+        digest = digests.get(work_out)
         if digest is None:
-            digest = self._of_losses[work_out] = Digest(set(self._losses))
-        return digest.at(now, lambda location: work_out(self, location, now))
+            digest = digests[work_out] = Digest(set(places))
+        return digest.at(now, lambda place: work_out(self, place, now))
 
     @property
     def losses(self) -> Mapping[str, list[float]]:
