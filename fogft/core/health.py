@@ -23,6 +23,7 @@ from fogft.core.model import (
     Observed,
     Phase,
     ReplicaId,
+    by_id,
 )
 from fogft.core.spec import PoolSpec
 
@@ -86,7 +87,7 @@ def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -
     links = {report.id: report for report in observed.links or ()}
     ours = [
         (machine, links.get(machine.id), history.record(machine.id.slot, machine.id.generation))
-        for machine in sorted(observed.machines or (), key=_slot_and_generation)
+        for machine in sorted(observed.machines or (), key=by_id)
         if machine.id.pool_uid == pool_uid
     ]
     heard = [
@@ -117,10 +118,6 @@ def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -
         uplink_suspected=uplink_suspected,
         links_known=observed.links is not None,
     )
-
-
-def _slot_and_generation(machine: Machine) -> tuple[int, int]:
-    return machine.id.slot, machine.id.generation
 
 
 def was_heard(link: LinkReport, record: Record | None) -> bool:

@@ -139,6 +139,12 @@ class Machine:
     progress: str = ""
 
 
+def by_id(machine: Machine) -> tuple[str, int, int]:
+    """Return what machines are sorted by. Plain values compare faster than ids do."""
+    id = machine.id
+    return id.pool_uid, id.slot, id.generation
+
+
 class LinkState(str, Enum):
     """What the client proxy knows of its link to a replica."""
 

@@ -33,6 +33,7 @@ from fogft.core.model import (
     Observed,
     Offer,
     ReplicaId,
+    by_id,
 )
 from fogft.core.planner import Plan, PlannedLaunch, plan
 from fogft.core.refreshing import Silent
@@ -225,7 +226,7 @@ class Reconciler:
             for id, order in busy.items():
                 if order is not None:
                     listed[id] = replace(listed.get(id, order), launched_at=now)
-            machines = tuple(sorted(listed.values(), key=_by_id))
+            machines = tuple(sorted(listed.values(), key=by_id))
         except CloudError as error:
             log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
             trouble.append(f"the cloud did not answer: {told(error)}")
@@ -349,11 +350,6 @@ class Reconciler:
             self._remember.add(EventKind.ENDING, id, detail=reason)
             log.info("terminate_ordered replica=%s reason=%r", id.short, reason)
         self._operations.start(id, None, lambda: self._cloud.terminate(id))
-
-
-def _by_id(machine: Machine) -> tuple[str, int, int]:
-    id = machine.id
-    return id.pool_uid, id.slot, id.generation
 
 
 def _refusal(error: Exception) -> str:
