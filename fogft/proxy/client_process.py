@@ -275,7 +275,6 @@ def _loop(
             following.renew()
         if revocations is not None and revocations.changed():
             _apply(functools.partial(_tell, revocations.path, proxy), revocations.path)
-        now = time.monotonic()
         seen.diagnose(proxy.report, now)
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
             reported, changed = now, False

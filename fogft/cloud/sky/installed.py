@@ -210,8 +210,9 @@ class InstalledSky:
         settings = importlib.import_module("sky.skypilot_config")
         with self._lock:
             given = list(settings.get_nested(guard.SETTING, []) or [])
-            if guard.command() not in given:
-                key, value = ".".join(guard.SETTING), json.dumps([*given, guard.command()])
+            command = guard.command()
+            if command not in given:
+                key, value = ".".join(guard.SETTING), json.dumps([*given, command])
                 settings.apply_cli_config([f"{key}={value}"])  # as `sky launch --config` does
 
     def _log(self, read: Callable[[io.StringIO], object]) -> str:
