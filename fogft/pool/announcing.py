@@ -11,8 +11,6 @@ Not here: what the membership is (`reconciler`).
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
-from pathlib import Path
 
 from fogft.core import names
 from fogft.core.errors import CredentialError
@@ -24,6 +22,7 @@ from fogft.pool import credentials
 from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.wire import record_cache
+from fogft.wire.config import CredentialPaths
 from fogft.wire.rendezvous_client import RendezvousClient
 from fogft.wire.signing import Signer
 
@@ -31,13 +30,6 @@ CERTIFICATE_DAYS = 365.0
 RENEW_BEFORE = datetime.timedelta(days=60)
 _CERTIFY_EVERY = datetime.timedelta(hours=1)
 _STEM = "manager"
-
-
-@dataclass(frozen=True)
-class _Files:
-    ca: Path
-    certificate: Path
-    key: Path
 
 
 class ManagerRecords:
@@ -100,9 +92,9 @@ class ManagerRecords:
         record_cache.write(self._paths.revocations, [signed])
         self._revoked = revoked
 
-    def _files(self) -> _Files:
+    def _files(self) -> CredentialPaths:
         folder = self._paths.credentials
-        return _Files(
+        return CredentialPaths(
             folder / credentials.AUTHORITY_CERTIFICATE,
             folder / f"{_STEM}.crt",
             folder / f"{_STEM}.key",

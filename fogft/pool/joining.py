@@ -35,6 +35,7 @@ from fogft.pool.credentials import Credential
 from fogft.pool.ledger import Ledger
 from fogft.pool.paths import PoolPaths
 from fogft.pool.store import PoolStore
+from fogft.wire.config import CredentialPaths
 
 FILE_LIMIT = 512 << 10
 _USED_LIMIT = 10_000
@@ -58,13 +59,6 @@ class Joined:
     config: Path
     command: str
     alone: bool = False
-
-
-@dataclass(frozen=True)
-class _Files:
-    ca: Path
-    certificate: Path
-    key: Path
 
 
 @dataclass(frozen=True)
@@ -163,7 +157,7 @@ def join(
     root: Path,
     now: float,
     *,
-    claim: Callable[[Holder, str, list[str], _Files], None] = claiming.claim,
+    claim: Callable[[Holder, str, list[str], CredentialPaths], None] = claiming.claim,
 ) -> Joined:
     """Set this machine up from a bundle, and destroy the bundle.
 
@@ -209,14 +203,14 @@ def join(
 
 
 @contextlib.contextmanager
-def _on_disk(folder: Path, files: dict[str, str], holder: Holder) -> Iterator[_Files]:
+def _on_disk(folder: Path, files: dict[str, str], holder: Holder) -> Iterator[CredentialPaths]:
     """Have credentials in files of their own before they are put where a proxy sees them."""
     stem, named = (
         holder.role.value,
         {PurePosixPath(name).name: text for name, text in files.items()},
     )
     with tempfile.TemporaryDirectory(dir=folder) as made:
-        place = _Files(*(Path(made) / n for n in ("ca.crt", f"{stem}.crt", f"{stem}.key")))
+        place = CredentialPaths(*(Path(made) / n for n in ("ca.crt", f"{stem}.crt", f"{stem}.key")))
         for path in (place.ca, place.certificate, place.key):
             disk.write_whole(path, named.get(path.name, ""))
         yield place

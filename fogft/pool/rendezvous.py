@@ -25,6 +25,7 @@ from fogft.core.record_set import RecordSet
 from fogft.pool import measures
 from fogft.scrape import Scrape
 from fogft.wire import record_cache
+from fogft.wire.config import CredentialPaths
 from fogft.wire.record_exchange import Exchange
 from fogft.wire.rendezvous_server import RendezvousServer
 from fogft.wire.signing import Verifier
@@ -33,15 +34,6 @@ log = logging.getLogger(__name__)
 
 DEFAULT_LISTEN = "0.0.0.0:7450"
 _SAVE_EVERY_S = 0.5
-
-
-@dataclass(frozen=True)
-class Credentials:
-    """Where the rendezvous finds its certificate, its key and the pool's CA."""
-
-    ca: Path
-    certificate: Path
-    key: Path
 
 
 @dataclass(frozen=True)
@@ -56,7 +48,7 @@ class RendezvousConfig:
 
     pool_uid: str
     listen: str
-    credentials: Credentials
+    credentials: CredentialPaths
     records: Path
     status: Path | None = None
     metrics: str = ""
@@ -82,7 +74,7 @@ def read_config(
         return RendezvousConfig(
             pool_uid=uid,
             listen=listen or str(raw.get("listen") or DEFAULT_LISTEN),
-            credentials=Credentials(
+            credentials=CredentialPaths(
                 *(base / str(ours[name]) for name in ("ca", "certificate", "key"))
             ),
             records=base / str(raw.get("records") or "records.json"),

@@ -20,18 +20,10 @@ from fogft.core.service_form import from_plain, seconds
 from fogft.core.spec import ServiceSpec
 from fogft.core.topics import TopicSpec
 from fogft.core.uplinks import is_interface
+from fogft.wire.config import CredentialPaths
 from fogft.wire.frame import ROBOT_BYTES_LIMIT
 
 DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
-
-
-@dataclass(frozen=True)
-class CredentialFiles:
-    """Where a process finds its certificate, its key and the pool's CA."""
-
-    ca: Path
-    certificate: Path
-    key: Path
 
 
 @dataclass(frozen=True)
@@ -57,7 +49,7 @@ class ClientProxyConfig:
     status: Path
     lease: Path
     lock: Path
-    credentials: CredentialFiles
+    credentials: CredentialPaths
     services: tuple[ServiceSpec, ...]
     suspect_after_s: float = 2.0
     tell_losers: bool = True
@@ -107,7 +99,7 @@ class ServerProxyConfig:
     services: tuple[ServiceSpec, ...]
     run: str
     workdir: Path
-    credentials: CredentialFiles
+    credentials: CredentialPaths
     envs: Mapping[str, str] = field(default_factory=dict)
     domain_id: int | None = None
     orphan_after_s: float = 3600.0
@@ -235,8 +227,8 @@ class _Reading:
             raise StateError(f"`{self._path}` is not usable: {error}", hint) from error
 
 
-def _credentials(raw: Mapping[str, str], base: Path) -> CredentialFiles:
-    return CredentialFiles(base / raw["ca"], base / raw["certificate"], base / raw["key"])
+def _credentials(raw: Mapping[str, str], base: Path) -> CredentialPaths:
+    return CredentialPaths(base / raw["ca"], base / raw["certificate"], base / raw["key"])
 
 
 def _speaks(raw: Mapping[str, Any]) -> Speaks:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from fogft.core import names
 from fogft.core.model import ReplicaId
@@ -24,20 +24,13 @@ _HANDSHAKES_LIMIT = 32
 _SIGN_OF_LIFE_EVERY_S = 2.0
 
 
-class CredentialPaths(Protocol):
+@dataclass(frozen=True)
+class CredentialPaths:
     """Where a process finds its certificate, its key and the pool's CA."""
 
-    @property
-    def ca(self) -> Path:
-        """The pool's CA."""
-
-    @property
-    def certificate(self) -> Path:
-        """Its own certificate."""
-
-    @property
-    def key(self) -> Path:
-        """Its own key."""
+    ca: Path
+    certificate: Path
+    key: Path
 
 
 @dataclass(frozen=True)

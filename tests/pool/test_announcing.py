@@ -20,10 +20,10 @@ from fogft.pool import credentials
 from fogft.pool.announcing import ManagerRecords
 from fogft.pool.paths import PoolPaths
 from fogft.wire import record_cache
+from fogft.wire.config import CredentialPaths
 from fogft.wire.record_exchange import Exchange
 from fogft.wire.rendezvous_server import RendezvousServer
 from fogft.wire.signing import Verifier
-from tests.wire.rendezvous_pool import Files
 from tests.wire.wire_pool import wait_for
 
 UID = "0123456789abcdef"
@@ -37,7 +37,9 @@ class Place:
         credentials.write(
             credentials.issue(folder, name, role=Role.RENDEZVOUS), folder, "rendezvous"
         )
-        files = Files(folder / "ca.crt", folder / "rendezvous.crt", folder / "rendezvous.key")
+        files = CredentialPaths(
+            folder / "ca.crt", folder / "rendezvous.crt", folder / "rendezvous.key"
+        )
         verify = Verifier(files.ca)
         self.records = RecordSet(UID, verify)
         self._server = RendezvousServer("127.0.0.1:0", files, verify, Exchange(self.records))

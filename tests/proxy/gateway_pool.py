@@ -19,9 +19,10 @@ from fogft.core import membership, names
 from fogft.core.holders import Role
 from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.topology import Gateway, Topology
+from fogft.wire.config import CredentialPaths
 from tests.wire.namespaces import inside
 from tests.wire.rendezvous_pool import free_port
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, Files, ReplicaProcess, wait_for
+from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
 
 ROOT = Path(__file__).parents[2]
 
@@ -120,7 +121,7 @@ class GatewayPool:
         new.write_text(json.dumps(membership.to_dict(wanted)))
         os.replace(new, path)
 
-    def config(self, stem: str, role: str, files: Files, extra: str) -> Path:
+    def config(self, stem: str, role: str, files: CredentialPaths, extra: str) -> Path:
         path = self.folder / f"{stem}.yaml"
         members = self.folder / f"{stem}-members.json"
         self._files.append(members)
@@ -148,8 +149,8 @@ class Process:
     """A gateway's process."""
 
     def __init__(
-        self, pool: GatewayPool, name: str, role: str, files: Files, *, extra: str, where: str,
-        first: int = 1,
+        self, pool: GatewayPool, name: str, role: str, files: CredentialPaths, *,
+        extra: str, where: str, first: int = 1,
     ) -> None:  # fmt: skip
         self._first = first
         self.name = name

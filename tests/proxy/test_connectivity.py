@@ -8,7 +8,6 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.records import RecordKind
 from fogft.core.roster import admission_content
 from fogft.ros import environment
+from fogft.wire.config import CredentialPaths
 from fogft.wire.rendezvous_client import RendezvousClient
 from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
 
@@ -27,13 +27,6 @@ environment.prepare(os.environ)
 
 # Requests go on while no replica can answer: the service must not be withdrawn meanwhile.
 SERVICES = "[{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 45.0, advertise: once_ready}]"
-
-
-@dataclass(frozen=True)
-class Files:
-    ca: Path
-    certificate: Path
-    key: Path
 
 
 def free_endpoint() -> str:
@@ -56,7 +49,9 @@ class Pool(Parts):
             "credentials: {ca: ca/ca.crt, certificate: rendezvous.crt, key: rendezvous.key}\n"
         )
         self.rendezvous = self.start("rendezvous", self._place)
-        files = Files(folder / "ca/ca.crt", folder / "manager.crt", folder / "manager.key")
+        files = CredentialPaths(
+            folder / "ca/ca.crt", folder / "manager.crt", folder / "manager.key"
+        )
         self.manager = RendezvousClient([self.meeting], files, UID)
         self.manager.start()
 

@@ -22,13 +22,13 @@ from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.records import Record, RecordKind
 from fogft.core.roster import admission_content
 from fogft.wire import config, frame, record_frames
-from fogft.wire.config import LinkSettings
+from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.port import Peer
 from fogft.wire.signing import Signer
 from tests.proxy.gateway_pool import GatewayPool
 from tests.wire import hostile
 from tests.wire.rendezvous_pool import free_port, manager_files
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, Files, hears, knows, wait_for
+from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, hears, knows, wait_for
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -90,13 +90,13 @@ class Scene:
         self.robot.all_right()
         assert self.state() == before
 
-    def session(self, files: Files) -> zenoh.Session:
+    def session(self, files: CredentialPaths) -> zenoh.Session:
         """Return the bare session of somebody whose certificate lets him ask the gateway."""
         name = names.gateway_certificate_name(POOL_UID, "edge")
         peer = Peer(ReplicaId(POOL_UID, SLOT, 1), self.port, name)
         return zenoh.open(config.to_zenoh(config.robot_settings(peer, files, LinkSettings())))
 
-    def greeting(self, files: Files) -> bytes:
+    def greeting(self, files: CredentialPaths) -> bytes:
         token = bytes(range(8))
         edge = names.gateway_certificate_name(POOL_UID, "edge")
         proof = Signer(files.certificate, files.key)(frame.greeted_bytes(token, edge))
@@ -162,7 +162,9 @@ def test_frames_that_cannot_be_read_at_a_gateways_port(scene):
         assert scene.pool.ran() == ran
 
 
-def _manager(files: Files, kind: RecordKind, sequence: int, content: dict[str, Any]) -> bytes:
+def _manager(
+    files: CredentialPaths, kind: RecordKind, sequence: int, content: dict[str, Any]
+) -> bytes:
     record = Record(POOL_UID, kind, "", 1, sequence, content)
     return record_frames.pack([hostile.signed(files, record)])
 

@@ -20,9 +20,10 @@ from fogft.core.records import SignedRecord, sign_record
 from fogft.pool.credentials import Role
 from fogft.wire import frame
 from fogft.wire import record_frames as frames
+from fogft.wire.config import CredentialPaths
 from fogft.wire.dial_in import PURPOSE
 from fogft.wire.signing import Signer
-from tests.wire.wire_pool import LIMIT_S, POOL_UID, Authority, Files, request_id
+from tests.wire.wire_pool import LIMIT_S, POOL_UID, Authority, request_id
 
 HELLO = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"  # how a TLS handshake begins
 JUNK: dict[str, Callable[[random.Random], bytes]] = {
@@ -53,7 +54,7 @@ def throw(endpoint: str, junk: bytes) -> None:
 # -- at a port that speaks TLS ------------------------------------------------------------------
 
 
-def tls(files: Files | None, ca: Path) -> ssl.SSLContext:
+def tls(files: CredentialPaths | None, ca: Path) -> ssl.SSLContext:
     """Return how one with such a certificate, or none, shakes hands."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
@@ -63,7 +64,7 @@ def tls(files: Files | None, ca: Path) -> ssl.SSLContext:
     return context
 
 
-def certificates(authority: Authority, stranger: Authority) -> Iterator[Files | None]:
+def certificates(authority: Authority, stranger: Authority) -> Iterator[CredentialPaths | None]:
     """None, another pool's, a replica's, a rendezvous's, a manager's, an expired one."""
     yield None
     yield stranger.robot()
@@ -123,7 +124,7 @@ def messages(slot: int, service_key: str) -> Iterator[tuple[Send, bytes, bytes |
         yield records, payload, token
 
 
-def signed(files: Files, statement: Statement) -> SignedRecord:
+def signed(files: CredentialPaths, statement: Statement) -> SignedRecord:
     return sign_record(statement, Signer(files.certificate, files.key))
 
 
@@ -137,7 +138,7 @@ def come(door: str) -> tuple[socket.socket, bytes]:
     return link, frames.read_challenge(message)[0]
 
 
-def greet(door: str, files: Files, purpose: str = PURPOSE) -> socket.socket:
+def greet(door: str, files: CredentialPaths, purpose: str = PURPOSE) -> socket.socket:
     """Return a connection on which one has said who it is."""
     link, nonce = come(door)
     proof = frames.proof_bytes(purpose, nonce, POOL_UID.encode())
@@ -145,7 +146,7 @@ def greet(door: str, files: Files, purpose: str = PURPOSE) -> socket.socket:
     return link
 
 
-def impostors(authority: Authority, folder: Path) -> Sequence[tuple[Files, str]]:
+def impostors(authority: Authority, folder: Path) -> Sequence[tuple[CredentialPaths, str]]:
     """Return who may not come in at a door, and as what each is counted."""
     id = ReplicaId(POOL_UID, 0, 1)
     elsewhere = ReplicaId("f" * 16, 0, 1)

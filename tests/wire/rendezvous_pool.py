@@ -16,8 +16,9 @@ from fogft.core.model import Member, Membership, ReplicaId
 from fogft.core.records import RecordKind
 from fogft.core.roster import SlotState, admission, admission_content, located
 from fogft.pool.credentials import Role
+from fogft.wire.config import CredentialPaths
 from fogft.wire.rendezvous_client import RendezvousClient
-from tests.wire.wire_pool import POOL_UID, Authority, Files, wait_for
+from tests.wire.wire_pool import POOL_UID, Authority, wait_for
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,7 +33,7 @@ class Rendezvous:
     """A `fogft rendezvous` process, which can be killed and started again."""
 
     def __init__(
-        self, authority: Authority, name: str, *, files: Files | None = None,
+        self, authority: Authority, name: str, *, files: CredentialPaths | None = None,
         endpoint: str = "", prefix: Sequence[str] = (),
     ) -> None:  # fmt: skip
         common_name = names.rendezvous_certificate_name(POOL_UID, name)
@@ -87,7 +88,7 @@ class Party:
     """A member of the pool that knows records."""
 
     def __init__(
-        self, files: Files, *endpoints: str, cache: Path | None = None, start: bool = True
+        self, files: CredentialPaths, *endpoints: str, cache: Path | None = None, start: bool = True
     ) -> None:
         self.changed = threading.Event()
         self.client = RendezvousClient(
@@ -123,5 +124,5 @@ class Party:
         return {record.key: record.order for record in self.client.known.records}
 
 
-def manager_files(authority: Authority) -> Files:
+def manager_files(authority: Authority) -> CredentialPaths:
     return authority.issue(names.manager_certificate_name(POOL_UID), Role.MANAGER)

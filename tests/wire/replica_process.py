@@ -17,11 +17,11 @@ from functools import lru_cache
 from pathlib import Path
 
 from fogft.core.model import ReplicaId
-from fogft.wire.config import LinkSettings
+from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.handshakes import HandshakeLog
 from fogft.wire.port import Incoming, Probe, ProbeAnswer
 from fogft.wire.zenoh_listener import ZenohListener
-from tests.wire.wire_pool import POOL_UID, SERVICE, Files, keys
+from tests.wire.wire_pool import POOL_UID, SERVICE, keys
 
 TEXT = b"the quick brown fox jumps over the lazy dog "
 
@@ -80,7 +80,7 @@ class Service(threading.Thread):
 
 def main() -> None:
     given = json.loads(sys.argv[1])
-    files = Files(Path(given["ca"]), Path(given["certificate"]), Path(given["key"]))
+    files = CredentialPaths(Path(given["ca"]), Path(given["certificate"]), Path(given["key"]))
     id = ReplicaId(POOL_UID, given["slot"], given["generation"])
     settings = LinkSettings(**given["settings"])
     listener = ZenohListener(

@@ -14,6 +14,7 @@ import pytest
 from fogft.core import names
 from fogft.core.model import LinkState, ReplicaId
 from fogft.wire import record_frames as frames
+from fogft.wire.config import CredentialPaths
 from fogft.wire.dial_in import PURPOSE, DialIn
 from fogft.wire.dial_out import WAITING, DialOut
 from fogft.wire.signing import Signer, Verifier
@@ -22,7 +23,6 @@ from tests.wire.wire_pool import (
     POOL_UID,
     SERVICE,
     Authority,
-    Files,
     request_id,
     wait_for,
 )
@@ -42,7 +42,7 @@ def door(authority: Authority) -> Iterator[DialIn]:
 def dial_out(authority: Authority) -> Iterator[Callable[..., DialOut]]:
     made: list[DialOut] = []
 
-    def start(local: str, *doors: str, files: Files | None = None) -> DialOut:
+    def start(local: str, *doors: str, files: CredentialPaths | None = None) -> DialOut:
         files = files or authority.replica()
         made.append(DialOut(local, POOL_UID, Signer(files.certificate, files.key)))
         made[-1].follow(doors)

@@ -83,11 +83,11 @@ def test_a_frozen_replica_is_suspected_and_comes_back(
 ROBOT = """
 import json, sys, time
 from pathlib import Path
-from fogft.wire.config import LinkSettings
+from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.zenoh_dialer import ZenohDialer
-from tests.wire.wire_pool import POOL_UID, SERVICE, Files, Owner, keys, peer, request_id, wait_for
+from tests.wire.wire_pool import POOL_UID, SERVICE, Owner, keys, peer, request_id, wait_for
 
-files = Files(*(Path(path) for path in sys.argv[1:4]))
+files = CredentialPaths(*(Path(path) for path in sys.argv[1:4]))
 owner = Owner()
 settings = LinkSettings(**json.loads(sys.argv[5]))
 dialer = ZenohDialer(files, robot="frozen", pool_uid=POOL_UID, settings=settings)

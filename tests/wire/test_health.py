@@ -161,10 +161,11 @@ def test_every_accepted_offer_is_answered_exactly_once(
 LEAVING = """
 import sys
 from pathlib import Path
+from fogft.wire.config import CredentialPaths
 from fogft.wire.zenoh_dialer import ZenohDialer
-from tests.wire.wire_pool import POOL_UID, SERVICE, Files, Owner, keys, peer, request_id, wait_for
+from tests.wire.wire_pool import POOL_UID, SERVICE, Owner, keys, peer, request_id, wait_for
 
-files = Files(*(Path(path) for path in sys.argv[1:4]))
+files = CredentialPaths(*(Path(path) for path in sys.argv[1:4]))
 owner = Owner()
 dialer = ZenohDialer(files, robot="robot", pool_uid=POOL_UID)
 link = dialer.dial(peer(sys.argv[4]), keys(0), owner)

@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from fogft.core.model import ReplicaId
+from fogft.wire.config import CredentialPaths
 from fogft.wire.dial_in import DialIn
 from fogft.wire.dial_out import DialOut
 from fogft.wire.signing import Signer, Verifier
 from tests.wire.namespaces import Namespaces, inside, why_not
 from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
-from tests.wire.wire_pool import POOL_UID, SERVICE, Files, request_id, wait_for
+from tests.wire.wire_pool import POOL_UID, SERVICE, request_id, wait_for
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "namespaces can be made")
 
@@ -35,7 +36,7 @@ def net() -> Iterator[Namespaces]:
 def party() -> Iterator[Callable[..., Party]]:
     made: list[Party] = []
 
-    def make(where: str, files: Files, endpoint: str) -> Party:
+    def make(where: str, files: CredentialPaths, endpoint: str) -> Party:
         with inside(where):
             made.append(Party(files, endpoint))
         return made[-1]

@@ -17,9 +17,10 @@ from fogft.core.records import Record, RecordKind, SignedRecord, sign_record
 from fogft.core.roster import admission_content
 from fogft.pool.credentials import Role
 from fogft.wire import record_cache
+from fogft.wire.config import CredentialPaths
 from fogft.wire.signing import Signer
 from tests.wire.rendezvous_pool import Party, Rendezvous, free_port, manager_files
-from tests.wire.wire_pool import POOL_UID, Authority, Files, wait_for
+from tests.wire.wire_pool import POOL_UID, Authority, wait_for
 
 
 @pytest.fixture
@@ -39,7 +40,7 @@ def rendezvous(authority: Authority) -> Iterator[Callable[..., Rendezvous]]:
 def party() -> Iterator[Callable[..., Party]]:
     made: list[Party] = []
 
-    def make(files: Files, *places: Rendezvous, cache: Path | None = None) -> Party:
+    def make(files: CredentialPaths, *places: Rendezvous, cache: Path | None = None) -> Party:
         made.append(Party(files, *(place.endpoint for place in places), cache=cache))
         return made[-1]
 

@@ -30,12 +30,13 @@ from fogft.core.records import (
 from fogft.core.roster import SlotState, admission_content
 from fogft.pool.credentials import Role
 from fogft.wire import record_frames as frames
+from fogft.wire.config import CredentialPaths
 from fogft.wire.rendezvous_dialling import Caller
 from fogft.wire.rendezvous_server import PURPOSE, binding_of
 from fogft.wire.signing import Signer
 from tests.wire import fuzz_records
 from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
-from tests.wire.wire_pool import POOL_UID, Authority, Files, wait_for
+from tests.wire.wire_pool import POOL_UID, Authority, wait_for
 
 
 class Scene:
@@ -61,13 +62,15 @@ class Scene:
         link.settimeout(10.0)
         return link
 
-    def greeted(self, files: Files, *, purpose: str = PURPOSE) -> ssl.SSLSocket:
+    def greeted(self, files: CredentialPaths, *, purpose: str = PURPOSE) -> ssl.SSLSocket:
         """Return a connection on which this one has said who it is."""
         link, greeting = self.greeting(files, purpose)
         link.sendall(greeting)
         return link
 
-    def greeting(self, files: Files, purpose: str = PURPOSE) -> tuple[ssl.SSLSocket, bytes]:
+    def greeting(
+        self, files: CredentialPaths, purpose: str = PURPOSE
+    ) -> tuple[ssl.SSLSocket, bytes]:
         """Return a connection, and what is to be said there first."""
         link = self.tls()
         nonce, _ = frames.read_challenge(next(iter(frames.Unframer().feed(link.recv(4096)))))
@@ -162,20 +165,20 @@ def test_a_greeting_that_is_cut_short(scene):
     assert scene.unchanged()
 
 
-def _stranger(authority: Authority, folder: Path) -> Files:
+def _stranger(authority: Authority, folder: Path) -> CredentialPaths:
     return Authority(folder / "stranger").robot()
 
 
-def _expired(authority: Authority, folder: Path) -> Files:
+def _expired(authority: Authority, folder: Path) -> CredentialPaths:
     name = names.robot_certificate_name(POOL_UID, "old")
     return authority.issue(name, Role.ROBOT, days=-0.5)
 
 
-def _rendezvous(authority: Authority, folder: Path) -> Files:
+def _rendezvous(authority: Authority, folder: Path) -> CredentialPaths:
     return authority.issue(names.rendezvous_certificate_name(POOL_UID, "x"), Role.RENDEZVOUS)
 
 
-def _of_another_pool(authority: Authority, folder: Path) -> Files:
+def _of_another_pool(authority: Authority, folder: Path) -> CredentialPaths:
     return authority.issue(names.robot_certificate_name("f" * 16, "r"), Role.ROBOT)
 
 
@@ -210,7 +213,7 @@ def test_a_proof_cannot_be_forged_replayed_or_meant_for_something_else(scene):
     assert scene.unchanged()
 
 
-def _signed(files: Files, record: Record) -> SignedRecord:
+def _signed(files: CredentialPaths, record: Record) -> SignedRecord:
     return sign_record(record, Signer(files.certificate, files.key))
 
 

@@ -12,6 +12,7 @@ from fogft.core import names
 from fogft.core.model import LinkState
 from fogft.core.records import Record, RecordKind, SignedRecord, sign_record
 from fogft.pool.credentials import Role
+from fogft.wire.config import CredentialPaths
 from fogft.wire.signing import Signer
 from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_link import ZenohLink
@@ -19,7 +20,6 @@ from tests.wire.wire_pool import (
     POOL_UID,
     SERVICE,
     Authority,
-    Files,
     Owner,
     ReplicaProcess,
     keys,
@@ -30,14 +30,14 @@ from tests.wire.wire_pool import (
 
 
 @pytest.fixture
-def files(authority: Authority, tmp_path: Path) -> Files:
+def files(authority: Authority, tmp_path: Path) -> CredentialPaths:
     """A robot's files, which its first generation is in."""
-    files = Files(tmp_path / "ca.crt", tmp_path / "robot.crt", tmp_path / "robot.key")
+    files = CredentialPaths(tmp_path / "ca.crt", tmp_path / "robot.crt", tmp_path / "robot.key")
     _replace(files, authority.robot("ada"))
     return files
 
 
-def _replace(files: Files, by: Files) -> None:
+def _replace(files: CredentialPaths, by: CredentialPaths) -> None:
     for path, new in ((files.ca, by.ca), (files.key, by.key), (files.certificate, by.certificate)):
         path.with_suffix(".new").write_bytes(new.read_bytes())
         path.with_suffix(".new").replace(path)
@@ -66,7 +66,7 @@ def _revoke(replica: ReplicaProcess, generation: int) -> None:
 @pytest.mark.parametrize("delay_s", [0.0, 0.2])
 def test_rotating_a_robots_credentials_loses_no_request(
     authority: Authority,
-    files: Files,
+    files: CredentialPaths,
     owner: Owner,
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
@@ -102,7 +102,7 @@ def test_rotating_a_robots_credentials_loses_no_request(
 
 def test_new_credentials_that_are_no_good_leave_the_old_link(
     authority: Authority,
-    files: Files,
+    files: CredentialPaths,
     owner: Owner,
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
@@ -113,7 +113,7 @@ def test_new_credentials_that_are_no_good_leave_the_old_link(
     link = dial(replica.endpoint, robot="ada", files=files)
     wait_for(lambda: link.usable)
     theirs = Authority(tmp_path / "stranger").robot("ada", 2)
-    _replace(files, Files(files.ca, theirs.certificate, theirs.key))
+    _replace(files, CredentialPaths(files.ca, theirs.certificate, theirs.key))
     link.renew()
     wait_for(lambda: "of another CA" in link.status().detail)
     assert link.status().state is LinkState.UP
@@ -147,7 +147,7 @@ def test_a_revoked_robot_is_shut_out_and_told_why_while_another_goes_on(
     assert owner.of(2)[0].payload == b"y"
 
 
-def _revocation(files: Files, name: str) -> SignedRecord:
+def _revocation(files: CredentialPaths, name: str) -> SignedRecord:
     content = {"names": [name]}
     record = Record(POOL_UID, RecordKind.REVOCATION, "", 1, 1, content)
     return sign_record(record, Signer(files.certificate, files.key))

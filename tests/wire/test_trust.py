@@ -14,13 +14,12 @@ from fogft.core.model import LinkState
 from fogft.pool import credentials
 from fogft.pool.credentials import Role
 from fogft.wire import config
-from fogft.wire.config import LinkSettings
+from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.zenoh_link import ZenohLink
 from tests.wire.wire_pool import (
     POOL_UID,
     SERVICE,
     Authority,
-    Files,
     Owner,
     ReplicaProcess,
     hears,
@@ -58,7 +57,10 @@ def test_a_robot_of_another_ca_is_refused(
     """It even trusts the right CA: its own certificate is what the replica refuses."""
     replica = start_replica()
     theirs = stranger.robot()
-    link = dial(replica.endpoint, files=Files(authority.robot().ca, theirs.certificate, theirs.key))
+    link = dial(
+        replica.endpoint,
+        files=CredentialPaths(authority.robot().ca, theirs.certificate, theirs.key),
+    )
     _refused(link, "of another CA")
     assert _heard_nothing(replica)
 

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import zenoh
@@ -17,7 +17,7 @@ from fogft.core import names
 from fogft.core.model import LinkState, ReplicaId
 from fogft.pool import credentials
 from fogft.pool.credentials import Role
-from fogft.wire.config import LinkSettings
+from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.port import Answer, Link, Peer
 
 POOL_UID = "0123456789abcdef"
@@ -33,15 +33,6 @@ def wait_for(condition: Callable[[], object], limit_s: float = LIMIT_S) -> None:
         time.sleep(0.005)
 
 
-@dataclass(frozen=True)
-class Files:
-    """Where a process finds its certificate, its key and the pool's CA."""
-
-    ca: Path
-    certificate: Path
-    key: Path
-
-
 class Authority:
     """A pool's CA in a folder, and what it issued; `ca` is where, if not in the same."""
 
@@ -51,19 +42,19 @@ class Authority:
         folder.mkdir(exist_ok=True)
         credentials.create_authority(self._ca, POOL_UID)
 
-    def issue(self, common_name: str, role: Role, *, days: float = 30.0) -> Files:
+    def issue(self, common_name: str, role: Role, *, days: float = 30.0) -> CredentialPaths:
         stem = f"{common_name}-{role.value}"
         credential = credentials.issue(self._ca, common_name, role=role, days=days)
         credentials.write(credential, self.folder, stem)
-        return Files(
+        return CredentialPaths(
             self.folder / "ca.crt", self.folder / f"{stem}.crt", self.folder / f"{stem}.key"
         )
 
-    def robot(self, name: str = "robot", generation: int = 1) -> Files:
+    def robot(self, name: str = "robot", generation: int = 1) -> CredentialPaths:
         name = names.robot_certificate_name(POOL_UID, name, generation)
         return self.issue(name, Role.ROBOT)
 
-    def replica(self, slot: int = 0, generation: int = 1) -> Files:
+    def replica(self, slot: int = 0, generation: int = 1) -> CredentialPaths:
         id = ReplicaId(POOL_UID, slot, generation)
         return self.issue(names.replica_certificate_name(id), Role.REPLICA)
 
@@ -131,7 +122,7 @@ class ReplicaProcess:
 
     def __init__(
         self,
-        files: Files,
+        files: CredentialPaths,
         *,
         endpoint: str = "127.0.0.1:0",
         slot: int = 0,
