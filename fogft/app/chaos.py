@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fogft.app.clouds import cloud_of, local_root, make_store
-from fogft.core.errors import FogftError
+from fogft.core.errors import FogftError, known_slots
 
 if TYPE_CHECKING:
     from fogft.cloud.local.chaos import Chaos
@@ -29,6 +29,6 @@ def machine_in(pool: str, slot: int) -> ReplicaId:
     machines = cloud_of(identity).machines(identity.uid)
     found = [machine.id for machine in machines if machine.id.slot == slot]
     if not found:
-        known = ", ".join(map(str, sorted({machine.id.slot for machine in machines}))) or "none"
+        known = known_slots(machine.id.slot for machine in machines)
         raise FogftError(f"no machine runs in slot {slot} of `{pool}`", f"slots with one: {known}")
     return max(found)

@@ -6,6 +6,8 @@ trace, and exits with status 1. Anything else is a defect of ours and keeps its 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class FogftError(Exception):
     """A failure that the user can understand and act on.
@@ -72,3 +74,8 @@ class QuotaExceeded(CloudError):
 def told(error: FogftError) -> str:
     """Return an error in one sentence, with what to do about it."""
     return f"{error.message}; {error.hint}" if error.hint else error.message
+
+
+def known_slots(slots: Iterable[int]) -> str:
+    """Return slots as a hint lists them: ``0, 1, 10``, or ``none``."""
+    return ", ".join(map(str, sorted(set(slots)))) or "none"

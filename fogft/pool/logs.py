@@ -10,7 +10,7 @@ import contextlib
 from pathlib import Path
 
 from fogft.cloud.port import Cloud
-from fogft.core.errors import CloudError, FogftError
+from fogft.core.errors import CloudError, FogftError, known_slots
 from fogft.core.history import MOVING
 from fogft.core.model import ReplicaId
 from fogft.pool.store import PoolStore
@@ -42,7 +42,7 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
         if path is not None:
             found.append((id.short, Path(path)))
     if slot is not None and not found:
-        known = ", ".join(map(str, sorted({s for s, _ in launched}))) or "none yet"
+        known = known_slots(slot for slot, _ in launched)
         raise FogftError(
             f"there is no log of a replica in slot {slot} of `{store.paths.folder.name}`",
             f"slots with one: {known}",

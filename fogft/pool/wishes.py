@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from fogft import disk
 from fogft.core import intent as intents
-from fogft.core.errors import FogftError, PoolBusy
+from fogft.core.errors import FogftError, PoolBusy, known_slots
 from fogft.core.intent import Intent
 from fogft.pool import seen
 from fogft.pool.paths import PoolPaths
@@ -68,7 +68,7 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
             f"`fogft credentials revoke replica {slot}` shuts it out",
         )
     if not found:
-        known = ", ".join(map(str, sorted({one.slot for one in status.replicas}))) or "none yet"
+        known = known_slots(replica.slot for replica in status.replicas)
         raise FogftError(
             f"pool `{status.pool}` has no replica in slot {slot}", f"slots with a replica: {known}"
         )
