@@ -30,6 +30,7 @@ _UNSENT = struct.Struct("@I"), 144
 _COUNT = struct.Struct("@i")
 _TCP_NOTSENT_LOWAT = 25
 _UNSENT_BYTES = 16 << 10
+_AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing waits for nothing, and resets
 
 
 def address(endpoint: str) -> Address:
@@ -151,6 +152,11 @@ def keep_short(connection: socket.socket) -> None:
 
 
 def end(connection: socket.socket) -> None:
-    """End a connection at both of its ends, whatever Zenoh is doing with it."""
+    """End a connection at both of its ends, whatever Zenoh is doing with it.
+
+    What its peer has not taken is dropped: Zenoh's one thread closes the socket, and would wait
+    for that peer up to 10 s (Zenoh's own SO_LINGER), and with it every link of this process.
+    """
     with contextlib.suppress(OSError):  # it ended by itself
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
         connection.shutdown(socket.SHUT_RDWR)

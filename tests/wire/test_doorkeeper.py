@@ -1,13 +1,17 @@
-"""Which strangers at the port have to go, and that their addresses are read right."""
+"""Which strangers at the port have to go, that their addresses are read right, and how they go."""
 
 from __future__ import annotations
+
+import contextlib
+import socket
+import struct
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.wire.doorkeeper import LEAST_AGE_S, PATIENCE_S, STRANGERS_LIMIT, condemned
-from fogft.wire.sockets import address
+from fogft.wire.sockets import address, end
 
 ages = st.lists(st.floats(0, 10), max_size=60)
 
@@ -48,3 +52,26 @@ def test_addresses_are_told_as_the_kernel_tells_them(
     endpoint: str, expected: tuple[str, int]
 ) -> None:
     assert address(endpoint) == expected
+
+
+def test_what_is_ended_lets_nobody_wait_for_a_peer_that_takes_nothing() -> None:
+    """Closed as Zenoh closes it, which would wait 10 s: the peer is reset at once instead."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        near = socket.create_connection(server.getsockname())
+        far, _ = server.accept()
+    with near, far:
+        near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 60))
+        near.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while near.send(bytes(1 << 16)):
+                pass
+        with near.dup() as ours:
+            end(ours)
+        near.close()
+        with pytest.raises(ConnectionResetError):
+            _read_all(far)
+
+
+def _read_all(connection: socket.socket) -> None:
+    while connection.recv(1 << 16):
+        pass

@@ -153,6 +153,29 @@ def test_a_frozen_robot_does_not_delay_another_robots_replies(
     assert link.status().reopened == 0
 
 
+def test_a_frozen_robot_is_given_up_without_delay_for_another(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+    frozen_robot: Callable[[str], subprocess.Popen[str]],
+) -> None:
+    """Its link is ended with megabytes in it; nobody waits for Zenoh to close that."""
+    settings = LinkSettings(stuck_after_s=0.5)
+    replica = start_replica(delay_s=1.0, reply_bytes=1 << 20, settings=settings)
+    robot = frozen_robot(replica.endpoint)
+    assert robot.stdout is not None
+    assert robot.stdout.readline() == "offered\n"
+    wait_for(lambda: replica.count("requests") == 60)
+    robot.send_signal(signal.SIGSTOP)
+    link = dial(replica.endpoint, suspect_after_s=7.0)  # Zenoh would wait for 10 s
+    wait_for(lambda: link.usable)
+    wait_for(lambda: replica.count("stuck_links"))
+    probes = replica.count("probes")
+    wait_for(lambda: replica.count("probes") >= probes + 2)
+    assert LinkState.SUSPECT not in {state for _, state in owner.states}
+    assert link.status().reopened == 0
+
+
 def test_a_robot_that_slept_suspects_nobody(
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
