@@ -103,6 +103,7 @@ class Dispatcher:
         self._requests: FirstResponse[Request] = FirstResponse()
         self._hedging = _policy(spec)
         self._next_look = NEVER  # when the policy wants to be asked, as the last tick said
+        self._in_burst = False
         self._links: dict[int, Link] = {}
         self._able: tuple[int, ...] = ()
         self._outcomes = Outcomes()
@@ -158,8 +159,9 @@ class Dispatcher:
         if turned_away:
             self._log_rarely("request_turned_away", turned_away, "pending is full")
             return False
+        name = self.spec.name
         for replica in chosen:
-            if not links[replica].offer(self.spec.name, request, payload, timeout_s):
+            if not links[replica].offer(name, request, payload, timeout_s, more=self._in_burst):
                 self._declined(request, replica)
         if len(chosen) > 1 and request not in self._requests:
             # Answered before the last link had it: `answered` could not reach that one.
@@ -167,6 +169,13 @@ class Dispatcher:
         if soon < self._next_look:
             self._wake()
         return True
+
+    def burst(self, begins: bool) -> None:
+        """Have what is submitted until the burst ends leave together, in few messages."""
+        self._in_burst = begins
+        if not begins:
+            for link in tuple(self._links.values()):
+                link.send()
 
     def cancel(self, request: bytes) -> None:
         """End a request that its caller no longer wants; unknown ids are fine."""

@@ -22,7 +22,7 @@ from queue import SimpleQueue
 from typing import Any, Protocol
 
 from fogft.core.errors import RosError
-from fogft.ros.port import RosClient
+from fogft.ros.port import OnBurst, RosClient
 from fogft.wire.port import Incoming, Refusal
 
 log = logging.getLogger(__name__)
@@ -271,7 +271,13 @@ class NoRos:
         """There is nothing to die."""
         return True
 
-    def serve(self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]) -> NoRos:
+    def serve(
+        self,
+        name: str,
+        type_name: str,
+        on_request: Callable[[bytes, Any], None],
+        on_burst: OnBurst | None = None,
+    ) -> NoRos:
         """Offer nothing: the listener does."""
         return self
 

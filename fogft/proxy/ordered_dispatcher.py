@@ -112,6 +112,9 @@ class OrderedDispatcher:
         """Whether a replica can answer now."""
         return self._order.ready
 
+    def burst(self, begins: bool) -> None:
+        """Do nothing: what was put in order leaves together anyway."""
+
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request, number it, and order it applied by every replica."""
         now = self._clock()

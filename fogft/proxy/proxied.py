@@ -51,7 +51,8 @@ class ProxiedService:
     def _offer(self, node: RosNode) -> None:
         spec = self.spec
         try:
-            self.server = node.serve(spec.name, spec.type, self.dispatcher.submit)
+            asked = self.dispatcher
+            self.server = node.serve(spec.name, spec.type, asked.submit, asked.burst)
         except RosError as error:  # it shall not take the other services with it
             if self.trouble != error.message:
                 self.trouble = error.message

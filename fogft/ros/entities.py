@@ -18,6 +18,7 @@ from typing import Any
 from fogft.core.errors import RosError
 from fogft.core.repeats import worth_logging
 from fogft.ros.pacing import Pacer
+from fogft.ros.port import OnBurst
 from fogft.ros.transfer import ClientEnd, ServiceEnd
 
 log = logging.getLogger(__name__)
@@ -47,12 +48,14 @@ class Server:
         end: ServiceEnd,
         on_request: Callable[[bytes, Any], None],
         withdraw: Callable[[Server], None],
+        on_burst: OnBurst | None = None,
     ) -> None:
         self.handle = service.handle
         self._service = service
         self._end: ServiceEnd | None = end
         self._take = end.take
         self._on_request = on_request
+        self._on_burst = on_burst
         self._withdraw = withdraw
         self._unreadable = _Unreadable(service.srv_name)
         self._lock = threading.Lock()
@@ -79,19 +82,46 @@ class Server:
 
     def drain(self) -> None:
         """Deliver what has arrived. Take loop only."""
-        for _ in range(BURST):
-            try:
-                taken = self._take()
-            except RosError as error:
-                self._unreadable(error)
-                return
-            if taken is None:
-                return
-            self._pacer.requested(taken[1])
-            try:
-                self._on_request(*taken)
-            except Exception:
-                log.exception("%s: a request was lost", self._service.srv_name)
+        taken = self._next()
+        if taken is None:
+            return
+        following = self._next()
+        if following is None:
+            self._deliver(taken)
+            return
+        self._tell_burst(True)
+        try:
+            self._deliver(taken)
+            for _ in range(BURST - 2):
+                self._deliver(following)
+                following = self._next()
+                if following is None:
+                    return
+            self._deliver(following)
+        finally:
+            self._tell_burst(False)
+
+    def _next(self) -> tuple[bytes, Any] | None:
+        try:
+            return self._take()
+        except RosError as error:
+            self._unreadable(error)
+            return None
+
+    def _deliver(self, taken: tuple[bytes, Any]) -> None:
+        self._pacer.requested(taken[1])
+        try:
+            self._on_request(*taken)
+        except Exception:
+            log.exception("%s: a request was lost", self._service.srv_name)
+
+    def _tell_burst(self, begins: bool) -> None:
+        if self._on_burst is None:
+            return
+        try:
+            self._on_burst(begins)
+        except Exception:
+            log.exception("%s: the end of a burst was not taken", self._service.srv_name)
 
     def destroy(self, node: Any) -> None:
         """Free everything. Take loop only, once, when no wait set holds the handle."""

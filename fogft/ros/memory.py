@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fogft.core.errors import RosError
+from fogft.ros.port import OnBurst
 
 _HEADER_BYTES = 4
 
@@ -205,7 +206,11 @@ class MemoryNode:
         return self._open
 
     def serve(
-        self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]
+        self,
+        name: str,
+        type_name: str,
+        on_request: Callable[[bytes, Any], None],
+        on_burst: OnBurst | None = None,
     ) -> MemoryServer:
         """Offer a service."""
         self._check(type_name)

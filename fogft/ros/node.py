@@ -20,7 +20,7 @@ from fogft.core import ros_names
 from fogft.core.errors import RosError
 from fogft.ros import topic_ends, transfer
 from fogft.ros.entities import Client, Server
-from fogft.ros.port import Quality
+from fogft.ros.port import OnBurst, Quality
 from fogft.ros.topic_ends import Publisher, Reader, Subscription
 from fogft.ros.visible import VisibleNode
 
@@ -109,7 +109,13 @@ class SerialisedNode:
         """Whether the take loop runs. It ends by `close`, or by an error that was logged."""
         return not self._ended.is_set()
 
-    def serve(self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]) -> Server:
+    def serve(
+        self,
+        name: str,
+        type_name: str,
+        on_request: Callable[[bytes, Any], None],
+        on_burst: OnBurst | None = None,
+    ) -> Server:
         """Offer a service. A first request may come before this returns.
 
         Raises:
@@ -121,7 +127,9 @@ class SerialisedNode:
                 service_type, name, lambda _, response: response, qos_profile=self._quality
             )
             try:
-                return Server(service, way.service_end(service), on_request, self._withdraw)
+                return Server(
+                    service, way.service_end(service), on_request, self._withdraw, on_burst
+                )
             except BaseException:
                 self._node.destroy_service(service)
                 raise

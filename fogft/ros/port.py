@@ -17,6 +17,8 @@ from typing import Any, Protocol
 
 from fogft.core.errors import RosError
 
+OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where it has ended
+
 
 class NotFoundYet(RosError):
     """Discovery does not know yet the way to who asked: sending again may help."""
@@ -104,9 +106,19 @@ class RosNode(Protocol):
         """Whether its thread runs. It ends by `close`, or by an error, which was logged."""
 
     def serve(
-        self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]
+        self,
+        name: str,
+        type_name: str,
+        on_request: Callable[[bytes, Any], None],
+        on_burst: OnBurst | None = None,
     ) -> RosServer:
-        """Offer a service; `on_request` gets the serialised request and a handle.
+        """Offer a service.
+
+        Args:
+            name: Its name.
+            type_name: Its type.
+            on_request: Gets the serialised request and a handle.
+            on_burst: Told, by the same thread, before and after requests that came together.
 
         Raises:
             RosError: The type cannot be loaded.

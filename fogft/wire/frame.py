@@ -21,7 +21,7 @@ from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.service_form import LONGEST_S
 from fogft.wire.port import Behind, Probe, ProbeAnswer
 
-VERSION = 2
+VERSION = 3
 # Beside the version, only towards peers that have said that they know them.
 _PACKED = 0x80  # the payload is compressed
 _MAY_PACK = 0x40  # the answer may be
@@ -45,7 +45,6 @@ _ANSWER = struct.Struct(f">B{REQUEST_ID_BYTES}s")
 _TOKEN = struct.Struct(f">B{TOKEN_BYTES}s")
 _GREETING = struct.Struct(f">B{TOKEN_BYTES}sH")
 _ORIGIN_AT = _REQUEST.size
-_ROBOT_AT = _ORIGIN_AT + TOKEN_BYTES
 
 
 class FrameError(ValueError):
@@ -104,6 +103,34 @@ def origin(robot: str, token: bytes) -> bytes:
     return token + name
 
 
+def read_origin(origin: bytes) -> tuple[bytes, str]:
+    """Return the token and the robot's name of what `origin` wrote.
+
+    Raises:
+        FrameError: It is no such thing.
+    """
+    token, name = origin[:TOKEN_BYTES], origin[TOKEN_BYTES:]
+    if not 0 < len(name) <= ROBOT_BYTES_LIMIT:
+        raise FrameError(f"a robot's name of {len(name)} bytes")
+    try:
+        robot = name.decode()
+    except UnicodeDecodeError as error:
+        raise FrameError("a robot's name that is not UTF-8") from error
+    if not robot.isprintable():
+        raise FrameError("a robot's name that is not printable")
+    return token, robot
+
+
+def check_remaining(remaining_s: float) -> None:
+    """Refuse a remaining time that is none.
+
+    Raises:
+        FrameError: It is negative, too long, or no number.
+    """
+    if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
+        raise FrameError(f"a remaining time of {remaining_s} s")
+
+
 def encode_request(
     request_id: bytes,
     remaining_s: float,
@@ -124,22 +151,16 @@ def decode_request(frame: bytes) -> RequestHeader:
     Raises:
         FrameError: It is not one.
     """
-    if not _ROBOT_AT < len(frame) <= _ROBOT_AT + ROBOT_BYTES_LIMIT:
+    if len(frame) < _ORIGIN_AT:
         raise FrameError(f"a request's header of {len(frame)} bytes")
     first, request_id, remaining_s = _REQUEST.unpack_from(frame)
     _check_first(first, _PACKED | _MAY_PACK | _READS_PACKED)
-    if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
-        raise FrameError(f"a remaining time of {remaining_s} s")
-    try:
-        robot = frame[_ROBOT_AT:].decode()
-    except UnicodeDecodeError as error:
-        raise FrameError("a robot's name that is not UTF-8") from error
-    if not robot.isprintable():
-        raise FrameError("a robot's name that is not printable")
+    check_remaining(remaining_s)
+    token, robot = read_origin(frame[_ORIGIN_AT:])
     return RequestHeader(
         request_id,
         remaining_s,
-        frame[_ORIGIN_AT:_ROBOT_AT],
+        token,
         robot,
         packed=bool(first & _PACKED),
         may_pack=bool(first & _MAY_PACK),
@@ -176,17 +197,28 @@ def decode_refusal(frame: bytes) -> tuple[bytes, str]:
     Raises:
         FrameError: It is not one.
     """
-    if not _ANSWER.size < len(frame) <= _ANSWER.size + REASON_LIMIT:
+    if len(frame) < _ANSWER.size:
         raise FrameError(f"a refusal of {len(frame)} bytes")
     version, request_id = _ANSWER.unpack_from(frame)
     _check_version(version)
+    return bytes(request_id), read_reason(frame[_ANSWER.size :])
+
+
+def read_reason(said: bytes) -> str:
+    """Return the reason of a refusal.
+
+    Raises:
+        FrameError: It is none.
+    """
+    if not 0 < len(said) <= REASON_LIMIT:
+        raise FrameError(f"a reason of {len(said)} bytes")
     try:
-        reason = frame[_ANSWER.size :].decode("ascii")
+        reason = said.decode("ascii")
     except UnicodeDecodeError as error:
         raise FrameError("a reason that is not ASCII") from error
     if not reason.isprintable():
         raise FrameError("a reason that is not printable")
-    return bytes(request_id), reason
+    return reason
 
 
 def greeted_bytes(token: bytes, replica: str) -> bytes:

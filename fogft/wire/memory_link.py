@@ -90,7 +90,15 @@ class MemoryLink:
         answer = self._status.probe_answer
         return answer is not None and answer.draining
 
-    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
         """Take one attempt, or return False."""
         session = self._session
         if session is None or not self.usable or service not in self._services:
@@ -127,6 +135,9 @@ class MemoryLink:
         self._forgotten.pop(attempt.request_id, None)
         if answer.payload is not None or answer.refusal == Refusal.LATE:
             self._events.late(self, attempt.service, attempt.request_id)
+
+    def send(self) -> None:
+        """Do nothing: it was sent."""
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request."""

@@ -213,12 +213,26 @@ class Link(Protocol):
     def draining(self) -> bool:
         """Whether the replica asked to be left alone. Cheap."""
 
-    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
         """Take one attempt, or return False when the window is full or the link not usable.
 
         Never blocks. `service` is the name in the pool; its key was set by `services`.
         Not to be called from within a `LinkEvents` callback: it may send.
+
+        Args:
+            more: Others follow at once, then `send`: it may wait for them, to leave in one message.
         """
+
+    def send(self) -> None:
+        """Send what was offered with `more`. Cheap; never blocks."""
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request whose answer is no longer wanted. Unknown ids are fine.

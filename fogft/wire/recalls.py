@@ -2,8 +2,8 @@
 
 Telling costs a message, and is worth it only where there is work to be saved. A request that
 was sent a moment ago is most likely answered before the message is there. So a recall is told
-at once if the request has been out for `WORTH_S`, else with the next flush, and not at all if
-the answer comes first.
+at once if the request has been out for `WORTH_S` and the replica was told nothing for `EVERY_S`,
+else with the next flush, and not at all if the answer comes first.
 
 Owns: which ids are to be told. Each step is one operation on a dictionary, which is atomic.
 """
@@ -11,6 +11,7 @@ Owns: which ids are to be told. Each step is one operation on a dictionary, whic
 from __future__ import annotations
 
 WORTH_S = 0.005
+EVERY_S = 0.01  # under load each answer has a loser: they are told together
 LIMIT = 4096  # what one message carries; further ones are not told, and their work is not saved
 
 
@@ -19,14 +20,25 @@ class Recalls:
 
     def __init__(self) -> None:
         self._ids: dict[bytes, None] = {}
+        self._told_at = float("-inf")
 
     def __bool__(self) -> bool:
         return bool(self._ids)
 
-    def add(self, request_id: bytes) -> None:
-        """Note that a request that was sent is no longer wanted."""
+    def add(self, request_id: bytes, sent_at: float, now: float) -> bool:
+        """Note that a request that was sent is no longer wanted; whether to tell at once.
+
+        Args:
+            request_id: The request.
+            sent_at: When it was sent, on the caller's clock, in seconds.
+            now: The clock.
+        """
         if len(self._ids) < LIMIT:
             self._ids[request_id] = None
+        if now - sent_at < WORTH_S or now - self._told_at < EVERY_S:
+            return False
+        self._told_at = now
+        return True
 
     def answered(self, request_id: bytes) -> None:
         """Its answer came all the same: there is nothing to be told."""

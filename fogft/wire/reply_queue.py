@@ -18,14 +18,14 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from queue import Empty, SimpleQueue
 
 import zenoh
 
 from fogft.core.repeats import worth_logging
-from fogft.wire import frame
+from fogft.wire import batch_frames, frame
 from fogft.wire.compression import Compression
 from fogft.wire.flow_watch import THIN_BYTES_PER_S
 from fogft.wire.port import Refusal
@@ -46,10 +46,10 @@ class Counters:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
 
-    def add(self, event: str) -> int:
+    def add(self, event: str, times: int = 1) -> int:
         """Count an event; return how often it has happened."""
         with self._lock:
-            self._counts[event] += 1
+            self._counts[event] += times
             return self._counts[event]
 
     def snapshot(self) -> Mapping[str, int]:
@@ -123,11 +123,34 @@ class Reply:
         self.payload = b""
         query.reply(query.key_expr, payload, attachment=header)
 
+    @property
+    def joins(self) -> bool:
+        """Whether it may leave in one message with others: small, and of an open query."""
+        small = len(self.payload) <= batch_frames.ENTRY_BYTES_LIMIT
+        return small and self.turn is None and not self.may_pack and not self.ends_only
+
     def end(self) -> None:
         """End the query, or the robot waits for more. May block as `send` does."""
         query, self.query = self.query, None
         if query is not None and self.turn is not None:
             query.drop()  # type: ignore[no-untyped-call]
+
+
+def send_together(replies: Sequence[Reply]) -> None:
+    """Send replies to one query, which stays open. May block as `Reply.send` does.
+
+    Raises:
+        zenoh.ZError: The session is closed.
+    """
+    query = replies[0].query
+    if len(replies) == 1 or query is None:
+        for reply in replies:
+            reply.send()
+        return
+    header, content = batch_frames.encode_answers(
+        [(reply.request_id, reply.payload, reply.refusal) for reply in replies]
+    )
+    query.reply(query.key_expr, content, attachment=header)
 
 
 class _Unended:
@@ -166,6 +189,30 @@ class _Queue:
         self.waiting = 0
         self.waiting_bytes = 0
         self.thread: threading.Thread | None = None
+        self._taken: list[Reply | None] = []  # it did not fit to what was taken before
+
+    def next(self, timeout_s: float) -> list[Reply]:
+        """Wait for what is to be sent next, together; nothing where all ends.
+
+        Raises:
+            Empty: Nothing came.
+        """
+        first = self._taken.pop() if self._taken else self.replies.get(timeout=timeout_s)
+        if first is None:
+            return []
+        together, size = [first], len(first.payload)
+        while first.joins and len(together) < batch_frames.LIMIT:
+            try:
+                reply = self.replies.get_nowait()
+            except Empty:
+                break
+            size += len(reply.payload) if reply is not None else 0
+            fits = size <= batch_frames.BYTES_LIMIT
+            if reply is None or not fits or not reply.joins or reply.query is not first.query:
+                self._taken.append(reply)
+                break
+            together.append(reply)
+        return together
 
 
 class ReplyQueues:
@@ -229,7 +276,7 @@ class ReplyQueues:
         unended = _Unended(self._turns)
         while True:
             try:
-                reply = queue.replies.get(timeout=_END_LOOK_S if unended else self._idle_s)
+                replies = queue.next(_END_LOOK_S if unended else self._idle_s)
             except Empty:
                 if unended:
                     self._guarded(unended.look)
@@ -239,17 +286,18 @@ class ReplyQueues:
                         continue  # one came between the time-out and the lock
                     self._queues.pop(token, None)
                     return
-            if reply is None:
+            if not replies:
                 return
-            size = len(reply.payload)
-            self._guarded(reply.send)
-            self._guarded(partial(unended.add, reply))
+            size = sum(len(reply.payload) for reply in replies)
+            self._guarded(partial(send_together, replies))
+            for reply in replies:
+                self._guarded(partial(unended.add, reply))
             if unended:
                 self._guarded(unended.look)
             with self._lock:
-                queue.waiting -= 1
+                queue.waiting -= len(replies)
                 queue.waiting_bytes -= size
-            del reply  # its payload, while this thread waits
+            del reply, replies  # their payloads, while this thread waits
 
     def _guarded(self, step: Callable[[], None]) -> None:
         try:

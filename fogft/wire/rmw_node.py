@@ -101,7 +101,13 @@ class RmwZenohNode:
         """Whether it is open."""
         return self._open and not self._session.is_closed()
 
-    def serve(self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]) -> Server:
+    def serve(
+        self,
+        name: str,
+        type_name: str,
+        on_request: Callable[[bytes, Any], None],
+        on_burst: Callable[[bool], None] | None = None,
+    ) -> Server:
         """Offer a service. A first request may come before this returns.
 
         Raises:

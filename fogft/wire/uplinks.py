@@ -83,7 +83,15 @@ class UplinksLink:
         """Whether the replica asked to be left alone."""
         return any(link.draining for link in self._links)
 
-    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
         """Take one attempt, or return False when no uplink takes it. Never blocks."""
         attempt = _Attempt(service, payload, time.monotonic() + remaining_s)
         with self._lock:
@@ -128,6 +136,9 @@ class UplinksLink:
         if ended:  # while it was sent: `forget` could not reach this uplink
             self._links[index].forget(request_id)
         return True
+
+    def send(self) -> None:
+        """Do nothing: no uplink is told of more to come."""
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request whose answer is no longer wanted, on every uplink."""

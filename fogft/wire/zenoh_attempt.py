@@ -6,9 +6,11 @@ Owns: what a connection keeps of an attempt, the meaning of a reply. Not here: s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import zenoh
 
-from fogft.wire import frame
+from fogft.wire import batch_frames, frame
 from fogft.wire.compression import unpack
 from fogft.wire.port import Answer, Refusal
 
@@ -16,7 +18,7 @@ from fogft.wire.port import Answer, Refusal
 class OpenAttempt:
     """A request on its way through one connection."""
 
-    __slots__ = (*("deadline", "mark", "offered", "payload", "request_id", "service", "size"),)
+    __slots__ = ("deadline", "mark", "offered", "payload", "request_id", "service", "size")
 
     def __init__(
         self,
@@ -36,22 +38,25 @@ class OpenAttempt:
         self.mark = 0  # what the connection had sent once this was sent (`credit`)
 
 
-def read_reply(reply: zenoh.Reply) -> Answer:
-    """Return what a replica answers to a request: a payload or a refusal.
+def read_reply(reply: zenoh.Reply) -> Sequence[Answer]:
+    """Return what a replica answers to requests: a payload or a refusal to each.
 
     Raises:
         FrameError: It does not say to which.
     """
     if reply.err is not None:
         id, refusal = frame.decode_refusal(reply.err.payload.to_bytes())
-        return Answer(id, None, refusal)
-    if reply.ok is None or reply.ok.attachment is None:
+        return (Answer(id, None, refusal),)
+    ok = reply.ok
+    if ok is None or ok.attachment is None:
         raise frame.FrameError("an answer without a header")
-    id, packed = frame.decode_answer(reply.ok.attachment.to_bytes())
-    payload = reply.ok.payload.to_bytes()
+    header, payload = ok.attachment.to_bytes(), ok.payload.to_bytes()
+    if batch_frames.is_batch(header):
+        return batch_frames.decode_answers(header, payload)
+    id, packed = frame.decode_answer(header)
     if packed:
         try:
             payload = unpack(payload)
         except ValueError:
-            return Answer(id, None, Refusal.MALFORMED)
-    return Answer(id, payload)
+            return (Answer(id, None, Refusal.MALFORMED),)
+    return (Answer(id, payload),)

@@ -19,7 +19,7 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -29,16 +29,17 @@ from zenoh import handlers
 from fogft.core import names
 from fogft.core.errors import WireError
 from fogft.core.records import Sign
-from fogft.wire import frame
+from fogft.wire import batch_frames, frame
 from fogft.wire.compression import Compression
 from fogft.wire.credit import Credit
 from fogft.wire.diagnosis import wrong_name
 from fogft.wire.flow_watch import FlowWatch
+from fogft.wire.held import Held
 from fogft.wire.in_time import InTime
 from fogft.wire.leaving import see_off
 from fogft.wire.link_window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.wire.port import Answer, Peer, Refusal
-from fogft.wire.recalls import WORTH_S, Recalls
+from fogft.wire.recalls import Recalls
 from fogft.wire.send_queue import SendQueue
 from fogft.wire.sockets import address
 from fogft.wire.turns import LARGE_BYTES, Turns
@@ -132,13 +133,13 @@ class Connection:
         self._room = room
         self._begun = False
         self._unanswered = Unanswered()
+        self._held = Held()
         self._token = secrets.token_bytes(frame.TOKEN_BYTES)
         self._origin = frame.origin(robot, self._token)
         self.certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
         greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
         self._queue = SendQueue(ways.latest)
-        self._timed = ways.timed
         self._compressions = {name: Compression() for name in keys.keys() - ways.plain}
         self.packs = False  # whether the replica reads what is compressed
         self.packs_answers = False  # whether it finds out by itself when to compress answers
@@ -166,7 +167,7 @@ class Connection:
             _close_aside(self._session, peer)
             raise
         self._in_time = InTime(
-            self._timed, self.flow.carries_bytes_per_s, self._left_bytes, self._compression
+            ways.timed, self.flow.carries_bytes_per_s, self._left_bytes, self._compression
         )
         self._thread = threading.Thread(
             target=self._run, name=f"fogft-send-{peer.id.short}", daemon=True
@@ -210,8 +211,16 @@ class Connection:
 
     # -- requests (any thread) ------------------------------------------------------------
 
-    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
-        """Take an attempt, or return False. Never blocks."""
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
+        """Take an attempt, or return False. Never blocks. With `more`, `send` must follow."""
         if service not in self._publishers or self._queue.qsize() >= _QUEUE_LIMIT:
             return False
         now = time.monotonic()
@@ -222,12 +231,46 @@ class Connection:
             return False
         mark = self._credit.take(attempt.size)
         if mark is None:
+            self.send()
             attempt.mark = self._credit.queue(attempt.size)
             self._queue.put(attempt)
-        else:  # it cannot block: the hop to another thread is saved
-            attempt.mark = mark
+            return True
+        # It cannot block: the hop to another thread is saved.
+        attempt.mark = mark
+        if (more or self._held) and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
+            self._send_together(self._held.add(attempt))
+        else:
             self._send_or_lose(attempt)
+        if not more:
+            self.send()
         return True
+
+    def send(self) -> None:
+        """Send what was offered with `more`. Never blocks: it was small, and reserved."""
+        self._send_together(self._held.take())
+
+    def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
+        if len(attempts) < 2 or self.flow.thin:  # there, each is compressed
+            for attempt in attempts:
+                self._send_or_lose(attempt)
+            return
+        now = time.monotonic()
+        parts = []
+        for attempt in attempts:
+            payload = attempt.payload  # read once, as in `_send`
+            attempt.payload = None
+            if payload is not None and self.window.holds(attempt):
+                parts.append((attempt.request_id, max(attempt.deadline - now, 0.0), payload))
+                self._unanswered.add(attempt)
+        if not parts:
+            return
+        header, content = batch_frames.encode_requests(parts, self._origin)
+        try:
+            self._publishers[attempts[0].service].put(content, attachment=header)
+        except Exception as error:  # whatever it is, the attempts must end
+            self._lose(f"sending failed: {error}")
+            for attempt in attempts:
+                self._end(attempt, None, Refusal.LOST)
 
     def _before(self, service: str) -> list[OpenAttempt]:
         """Return what leaves before an attempt that comes now."""
@@ -257,10 +300,9 @@ class Connection:
         attempt = self.window.forget(request_id)
         if attempt is None:
             return
-        if attempt.payload is None and self._recalls is not None:  # it was sent
-            self._recalls.add(request_id)
-            if time.monotonic() - attempt.offered >= WORTH_S:
-                self.flush()
+        sent, recalls, now = attempt.payload is None, self._recalls, time.monotonic()
+        if sent and recalls is not None and recalls.add(request_id, attempt.offered, now):
+            self.flush()
         attempt.payload = None
         if self.window.regained_room():
             self._room()
@@ -370,10 +412,14 @@ class Connection:
 
     def _heard(self, reply: zenoh.Reply) -> None:
         try:
-            answer = read_reply(reply)
+            answers = read_reply(reply)
         except frame.FrameError as error:
             self._lose(f"its answers cannot be read: {error}")
             return
+        for answer in answers:
+            self._take_answer(answer)
+
+    def _take_answer(self, answer: Answer) -> None:
         attempt = self._unanswered.answered(answer.request_id)
         if attempt is None:
             return  # it was answered before

@@ -127,10 +127,26 @@ class ZenohLink:
         live = self._live
         return b"" if live is None else live.certificate
 
-    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
-        """Take one attempt, or return False. Never blocks."""
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
+        """Take one attempt, or return False. Never blocks. With `more`, `send` must follow."""
         live = self._live
-        return live is not None and live.offer(service, request_id, payload, remaining_s)
+        return live is not None and live.offer(service, request_id, payload, remaining_s, more=more)
+
+    def send(self) -> None:
+        """Send what was offered with `more`. Never blocks."""
+        live = self._live
+        if live is not None:
+            live.send()
+        for retiring in tuple(self._retiring):  # a moment ago it was the live one
+            retiring.send()
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request whose answer is no longer wanted."""
@@ -142,6 +158,7 @@ class ZenohLink:
 
     def flush(self) -> None:
         """Tell the replica of all that was forgotten and not answered."""
+        self.send()
         live = self._live
         if live is not None:
             live.flush()

@@ -31,7 +31,7 @@ from fogft.core.model import ReplicaId
 from fogft.core.record_set import RecordSet, Verdict
 from fogft.core.records import RecordError, SignedRecord
 from fogft.core.repeats import worth_logging
-from fogft.wire import config, frame, record_frames
+from fogft.wire import batch_frames, config, frame, record_frames
 from fogft.wire.compression import ACCEPTED, unpack
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.doorkeeper import Doorkeeper
@@ -192,42 +192,52 @@ class ZenohListener:
     # -- Zenoh's threads ------------------------------------------------------------------
 
     def _request(self, on_request: Callable[[Incoming], None], sample: zenoh.Sample) -> None:
-        self._counters.add("requests")
         attachment = sample.attachment
+        head = attachment.to_bytes() if attachment else b""
         try:
-            header = frame.decode_request(attachment.to_bytes() if attachment else b"")
+            if batch_frames.is_batch(head):
+                requests = batch_frames.decode_requests(head, sample.payload.to_bytes())
+            else:
+                requests = [(frame.decode_request(head), sample.payload.to_bytes())]
         except frame.FrameError as error:
             self._count("malformed", "request_malformed", error)
             return
-        stream = self._streams.of(header.token)
-        if stream is None or not self._guests.admits(header.token):
+        self._counters.add("requests", len(requests))
+        token = requests[0][0].token
+        stream = self._streams.of(token)
+        if stream is None or not self._guests.admits(token):
             self._count("not_admitted", "robot_not_admitted", "it did not greet")
             if stream is not None:
-                self._refuse(header, stream, Refusal.NOT_ADMITTED)
+                self._refuse_all(requests, stream, Refusal.NOT_ADMITTED)
             return
         service = self._services.get(str(sample.key_expr))
         if service is None:
-            self._refuse(header, stream, Refusal.NOT_READY)
+            self._refuse_all(requests, stream, Refusal.NOT_READY)
             return
-        payload = sample.payload.to_bytes()
-        if header.packed:
+        for header, payload in requests:
             try:
-                payload = unpack(payload)
+                request = unpack(payload) if header.packed else payload
             except ValueError as error:
                 self._count("malformed", "request_malformed", error)
                 self._refuse(header, stream, Refusal.MALFORMED)
-                return
-        on_request(
-            ZenohIncoming(
-                service,
-                header,
-                payload,
-                stream=stream,
-                queues=self._queues,
-                chores=self._chores,
-                thin=self._thin,
+                continue
+            on_request(
+                ZenohIncoming(
+                    service,
+                    header,
+                    request,
+                    stream=stream,
+                    queues=self._queues,
+                    chores=self._chores,
+                    thin=self._thin,
+                )
             )
-        )
+
+    def _refuse_all(
+        self, requests: list[tuple[frame.RequestHeader, bytes]], stream: zenoh.Query, reason: str
+    ) -> None:
+        for header, _ in requests:
+            self._refuse(header, stream, reason)
 
     def _refuse(self, header: frame.RequestHeader, stream: zenoh.Query, reason: str) -> None:
         self._queues.put(header.token, header.robot, Reply(stream, header.request_id, b"", reason))

@@ -39,11 +39,22 @@ class FakeLink:
     def usable(self) -> bool:
         return bool(self.ready)
 
-    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
         if len(self.offered) >= self.room:
             return False
         self.offered.append((service, request_id, payload, remaining_s))
         return True
+
+    def send(self) -> None:
+        pass
 
     def forget(self, request_id: bytes) -> None:
         self.forgotten.append(request_id)
@@ -181,7 +192,7 @@ class FakeNode:
         self.refuses = ""
         self.graph: dict[str, str] = {}
 
-    def serve(self, name, type_name, on_request) -> FakeServer:
+    def serve(self, name, type_name, on_request, on_burst=None) -> FakeServer:
         if self.refuses == name:
             raise RosError("its type cannot be loaded")
         self.servers[name] = FakeServer(on_request)

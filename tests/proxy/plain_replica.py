@@ -39,7 +39,7 @@ class EchoNode:
         self._wake = threading.Condition()
         threading.Thread(target=self._answer, daemon=True).start()
 
-    def serve(self, name: str, type_name: str, on_request: Any) -> Any:
+    def serve(self, name: str, type_name: str, on_request: Any, on_burst: Any = None) -> Any:
         raise NotImplementedError
 
     def client(self, name: str, type_name: str) -> EchoNode:

@@ -42,7 +42,13 @@ class Callers:
         self.slowest_s = 0.0
         self._began: dict[int, float] = {}
 
-    def serve(self, name: str, type_name: str, on_request: Callable[[bytes, Any], None]) -> Callers:
+    def serve(
+        self,
+        name: str,
+        type_name: str,
+        on_request: Callable[[bytes, Any], None],
+        on_burst: Any = None,
+    ) -> Callers:
         self._ask[name] = on_request
         return self
 

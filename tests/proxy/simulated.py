@@ -48,7 +48,15 @@ class SimulatedLink:
         self.offers = 0
         self._attempts = count()
 
-    def offer(self, service: str, request_id: bytes, payload: bytes, remaining_s: float) -> bool:
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
         if not self.usable or request_id in self.open:
             return False
         self.offers += 1
@@ -60,6 +68,9 @@ class SimulatedLink:
             self.world.at(end, lambda: self._end(request_id, attempt, payload))
         self.world.at(self.world.now + remaining_s, lambda: self._end(request_id, attempt, None))
         return True
+
+    def send(self) -> None:
+        pass
 
     def _end(self, request: bytes, attempt: int, payload: bytes | None) -> None:
         if self.open.get(request) == attempt:
