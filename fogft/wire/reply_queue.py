@@ -181,7 +181,7 @@ class _Unended:
                 self._replies.append((since, reply))
 
 
-class _Queue:
+class ReplyQueue:
     """The replies for one connection of a robot."""
 
     def __init__(self) -> None:
@@ -231,7 +231,7 @@ class ReplyQueues:
         self._turns = turns or QueryTurns()
         self._idle_s = idle_s
         self._lock = threading.Lock()
-        self._queues: dict[bytes, _Queue] = {}
+        self._queues: dict[bytes, ReplyQueue] = {}
         self._closed = False
 
     def __len__(self) -> int:
@@ -264,15 +264,15 @@ class ReplyQueues:
         elif not reply.ends_only:
             self._counters.add("refused" if reply.refusal else "replies")
 
-    def _begin(self, token: bytes, robot: str) -> _Queue:
-        queue = self._queues[token] = _Queue()
+    def _begin(self, token: bytes, robot: str) -> ReplyQueue:
+        queue = self._queues[token] = ReplyQueue()
         queue.thread = threading.Thread(
             target=self._run, args=(token, queue), name=f"fogft-reply-{robot}", daemon=True
         )
         queue.thread.start()
         return queue
 
-    def _run(self, token: bytes, queue: _Queue) -> None:
+    def _run(self, token: bytes, queue: ReplyQueue) -> None:
         unended = _Unended(self._turns)
         while True:
             try:

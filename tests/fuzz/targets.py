@@ -31,7 +31,7 @@ from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.record_set import RecordSet
 from fogft.core.records import RecordError, RecordKind, SignedRecord
 from fogft.pool import bundle, credentials, joining
-from fogft.wire import compression, frame, record_frames, topic_frames
+from fogft.wire import batch_frames, compression, frame, record_frames, topic_frames
 from fogft.wire.frame import FrameError, Greeting
 from fogft.wire.guests import Guests, NotAdmittedError
 from fogft.wire.port import Behind, Probe, ProbeAnswer
@@ -213,6 +213,7 @@ def targets() -> dict[str, Target]:
     plain = [json.dumps(records.to_plain(one)).encode() for one in _records()]
     known = Membership("p", UID, 1, 2, (Member(ReplicaId(UID, 0, 1), "h:1"),), frozenset({ROBOT}))
     greeting = _greeting()
+    origin = frame.origin("ada", TOKEN)
     stream = b"".join(
         [
             record_frames.ping(),
@@ -227,7 +228,7 @@ def targets() -> dict[str, Target]:
             frame.decode_request,
             framed,
             (
-                frame.encode_request(ID, 1.5, frame.origin("ada", TOKEN)),
+                frame.encode_request(ID, 1.5, origin),
                 frame.encode_request(
                     ID,
                     1.5,
@@ -237,6 +238,22 @@ def targets() -> dict[str, Target]:
                     reads_packed=True,
                 ),
             ),
+        ),
+        "batch of requests": Target(
+            lambda data: batch_frames.decode_requests(data[:12], data[12:]),
+            framed,
+            (
+                b"".join(
+                    batch_frames.encode_requests(
+                        [(ID, 1.5, b"x"), (ID, 2.0, b"")], frame.origin("ada", TOKEN)
+                    )
+                ),
+            ),
+        ),
+        "batch of answers": Target(
+            lambda data: batch_frames.decode_answers(data[:1], data[1:]),
+            framed,
+            (b"".join(batch_frames.encode_answers([(ID, b"x", ""), (ID, b"", "lost")])),),
         ),
         "answer": Target(frame.decode_answer, framed, (frame.encode_answer(ID),)),
         "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(ID, "lost"),)),

@@ -31,6 +31,7 @@ class FakeLink:
         self.draining = False
         self.room = room
         self.offered: list[tuple[str, bytes, bytes, float]] = []
+        self.waits = 0  # offers that wait for more
         self.forgotten: list[bytes] = []
         self.closed = False
         self.told: ProbeAnswer | None = None
@@ -51,10 +52,11 @@ class FakeLink:
         if len(self.offered) >= self.room:
             return False
         self.offered.append((service, request_id, payload, remaining_s))
+        self.waits += more
         return True
 
     def send(self) -> None:
-        pass
+        self.waits = 0
 
     def forget(self, request_id: bytes) -> None:
         self.forgotten.append(request_id)

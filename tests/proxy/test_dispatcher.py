@@ -59,6 +59,19 @@ def test_every_replica_gets_the_request_under_one_id():
     assert all((name, payload) == ("/s", b"q") for name, _, payload, _ in offers)
 
 
+def test_a_burst_waits_for_its_end_on_every_link_and_no_longer():
+    scene = Scene(2)
+    scene.dispatcher.burst(True)
+    for number in range(3):
+        scene.dispatcher.submit(b"q", number)
+    assert [link.waits for link in scene.links] == [3, 3]
+    scene.dispatcher.burst(False)
+    assert [link.waits for link in scene.links] == [0, 0]
+    scene.dispatcher.submit(b"q", "alone")
+    assert [link.waits for link in scene.links] == [0, 0]
+    assert [len(link.offered) for link in scene.links] == [4, 4]
+
+
 def test_the_first_answer_is_returned_and_the_second_is_late():
     scene = Scene()
     scene.dispatcher.submit(b"q", "caller")
@@ -311,8 +324,8 @@ def test_a_request_that_is_answered_while_it_is_offered_is_forgotten_by_the_rest
     scene = Scene()
     offer = scene.links[0].offer
 
-    def answered_at_once(*arguments):
-        offer(*arguments)
+    def answered_at_once(*arguments, **options):
+        offer(*arguments, **options)
         scene.answer(0, b"fast")
         return True
 
