@@ -12,6 +12,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests.wire.namespaces import Namespaces, why_not
 from tests.wire.rmw_router import Router, running
 
 # No test asserts wall-clock time; Hypothesis would, by default.
@@ -69,3 +70,16 @@ def rmw_router() -> Iterator[Router]:
     """A Zenoh router, by which nodes of `rmw_zenoh` find each other."""
     with running() as router:
         yield router
+
+
+@pytest.fixture
+def net() -> Iterator[Namespaces]:
+    """Network namespaces of the test's own; without root it is skipped."""
+    reason = why_not()
+    if reason:
+        pytest.skip(reason)
+    made = Namespaces()
+    try:
+        yield made
+    finally:
+        made.close()

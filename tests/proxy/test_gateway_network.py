@@ -11,21 +11,10 @@ from collections.abc import Iterator
 import pytest
 
 from tests.proxy.gateway_pool import GatewayPool
-from tests.wire.namespaces import Namespaces, why_not
 from tests.wire.wire_pool import wait_for
 
-pytestmark = [
-    pytest.mark.timeout(120),
-    pytest.mark.skipif(bool(why_not()), reason=why_not() or "namespaces can be made"),
-]
+pytestmark = pytest.mark.timeout(120)
 PAYLOAD_BYTES = 100_000
-
-
-@pytest.fixture
-def net() -> Iterator[Namespaces]:
-    made = Namespaces()
-    yield made
-    made.close()
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import pytest
 
 from tests.proxy.gateway_pool import GatewayPool, Robot, ran
-from tests.wire.namespaces import Namespaces, why_not
 from tests.wire.rough_cable import RoughCable, why_not_rough
 from tests.wire.thin_relay import ThinRelay
 from tests.wire.wire_pool import SERVICE, wait_for
@@ -20,16 +19,7 @@ ROBOT, CLOUD = "10.85.1.1", "10.85.1.2"
 LIMIT_S = 110.0
 SIZES = (8, 1000, 20_000, 60_000)
 pytestmark = pytest.mark.timeout(240)
-needs_tun = pytest.mark.skipif(
-    bool(why_not() or why_not_rough()), reason=why_not() or why_not_rough() or "there is a TUN"
-)
-
-
-@pytest.fixture
-def net() -> Iterator[Namespaces]:
-    made = Namespaces()
-    yield made
-    made.close()
+needs_tun = pytest.mark.skipif(bool(why_not_rough()), reason=why_not_rough() or "there is a TUN")
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fogft.ros import environment
-from tests.wire.namespaces import Namespaces, why_not
+from tests.wire.namespaces import Namespaces
 
 pytestmark = pytest.mark.ros
 SCRIPT = Path(__file__).with_name("ours.py")
@@ -81,34 +81,24 @@ def test_with_discovery_off_nothing_is_found(start: Start) -> None:
     assert answered(start, limit_s=3, ROS_AUTOMATIC_DISCOVERY_RANGE="OFF") == 0
 
 
-@pytest.mark.skipif(bool(why_not()), reason=why_not() or "it can be")
-def test_static_peers_are_found_where_there_is_no_multicast(start: Start) -> None:
+def test_static_peers_are_found_where_there_is_no_multicast(net: Namespaces, start: Start) -> None:
     """Two machines whose network carries no multicast: only the peers that are named find one."""
-    spaces = Namespaces()
-    try:
-        here, there = spaces.add("ros-here"), spaces.add("ros-there")
-        cables = spaces.join(here, "10.99.7.1", there, "10.99.7.2")
-        for space, cable in zip((here, there), cables, strict=True):
-            words = ["ip", "-n", space, "link", "set", cable, "multicast", "off"]
-            subprocess.run(words, check=True)
-        # Shared memory would join two namespaces of one machine behind the network's back.
-        only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.PROFILE_VARIABLE: ""}
-        alone = {**only_udp, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        serving(start, where=there, ROS_STATIC_PEERS="10.99.7.1", **alone)
-        assert answered(start, where=here, ROS_STATIC_PEERS="10.99.7.2", **alone) == IN_FLIGHT
-    finally:
-        spaces.close()
+    here, there = net.add("ros-here"), net.add("ros-there")
+    cables = net.join(here, "10.99.7.1", there, "10.99.7.2")
+    for space, cable in zip((here, there), cables, strict=True):
+        words = ["ip", "-n", space, "link", "set", cable, "multicast", "off"]
+        subprocess.run(words, check=True)
+    # Shared memory would join two namespaces of one machine behind the network's back.
+    only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.PROFILE_VARIABLE: ""}
+    alone = {**only_udp, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    serving(start, where=there, ROS_STATIC_PEERS="10.99.7.1", **alone)
+    assert answered(start, where=here, ROS_STATIC_PEERS="10.99.7.2", **alone) == IN_FLIGHT
 
 
-@pytest.mark.skipif(bool(why_not()), reason=why_not() or "it can be")
-def test_without_named_peers_and_multicast_nothing_is_found(start: Start) -> None:
-    spaces = Namespaces()
-    try:
-        here, there = spaces.add("ros-here"), spaces.add("ros-there")
-        spaces.join(here, "10.99.8.1", there, "10.99.8.2")
-        only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.PROFILE_VARIABLE: ""}
-        alone = {**only_udp, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        serving(start, where=there, **alone)
-        assert answered(start, limit_s=3, where=here, **alone) == 0
-    finally:
-        spaces.close()
+def test_without_named_peers_and_multicast_nothing_is_found(net: Namespaces, start: Start) -> None:
+    here, there = net.add("ros-here"), net.add("ros-there")
+    net.join(here, "10.99.8.1", there, "10.99.8.2")
+    only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.PROFILE_VARIABLE: ""}
+    alone = {**only_udp, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    serving(start, where=there, **alone)
+    assert answered(start, limit_s=3, where=here, **alone) == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import json
 import os
 import subprocess
@@ -19,6 +20,7 @@ def _run(*words: str) -> None:
     subprocess.run(words, check=True, capture_output=True, text=True)
 
 
+@functools.cache
 def why_not() -> str:
     """Return why no namespace can be made here; empty where one can."""
     if os.geteuid() != 0:

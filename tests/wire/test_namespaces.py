@@ -16,20 +16,11 @@ from fogft.wire.config import CredentialPaths
 from fogft.wire.dial_in import DialIn
 from fogft.wire.dial_out import DialOut
 from fogft.wire.signing import Signer, Verifier
-from tests.wire.namespaces import Namespaces, inside, why_not
+from tests.wire.namespaces import inside
 from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
 from tests.wire.wire_pool import POOL_UID, SERVICE, request_id, wait_for
 
-pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "namespaces can be made")
-
 PLACE, ROBOT, MANAGER = "10.77.1.1", "10.77.1.2", "10.77.2.2"
-
-
-@pytest.fixture
-def net() -> Iterator[Namespaces]:
-    made = Namespaces()
-    yield made
-    made.close()
 
 
 @pytest.fixture

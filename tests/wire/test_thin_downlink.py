@@ -6,17 +6,15 @@ kernel's token buckets (root), and over loopback through a slow relay, which alw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
-
-import pytest
 
 from fogft.wire.config import LinkSettings
 from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_link import ZenohLink
-from tests.wire.namespaces import Namespaces, inside, why_not
+from tests.wire.namespaces import Namespaces, inside
 from tests.wire.replica_process import content
 from tests.wire.thin_relay import ThinRelay
 from tests.wire.wire_pool import (
@@ -39,14 +37,6 @@ PATIENT: dict[str, Any] = {
     "suspect_after_s": LONG_S,
     "settings": LinkSettings(stall_after_s=LONG_S, stuck_after_s=LONG_S),
 }
-needs_namespaces = pytest.mark.skipif(bool(why_not()), reason=why_not() or "they can be made")
-
-
-@pytest.fixture
-def net() -> Iterator[Namespaces]:
-    made = Namespaces()
-    yield made
-    made.close()
 
 
 class Asking:
@@ -127,7 +117,6 @@ def test_a_service_that_wants_none_gets_none(
         relay.close()
 
 
-@needs_namespaces
 def test_over_a_thin_cable(authority: Authority, net: Namespaces, owner: Owner) -> None:
     robot_at, replica_at = net.add("r"), net.add("p")
     _, far = net.join(robot_at, ROBOT, replica_at, REPLICA)

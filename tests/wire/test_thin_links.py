@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -18,7 +18,7 @@ from fogft.wire.config import LinkSettings
 from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_link import ZenohLink
-from tests.wire.namespaces import Namespaces, inside, why_not
+from tests.wire.namespaces import inside
 from tests.wire.thin_relay import ThinRelay
 from tests.wire.wire_pool import (
     POOL_UID,
@@ -37,14 +37,6 @@ ROBOT, REPLICA = "10.81.1.1", "10.81.1.2"
 LONG_S = 90.0
 # A busy machine is no silence, and a megabyte takes longer than that.
 PATIENT: dict[str, Any] = {"suspect_after_s": 4.0, "settings": LinkSettings(stall_after_s=4.0)}
-needs_namespaces = pytest.mark.skipif(bool(why_not()), reason=why_not() or "they can be made")
-
-
-@pytest.fixture
-def net() -> Iterator[Namespaces]:
-    made = Namespaces()
-    yield made
-    made.close()
 
 
 def answered(owner: Owner, *numbers: int) -> Callable[[], bool]:
@@ -59,7 +51,6 @@ def never_given_up(owner: Owner, links: list[ZenohLink], asked: int) -> None:
     assert LinkState.SUSPECT not in [state for _, state in owner.states]
 
 
-@needs_namespaces
 @pytest.mark.parametrize(("mbit", "reply_bytes"), [(1, 16), (2, 16), (5, -1)])
 def test_a_megabyte_gets_through_a_thin_uplink(authority, net, owner, mbit, reply_bytes):
     """At 1, 2 and 5 Mbit/s, up, and down at 5; so much silence would be suspected."""
@@ -85,7 +76,6 @@ def test_a_megabyte_gets_through_a_thin_uplink(authority, net, owner, mbit, repl
             replica.kill()
 
 
-@needs_namespaces
 def test_a_blackhole_on_a_thin_uplink_is_told_from_a_slow_one(authority, net, owner):
     """What flows is let flow; what stands still is given up, and comes back with the path."""
     robot_at, replica_at = net.add("r"), net.add("p")

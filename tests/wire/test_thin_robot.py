@@ -9,15 +9,13 @@ from __future__ import annotations
 import contextlib
 import statistics
 import time
-from collections.abc import Callable, Iterator
-
-import pytest
+from collections.abc import Callable
 
 from fogft.core.model import LinkState
 from fogft.wire.port import Answer, Link
 from fogft.wire.zenoh_dialer import ZenohDialer
 from fogft.wire.zenoh_link import ZenohLink
-from tests.wire.namespaces import Namespaces, inside, why_not
+from tests.wire.namespaces import inside
 from tests.wire.thin_relay import ThinRelay
 from tests.wire.wire_pool import (
     POOL_UID,
@@ -39,7 +37,6 @@ LONG_S = 120.0
 # A single response to the thin robot takes a thousand times as long as one to the other. What
 # other work on this machine makes of two medians a second apart is far less than this.
 AS_LONG = 100.0
-needs_namespaces = pytest.mark.skipif(bool(why_not()), reason=why_not() or "they can be made")
 
 
 class Timed(Owner):
@@ -102,13 +99,6 @@ def compare(
     return alone, beside
 
 
-@pytest.fixture
-def net() -> Iterator[Namespaces]:
-    made = Namespaces()
-    yield made
-    made.close()
-
-
 def test_a_robot_behind_a_thin_relay_does_not_delay_another(
     start_replica: Callable[..., ReplicaProcess], authority: Authority
 ) -> None:
@@ -121,7 +111,6 @@ def test_a_robot_behind_a_thin_relay_does_not_delay_another(
     assert beside < AS_LONG * alone, (alone, beside)
 
 
-@needs_namespaces
 def test_a_robot_on_a_thin_cable_does_not_delay_another(authority: Authority, net) -> None:
     replica_at, thin_at, healthy_at = net.add("p"), net.add("t"), net.add("h")
     _, far = net.join(thin_at, "10.83.1.1", replica_at, "10.83.1.2")
