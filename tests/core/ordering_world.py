@@ -1,21 +1,20 @@
-"""A sequencer, replicas with services, and a network that loses, repeats and reorders. No time
-passes by itself: each step does one thing, chosen by whoever drives the world.
+"""A sequencer, its replicas and their network. No time passes by itself: each step does one thing,
+chosen by whoever drives the world.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from fogft.core import ordering
 from fogft.core.ordered_peer import Order
-from fogft.core.ordered_replica import Begin, OrderedReplica, Refuse, Reply
-from fogft.core.ordering import START, Op
+from fogft.core.ordered_replica import OrderedReplica
+from fogft.core.ordering import START
 from fogft.core.sequencer import Sequencer
+from tests.core.service_world import LOST, Asked, Letter, ServiceWorld
 from tests.linearizability import Call
-
-LOST = "lost"
 
 
 @dataclass(eq=False)
@@ -27,58 +26,22 @@ class Sent:
     open: bool = True
 
 
-@dataclass(eq=False)
-class Letter:
-    """Something in the network: an order (to a replica), or its end (to the sequencer)."""
-
-    sent: Sent
-    to_replica: bool
-    payload: bytes | None = None
-    reason: str = ""
-
-
-@dataclass
-class Asked:
-    """A call under way."""
-
-    began: float
-    asked: Any
-    client: int
-
-
-@dataclass
-class Host:
-    """A replica: the machine in the middle, its service at the bottom."""
-
-    machine: OrderedReplica[Sent] = field(default_factory=OrderedReplica)
-    state: Any = None
-    work: Begin | None = None
-    applied: list[Any] = field(default_factory=list)
-
-
-class World:
-    """The whole of it, with a history of what callers saw.
+class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
+    """One robot's sequencer and its replicas.
 
     Args:
-        step: The service: state and question in, next state and answer out.
-        start: The service's first state.
+        step: See `ServiceWorld`.
+        start: Likewise.
         log_entries: Of the sequencer.
     """
 
     def __init__(self, step: Any, start: Any, *, replicas: int = 3, log_entries: int = 16) -> None:
-        self.step, self.start = step, start
-        self.now = 0.0
-        self.hosts: dict[int, Host] = {}
-        self.letters: list[Letter] = []
-        self.history: list[Call] = []
+        super().__init__(step, start)
         self.pending: dict[int, Asked] = {}  # by number
-        self.questions: dict[bytes, Any] = {}
         self.waiting: list[tuple[int, Asked]] = []
         self.mark = START  # on the robot's disk
         self.epoch = 0  # likewise
         self.log_entries = log_entries
-        self.next_replica = 0
-        self.restored = 0
         for _ in range(replicas):
             self.add_replica()
         self.sequencer = self.new_term()
@@ -98,8 +61,7 @@ class World:
 
     def add_replica(self) -> int:
         replica, self.next_replica = self.next_replica, self.next_replica + 1
-        self.hosts[replica] = Host(state=self.start)
-        self.hosts[replica].machine.serving = True
+        self.begin_process(replica, OrderedReplica())
         if replica >= 3 or hasattr(self, "sequencer"):
             self.reach()
         return replica
@@ -111,13 +73,6 @@ class World:
             if letter.sent.order.replica == replica:
                 self.end(letter.sent, None, LOST)
         self.reach()
-
-    def crash_service(self, replica: int) -> None:
-        """The service dies and starts anew, in its first state."""
-        host = self.hosts[replica]
-        host.work, host.state, host.applied = None, self.start, []
-        self.effects(replica, host.machine.lost())
-        host.machine.serving = True
 
     def reach(self) -> None:
         self.sequencer.reach(self.hosts, self.now)
@@ -164,21 +119,6 @@ class World:
         for order in self.sequencer.take():
             self.letters.append(Letter(Sent(self.sequencer.epoch, order), to_replica=True))
 
-    def deliver(self, at: int, *, keep: bool = False) -> None:
-        """Let a letter arrive; with `keep` it will arrive once more."""
-        letter = self.letters[at]
-        if not keep:
-            self.letters[at] = self.letters[-1]
-            self.letters.pop()
-        if letter.to_replica:
-            self.arrive(letter.sent)
-        else:
-            self.end(letter.sent, letter.payload, letter.reason)
-
-    def lose(self, at: int) -> None:
-        """The sender is told that a letter was lost: it may arrive all the same."""
-        self.end(self.letters[at].sent, None, LOST)
-
     def arrive(self, sent: Sent) -> None:
         host = self.hosts.get(sent.order.replica)
         if host is None:
@@ -188,18 +128,7 @@ class World:
         id = ordering.encode(order.op, sent.term, order.index)
         op, epoch, index = ordering.decode(id)
         effects = host.machine.order(op, epoch, index, order.payload, robot="r", to=sent)
-        self.effects(order.replica, effects)
-
-    def effects(self, replica: int, effects: list[Any]) -> None:
-        host = self.hosts[replica]
-        for effect in effects:
-            if isinstance(effect, Reply):
-                self.letters.append(Letter(effect.to, False, effect.payload))
-            elif isinstance(effect, Refuse):
-                self.letters.append(Letter(effect.to, False, None, effect.reason))
-            else:
-                assert host.work is None, "the service was given two things at once"
-                host.work = effect
+        self.effects(host, effects)
 
     def end(self, sent: Sent, payload: bytes | None, reason: str) -> None:
         if not sent.open:
@@ -222,31 +151,6 @@ class World:
         assert self.sequencer.deposed_by is None
         self.send()
 
-    # -- services -------------------------------------------------------------------------
-
-    def work(self, replica: int) -> None:
-        """The service ends what it does."""
-        host = self.hosts[replica]
-        begun, host.work = host.work, None
-        assert begun is not None
-        answer: bytes | None
-        if begun.op is Op.APPLY:
-            question = self.questions[begun.payload]
-            host.state, result = self.apply(replica, host.state, question)
-            host.applied.append(question)
-            answer = repr(result).encode()
-        elif begun.op is Op.SNAPSHOT:
-            answer = repr((host.state, host.applied)).encode()
-        else:
-            self.restored += 1
-            host.state, host.applied = eval(begun.payload.decode())
-            answer = b""
-        self.effects(replica, host.machine.done(begun.serial, answer))
-
-    def apply(self, replica: int, state: Any, question: Any) -> Any:
-        """Return the service's next state and answer."""
-        return self.step(state, question)
-
     def accepted(self, order: Order, payload: bytes) -> None:
         """Note an answer that a caller sees."""
 
@@ -256,7 +160,7 @@ class World:
         """No more faults: let everything come to rest."""
         for _ in range(limit):
             self.now += 0.001
-            working = [r for r, host in self.hosts.items() if host.work is not None]
+            working = self.working()
             if self.letters:
                 self.deliver(0)
             elif working:

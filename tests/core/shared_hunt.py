@@ -13,9 +13,9 @@ import sys
 from collections import Counter
 
 from fogft.core import catching_up, lag, shared_sequencer
+from tests.core.service_world import ask_counter, ask_key_value
 from tests.core.shared_world import SharedWorld
-from tests.core.test_ordering_simulated import ask_counter, ask_key_value
-from tests.core.test_shared_simulated import ALL_KINDS, check, drive
+from tests.core.test_shared_simulated import ALL_KINDS, drive
 from tests.linearizability import counter, key_value
 
 
@@ -41,7 +41,7 @@ def run(seed: int, seen: Counter[str]) -> None:
     seen["runs"] += 1
     seen["asked"] += world.asked
     seen["terms"] += world.moved
-    check(world, step, start)
+    world.check()
     seen["answered"] += sum(call.answered for call in world.history)
 
 

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fogft.core import ordering
-from fogft.core.ordered_replica import Begin, Refuse, Reply
-from fogft.core.ordering import START, Op, Position
+from fogft.core.ordering import START, Position
 from fogft.core.shared_replica import SharedReplica
 from fogft.core.shared_robot import Outgoing, SharedRobot
-from tests.core.ordering_world import LOST, Asked
+from tests.core.service_world import LOST, Asked, Host, Letter, ServiceWorld
 from tests.linearizability import Call
 
 
@@ -23,29 +22,8 @@ class Sent:
     """An order on its way, until it ends: exactly once."""
 
     robot: Robot
-    host: Host
+    host: Host[Any]
     what: Outgoing
-
-
-@dataclass(eq=False)
-class Letter:
-    """Something in the network: an order (to a replica), or its end (to a robot)."""
-
-    sent: Sent
-    to_replica: bool
-    payload: bytes | None = None
-    reason: str = ""
-
-
-@dataclass(eq=False)
-class Host:
-    """A replica: one process of the server proxy, with a service under it."""
-
-    replica: int
-    machine: SharedReplica[Sent]
-    state: Any = None
-    work: Begin | None = None
-    applied: list[Any] = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -57,12 +35,12 @@ class Robot:
     pending: dict[int, Asked] = field(default_factory=dict)
 
 
-class SharedWorld:
+class SharedWorld(ServiceWorld[Sent, SharedReplica[Sent]]):
     """The whole of it, with one history of what all callers saw.
 
     Args:
-        step: The service: state and question in, next state and answer out.
-        start: The service's first state.
+        step: See `ServiceWorld`.
+        start: Likewise.
         source: Chance.
         log_entries: Of a sequencer.
     """
@@ -71,19 +49,14 @@ class SharedWorld:
         self, step: Any, start: Any, source: random.Random, *,
         robots: int = 2, replicas: int = 3, log_entries: int = 64,
     ) -> None:  # fmt: skip
-        self.step, self.start, self.source = step, start, source
-        self.now = 0.0
+        super().__init__(step, start)
+        self.source = source
         self.log_entries = log_entries
-        self.letters: list[Letter] = []
         self.open: dict[Sent, None] = {}  # orders that have not ended
-        self.history: list[Call] = []
-        self.questions: dict[bytes, Any] = {}
         self.cut: set[tuple[str, int]] = set()
-        self.hosts: dict[int, Host] = {}
         self.robots: dict[str, Robot] = {}
         self.marks: dict[str, Position] = {}  # on the robots' disks
         self.epochs: dict[str, int] = {}  # likewise
-        self.next_replica = 0
         self.asked = 0
         self.moved = 0
         self.killed = 0  # calls whose proxy was killed
@@ -97,32 +70,23 @@ class SharedWorld:
 
     def add_replica(self) -> int:
         replica, self.next_replica = self.next_replica, self.next_replica + 1
-        self.begin_process(replica)
+        self.begin_process(replica, self.new_machine())
         self.reach()
         return replica
 
-    def begin_process(self, replica: int) -> None:
-        host = Host(replica, SharedReplica(self.source.getrandbits(64)), self.start)
-        host.machine.serving = True
-        self.hosts[replica] = host
+    def new_machine(self) -> SharedReplica[Sent]:
+        return SharedReplica(self.source.getrandbits(64))
 
     def kill_process(self, replica: int) -> None:
         """The server proxy is killed and started again: it remembers nothing."""
         self.lose_all(lambda sent: sent.host.replica == replica)
-        self.begin_process(replica)
+        self.begin_process(replica, self.new_machine())
 
     def remove_replica(self, replica: int) -> None:
         """The machine is gone for good."""
         del self.hosts[replica]
         self.lose_all(lambda sent: sent.host.replica == replica)
         self.reach()
-
-    def crash_service(self, replica: int) -> None:
-        """The service dies and starts anew, in its first state."""
-        host = self.hosts[replica]
-        host.work, host.state, host.applied = None, self.start, []
-        self.effects(host, host.machine.lost())
-        host.machine.serving = True
 
     def start_robot(self, name: str) -> None:
         """A client proxy begins; one that was killed has only its epoch and its mark left."""
@@ -220,21 +184,6 @@ class SharedWorld:
                 id = (what.order.op, what.epoch, what.order.index)
                 robot.brain.declined(what.order.replica, id, self.now)
 
-    def deliver(self, at: int, *, keep: bool = False) -> None:
-        """Let a letter arrive; with `keep` it will arrive once more."""
-        letter = self.letters[at]
-        if not keep:
-            self.letters[at] = self.letters[-1]
-            self.letters.pop()
-        if letter.to_replica:
-            self.arrive(letter.sent)
-        else:
-            self.end(letter.sent, letter.payload, letter.reason)
-
-    def lose(self, at: int) -> None:
-        """The sender is told that a letter was lost: it may arrive all the same."""
-        self.end(self.letters[at].sent, None, LOST)
-
     def arrive(self, sent: Sent) -> None:
         host = self.hosts.get(sent.host.replica)
         if host is None or (sent.robot.name, host.replica) in self.cut:
@@ -248,16 +197,6 @@ class SharedWorld:
             op, epoch, index, order.payload, robot=sent.robot.name, to=sent
         )  # fmt: skip
         self.effects(host, effects)
-
-    def effects(self, host: Host, effects: list[Any]) -> None:
-        for effect in effects:
-            if isinstance(effect, Reply):
-                self.letters.append(Letter(effect.to, False, effect.payload))
-            elif isinstance(effect, Refuse):
-                self.letters.append(Letter(effect.to, False, None, effect.reason))
-            else:
-                assert host.work is None, "the service was given two things at once"
-                host.work = effect
 
     def end(self, sent: Sent, payload: bytes | None, reason: str) -> None:
         if self.open.pop(sent, sent) is sent:
@@ -273,28 +212,9 @@ class SharedWorld:
         self.take_answers(robot)
         self.send(robot)
 
-    # -- services -------------------------------------------------------------------------
-
-    def work(self, replica: int) -> None:
-        """The service ends what it does."""
-        host = self.hosts[replica]
-        begun, host.work = host.work, None
-        assert begun is not None
-        answer: bytes | None
-        if begun.op is Op.APPLY:
-            host.state, result = self.step(host.state, self.questions[begun.payload])
-            assert begun.payload not in host.applied, "a request was applied twice"
-            host.applied.append(begun.payload)
-            answer = repr(result).encode()
-        elif begun.op is Op.SNAPSHOT:
-            answer = repr((host.state, host.applied)).encode()
-        else:
-            host.state, host.applied = eval(begun.payload.decode())
-            answer = b""
-        self.effects(host, host.machine.done(begun.serial, answer))
-
-    def working(self) -> list[int]:
-        return [replica for replica, host in self.hosts.items() if host.work is not None]
+    def apply(self, host: Host[SharedReplica[Sent]], payload: bytes) -> Any:
+        assert payload not in host.applied, "a request was applied twice"
+        return super().apply(host, payload)
 
     # -- the end --------------------------------------------------------------------------
 
@@ -320,6 +240,10 @@ class SharedWorld:
             for asked in robot.pending.values():
                 self.history.append(Call(asked.began, asked.asked, math.inf))
             robot.pending.clear()
+
+    def check(self) -> None:
+        self.finish()
+        super().check()
 
     def at_rest(self) -> bool:
         """Whether all is answered, and all replicas are in one state."""

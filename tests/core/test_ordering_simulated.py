@@ -6,9 +6,10 @@ import random
 
 import pytest
 
-from fogft.core import catching_up, lag
+from fogft.core import lag
 from fogft.core.catching_up import WINDOW
 from tests.core.ordering_world import World
+from tests.core.service_world import ask_counter, ask_key_value
 from tests.linearizability import Call, counter, key_value, linearizable
 
 CLIENTS = 3
@@ -19,7 +20,7 @@ def drive(world: World, source: random.Random, questions, steps: int, faults: fl
     for _ in range(steps):
         world.now += 0.001
         chance = source.random()
-        working = [r for r, host in world.hosts.items() if host.work is not None]
+        working = world.working()
         if chance < faults:
             fault(world, source)
         elif chance < faults + 0.15:
@@ -54,31 +55,6 @@ def fault(world: World, source: random.Random) -> None:
         world.give_up(source.randrange(CLIENTS))
 
 
-def ask_counter(source: random.Random):
-    return ("add", source.randint(1, 9)) if source.random() < 0.7 else ("get", 0)
-
-
-def ask_key_value(source: random.Random):
-    key = source.choice("abc")
-    return ("put", key, source.randint(0, 99)) if source.random() < 0.6 else ("get", key)
-
-
-def check(world: World, step, start) -> None:
-    answered = [call for call in world.history if call.answered]
-    assert linearizable(world.history, step, start), [*map(str, answered)]
-    if world.at_rest():
-        states = {(repr(host.state), repr(host.applied)) for host in world.hosts.values()}
-        assert len(states) == 1
-
-
-@pytest.fixture(params=["wide", "narrow"])
-def limits(request, monkeypatch) -> None:
-    """With narrow limits replicas fall too far behind all the time."""
-    if request.param == "narrow":
-        monkeypatch.setattr(lag, "LIMIT", 3)
-        monkeypatch.setattr(catching_up, "WINDOW", 2)
-
-
 @pytest.mark.usefixtures("limits")
 @pytest.mark.parametrize("seed", [*range(40), 20223])
 @pytest.mark.parametrize(
@@ -92,7 +68,7 @@ def test_histories_are_linearizable_under_faults(seed, questions, step, start):
     world = World(step, start, replicas=source.randint(1, 3), log_entries=source.choice([4, 16]))
     drive(world, source, questions, 400, faults=source.choice([0.0, 0.01, 0.05]))
     world.settle()
-    check(world, step, start)
+    world.check()
 
 
 @pytest.mark.usefixtures("limits")
@@ -115,7 +91,7 @@ def test_without_losing_every_copy_all_recover_and_agree(seed):
             world.add_replica()
         world.settle()
         assert world.at_rest(), "somebody never caught up"
-    check(world, counter, 0)
+    world.check()
 
 
 def test_all_replicas_lost_while_the_proxy_lives_loses_nothing():
@@ -145,7 +121,7 @@ def test_proxy_and_all_replicas_lost_is_said_and_never_answered_from_an_older_st
     world.new_term()
     world.ask(0, ("get", 0))
     world.settle(500)
-    assert [call.answer for call in world.history if call.answered] == [5]
+    assert world.answers() == [5]
     assert world.sequencer.stranded
 
 

@@ -13,7 +13,8 @@ import pytest
 from fogft.core.office import VACANCY_S, Office
 from fogft.core.sequencer import Sequencer
 from tests.core.ordering_world import World
-from tests.core.test_ordering_simulated import ask_counter, drive
+from tests.core.service_world import ask_counter
+from tests.core.test_ordering_simulated import drive
 from tests.linearizability import counter
 
 FACTORS = {"old": 1, "new": 2}
@@ -39,9 +40,12 @@ class Versions(World):
         self.leaving.add(replica)
         self.reach()
 
-    def apply(self, replica, state, question):
-        kind, value = question
-        return counter(state, (kind, value * FACTORS[self.version_of[replica]]))
+    def step_of(self, replica):
+        def step(state, question):
+            kind, value = question
+            return counter(state, (kind, value * FACTORS[self.version_of[replica]]))
+
+        return step
 
     def accepted(self, order, payload):
         version = self.version_of[order.replica]

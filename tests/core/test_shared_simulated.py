@@ -6,15 +6,15 @@ import random
 
 import pytest
 
-from fogft.core import catching_up, lag, ordering, shared_sequencer
+from fogft.core import ordering
 from fogft.core.ordering import START, Op
 from fogft.core.shared_orders import Vote
 from fogft.core.shared_places import PLACE_BYTES, PLACE_LIMIT, Places
 from fogft.core.shared_robot import AHEAD, SharedRobot
 from fogft.core.shared_sequencer import SharedSequencer
+from tests.core.service_world import ask_counter, ask_key_value
 from tests.core.shared_world import SharedWorld
-from tests.core.test_ordering_simulated import ask_counter, ask_key_value
-from tests.linearizability import counter, key_value, linearizable
+from tests.linearizability import counter, key_value
 
 CLIENTS = 2
 ALL_KINDS = "SSRCPMXXHHG"  # see `fault`
@@ -72,24 +72,6 @@ def fault(world: SharedWorld, kind: str) -> None:
         world.give_up(source.choice(robots), source.randrange(CLIENTS))
 
 
-def check(world: SharedWorld, step, start) -> None:
-    world.finish()
-    answered = [call for call in world.history if call.answered]
-    assert linearizable(world.history, step, start), [*map(str, answered)]
-    if world.at_rest():
-        states = {(repr(h.state), repr(h.applied)) for h in world.hosts.values()}
-        assert len(states) == 1
-
-
-@pytest.fixture(params=["wide", "narrow"])
-def limits(request, monkeypatch) -> None:
-    """With narrow limits replicas fall too far behind, and are let go, all the time."""
-    if request.param == "narrow":
-        monkeypatch.setattr(lag, "LIMIT", 3)
-        monkeypatch.setattr(catching_up, "WINDOW", 2)
-        monkeypatch.setattr(shared_sequencer, "GONE_AFTER_S", 0.2)
-
-
 @pytest.mark.usefixtures("limits")
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize(
@@ -109,7 +91,7 @@ def test_histories_are_linearizable_under_faults(seed, questions, step, start):
     drive(world, questions, 1500, faults, kinds=ALL_KINDS)
     world.heal()
     world.settle(3000)
-    check(world, step, start)
+    world.check()
 
 
 @pytest.mark.usefixtures("limits")
@@ -126,7 +108,7 @@ def test_while_a_majority_lives_all_recover_and_agree(seed):
         assert world.settle(8000, whole(world)), "somebody never caught up"
     lost = sum(not call.answered for call in world.history)
     assert lost <= world.killed
-    check(world, counter, 0)
+    world.check()
 
 
 def whole(world: SharedWorld):
@@ -151,10 +133,6 @@ def sequencer_of(world: SharedWorld) -> str:
     return name
 
 
-def answers(world: SharedWorld) -> list[int]:
-    return [call.answer for call in world.history if call.answered]
-
-
 def test_another_robot_goes_on_when_the_sequencer_is_lost():
     """What it had been answered is there, and what had been handed in is answered once."""
     world = begun()
@@ -166,7 +144,7 @@ def test_another_robot_goes_on_when_the_sequencer_is_lost():
     world.ask(other, 0, ("add", 1))
     world.kill_robot(first)
     assert world.settle(4000)
-    assert answers(world) == [1, 2, 3]
+    assert world.answers() == [1, 2, 3]
     assert sequencer_of(world) == other
 
 
@@ -182,10 +160,10 @@ def test_a_sequencer_without_a_majority_answers_nothing_and_another_goes_on():
     world.ask(other, 0, ("add", 1))
     assert world.settle(3000, lambda: bool(world.history))
     world.settle(200, lambda: False)
-    assert answers(world) == [1], "nobody was there to agree with the first"
+    assert world.answers() == [1], "nobody was there to agree with the first"
     world.heal()
     assert world.settle(4000)
-    assert answers(world) == [1, 6]
+    assert world.answers() == [1, 6]
     assert sequencer_of(world) == other
 
 
@@ -197,7 +175,7 @@ def test_one_replica_that_both_reach_is_enough_to_be_answered_through():
     world.cut_off(first, 1)
     world.ask(first, 0, ("add", 5))
     assert world.settle(3000)
-    assert answers(world) == [5]
+    assert world.answers() == [5]
     assert sequencer_of(world) != first
 
 
@@ -211,7 +189,7 @@ def test_the_services_of_all_replicas_die_while_proxies_and_sequencer_live():
         world.crash_service(replica)
     world.ask(sequencer_of(world), 0, ("add", 1))
     assert world.settle(20_000)
-    assert answers(world) == list(range(1, 52))
+    assert world.answers() == list(range(1, 52))
 
 
 def test_a_majority_lost_at_once_is_said_and_never_answered_from_an_older_state():
@@ -226,7 +204,7 @@ def test_a_majority_lost_at_once_is_said_and_never_answered_from_an_older_state(
         world.start_robot(name)
         world.ask(name, 0, ("get", 0))
     assert not world.settle(3000)
-    assert answers(world) == [5]
+    assert world.answers() == [5]
     troubles = {robot.brain.trouble for robot in world.robots.values()}
     assert any("most of the 3 replicas that have the state" in trouble for trouble in troubles)
 
@@ -244,7 +222,7 @@ def test_new_replicas_alone_do_not_begin_anew():
         world.start_robot(name)
         world.ask(name, 0, ("get", 0))
     assert not world.settle(2000)
-    assert answers(world) == [5]
+    assert world.answers() == [5]
     troubles = {robot.brain.trouble for robot in world.robots.values()}
     assert {"no replica that can be reached" in trouble for trouble in troubles} == {True}
 
@@ -259,7 +237,7 @@ def test_a_service_begins_only_with_all_replicas_that_the_pool_has():
     assert all("2 of 3 replicas" in robot.brain.trouble for robot in world.robots.values())
     world.heal()
     assert world.settle(4000)
-    assert answers(world) == [1]
+    assert world.answers() == [1]
 
 
 def test_a_robot_that_waits_for_much_is_given_no_more_numbers():
