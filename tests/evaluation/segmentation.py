@@ -64,8 +64,8 @@ class Segmentation(Defaults):
         )
 
     def trials(self, scale: Scale) -> Mapping[str, int]:
-        """As many as the paper's for `full`."""
-        return dict.fromkeys(CONDITIONS, scale.choose(quick=25, normal=150, full=300))
+        """As many as the paper's, but for `quick`."""
+        return dict.fromkeys(CONDITIONS, scale.choose(quick=25, normal=300, full=300))
 
     @contextlib.contextmanager
     def session(self, stage: Stage) -> Iterator[Run]:

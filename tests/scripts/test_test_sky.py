@@ -65,11 +65,51 @@ def test_an_unknown_option_is_wrong_usage(tree):
     assert run(tree, "scripts/test-sky", "--slow").returncode == 2
 
 
-@pytest.mark.parametrize(("status", "whole"), [(0, 0), (77, 0), (1, 1), (124, 1)])
-def test_ci_goes_on_after_a_skip_and_fails_after_a_failure(tree, status, whole):
-    for name in ("check", "test", "quickstart", "soak", "reproduce"):
+@pytest.fixture
+def ci(tree):
+    """A tree in which all that `.ci/run` calls passes, and nothing is installed."""
+    for name in ("check", "test", "quickstart", "soak", "test-sky"):
         program(tree / "scripts" / name, "#!/bin/sh\nexit 0\n")
-    program(tree / "scripts/test-sky", f"#!/bin/sh\nexit {status}\n")
-    done = run(tree, ".ci/run")
+    program(tree / "scripts/reproduce", '#!/bin/sh\necho "reproduce $*"\n')
+    (tree / "stubs").mkdir()
+    tools = dict.fromkeys(("apt-get", "g++", "cmake", "ninja", "npm"), "exit 0")
+    for name, text in {**tools, "ldconfig": "echo libEGL.so.1"}.items():
+        program(tree / "stubs" / name, f"#!/bin/sh\n{text}\n")
+    return tree
+
+
+@pytest.mark.parametrize(("status", "whole"), [(0, 0), (77, 0), (1, 1), (124, 1)])
+def test_ci_goes_on_after_a_skip_and_fails_after_a_failure(ci, status, whole):
+    program(ci / "scripts/test-sky", f"#!/bin/sh\nexit {status}\n")
+    done = run(ci, ".ci/run")
     assert done.returncode == whole
     assert ("SKIPPED: scripts/test-sky" in done.stderr) is (status == 77)
+
+
+def pip(tree: Path, text: str) -> None:
+    (tree / ".venv/bin").mkdir(parents=True)
+    program(tree / ".venv/bin/python", f"#!/bin/sh\n{text}\n")
+
+
+def test_ci_runs_every_experiment_where_the_machine_can(ci):
+    pip(ci, """echo '{"name": "torch"}'""")
+    done = run(ci, ".ci/run")
+    assert "reproduce --quick\n" in done.stdout
+    assert "SKIPPED" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("plan", "why"),
+    [
+        ("""echo '{"name": "torch"}, {"name": "nvidia-cublas-cu12"}'""", "all that GPUs need"),
+        ("exit 1", "pip does not find"),
+    ],
+)
+def test_ci_says_which_experiments_it_did_not_run_and_why(ci, plan, why):
+    pip(ci, plan)
+    done = run(ci, ".ci/run")
+    assert done.returncode == 0
+    assert "--only planning" in done.stdout
+    assert "detection" not in done.stdout
+    assert "SKIPPED: detection, segmentation and picking" in done.stderr
+    assert why in done.stderr
