@@ -87,11 +87,11 @@ class Buyer:
             spent += launch.offer.usd_per_hour
         return spent
 
-    @cached_property
+    @property
     def _resting(self) -> Mapping[str, Backoff]:
         return resting(self.history, self.observed.now)
 
-    @cached_property
+    @property
     def _avoided(self) -> Mapping[str, float]:
         return avoided(self.history, self.observed.now)
 

@@ -11,8 +11,7 @@ from dataclasses import replace
 
 from fogft.core.endings import Census, Standing
 from fogft.core.groups import BLOCK, replica_hash
-from fogft.core.health import Health, Judged, Verdict
-from fogft.core.history import History
+from fogft.core.health import Health, Verdict
 from fogft.core.intent import Intent
 from fogft.core.model import MachinePhase, Observed
 from fogft.core.needs import part
@@ -20,30 +19,31 @@ from fogft.core.sizing import Size
 from fogft.core.spec import PoolSpec
 
 _ORDER = {"drained": 0, "excluded": 1, "outdated": 3}
+_LOST = (Verdict.LEAVING, Verdict.UNRESPONSIVE)
+_DOUBTED = (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES)
 
 
 def take_census(
     spec: PoolSpec,
     intent: Intent,
     observed: Observed,
-    history: History,
     *,
     health: Health,
     size: Size,
 ) -> Census:
     """Sort every machine of the pool."""
     census = Census()
+    failed = Verdict.FAILED
     blocks = {group.block for group in size.groups}
     for judged in health.replicas:
-        record = history.record(judged.id.slot, judged.id.generation)
-        standing = Standing(judged, record)
-        if judged.id in observed.ending:
+        standing, verdict = Standing(judged), judged.verdict
+        if observed.ending and standing.id in observed.ending:
             census.ending.append(standing)
-        elif judged.verdict is Verdict.FAILED:
+        elif verdict is failed:
             census.failed.append(standing)
-        elif judged.verdict in (Verdict.LEAVING, Verdict.UNRESPONSIVE):
+        elif verdict in _LOST:
             census.lost.append(standing)
-        elif why := _unwanted(spec, intent, judged, blocks):
+        elif why := _unwanted(spec, intent, standing, blocks):
             standing.reason = why
             if _is_young(standing, health) or _never_served(standing, health):
                 census.aborted.append(standing)
@@ -77,15 +77,15 @@ def _supersede(census: Census, health: Health, size: Size) -> None:
             (census.aborted if young else census.replaced).append(goes)
 
 
-def _unwanted(spec: PoolSpec, intent: Intent, judged: Judged, blocks: Collection[int]) -> str:
+def _unwanted(spec: PoolSpec, intent: Intent, standing: Standing, blocks: Collection[int]) -> str:
     """Return why a working replica is to be replaced; empty when it is not."""
-    machine, slot = judged.machine, judged.id.slot
-    if intent.is_drained(slot, judged.id.generation):
+    machine, slot = standing.judged.machine, standing.slot
+    if intent.drained and intent.is_drained(slot, standing.id.generation):
         return "drained by the user"
     if intent.excluded and intent.is_excluded(machine.placement.location):
         return f"excluded location {machine.placement.location}"
-    if judged.verdict in (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES):
-        return judged.why
+    if standing.verdict in _DOUBTED:
+        return standing.judged.why
     if slot // BLOCK not in blocks:
         return "its group is not in the pool file"
     if machine.spec_hash != replica_hash(spec, slot):

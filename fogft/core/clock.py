@@ -88,4 +88,4 @@ class Watch:
             if self._last.awake_s - self._set[0][0] < DOUBT_S:
                 break
             self._set.popleft()
-        return sum(set_s for _, set_s in self._set)
+        return sum([set_s for _, set_s in self._set], 0.0) if self._set else 0.0

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
+S = TypeVar("S")
+_SINCE, _UNTIL = attrgetter("since"), attrgetter("until")
 
 
 @dataclass
@@ -21,21 +24,23 @@ class Lasting(Generic[T]):
     until: float
 
 
-class Digest(Generic[T]):
+class Digest(Generic[T, S]):
     """What follows from the events of each of several places, kept as long as it is so.
 
     Args:
         outdated: Places to be worked out when next asked for.
+        sum_up: Makes one answer of what is so at each place. Pure.
     """
 
-    def __init__(self, outdated: set[str]) -> None:
+    def __init__(self, outdated: set[str], sum_up: Callable[[Mapping[str, T]], S]) -> None:
         self.outdated = outdated
+        self._sum_up = sum_up
         self._known: dict[str, Lasting[T | None]] = {}
-        self._values: dict[str, T] = {}
+        self._whole = sum_up({})
         self._since, self._until = float("-inf"), float("inf")
 
-    def at(self, now: float, work_out: Callable[[str], Lasting[T | None]]) -> Mapping[str, T]:
-        """Return what is so at a time, by place; None is left out."""
+    def at(self, now: float, work_out: Callable[[str], Lasting[T | None]]) -> S:
+        """Return what is so at a time, all places summed up; None at a place is left out."""
         if not self._since <= now < self._until:
             self.outdated.update(
                 place for place, one in self._known.items() if not one.since <= now < one.until
@@ -44,13 +49,15 @@ class Digest(Generic[T]):
             for place in self.outdated:
                 self._known[place] = work_out(place)
             self.outdated.clear()
-            self._values = {p: one.value for p, one in self._known.items() if one.value is not None}
-            self._since = max(one.since for one in self._known.values())
-            self._until = min(one.until for one in self._known.values())
-        return self._values
+            self._since = max(map(_SINCE, self._known.values()))
+            self._until = min(map(_UNTIL, self._known.values()))
+            self._whole = self._sum_up(
+                {place: one.value for place, one in self._known.items() if one.value is not None}
+            )
+        return self._whole
 
 
-def outdate(digests: Mapping[Any, Digest[Any]], place: str) -> None:
+def outdate(digests: Mapping[Any, Digest[Any, Any]], place: str) -> None:
     """Have a place worked out anew in all of them."""
     for digest in digests.values():
         digest.outdated.add(place)

@@ -25,21 +25,26 @@ DRAIN_SETTLE_S = 2.0
 
 @dataclass(eq=False)
 class Standing:
-    """A judged machine with its record, and why it should be replaced, if it should."""
+    """A judged machine, and why it should be replaced, if it should.
+
+    Attributes:
+        id: The replica.
+        slot: Its slot.
+        record: What is remembered of it; None for nothing.
+        verdict: What health says.
+    """
 
     judged: Judged
-    record: Record | None
     reason: str = ""
+    id: ReplicaId = field(init=False)
+    slot: int = field(init=False)
+    record: Record | None = field(init=False)
+    verdict: Verdict = field(init=False)
 
-    @property
-    def id(self) -> ReplicaId:
-        """The replica."""
-        return self.judged.machine.id
-
-    @property
-    def slot(self) -> int:
-        """Its slot."""
-        return self.judged.machine.id.slot
+    def __post_init__(self) -> None:
+        self.id = self.judged.machine.id
+        self.slot = self.id.slot
+        self.record, self.verdict = self.judged.record, self.judged.verdict
 
     @property
     def short(self) -> str:
@@ -55,11 +60,6 @@ class Standing:
     def usd_per_hour(self) -> float:
         """What it costs."""
         return self.judged.machine.usd_per_hour
-
-    @property
-    def verdict(self) -> Verdict:
-        """What health says."""
-        return self.judged.verdict
 
     @property
     def why(self) -> str:
@@ -137,9 +137,13 @@ class Census:
 
     @property
     def live(self) -> int:
-        """Machines that count against `replicas + max_surge`."""
+        """Machines that count against `replicas + max_surge`.
+
+        Not those that are lost or have failed, whether or not they were asked to end.
+        """
         exempt = (Verdict.FAILED, Verdict.LEAVING, Verdict.UNRESPONSIVE)
-        return sum(s.verdict not in exempt for s in self.everyone())
+        kept = len(self.good) + len(self.replaced) + len(self.aborted)
+        return kept + sum(s.verdict not in exempt for s in self.ending)
 
 
 @dataclass

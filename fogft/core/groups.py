@@ -182,6 +182,8 @@ def shares(groups: tuple[Group, ...], total: int) -> tuple[int, ...]:
     The file's own numbers, with what is more or less given to or taken from the last
     group, then the one before it.
     """
+    if len(groups) == 1:
+        return (max(0, total),)
     counts = [group.replicas for group in groups]
     counts[-1] += max(0, total - sum(counts))
     for index in reversed(range(len(counts))):

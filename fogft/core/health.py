@@ -25,7 +25,7 @@ from fogft.core.model import (
     ReplicaId,
     by_id,
 )
-from fogft.core.spec import PoolSpec
+from fogft.core.spec import HealthSpec, PoolSpec
 
 # A single replica's silence looks like a dead uplink. When the cloud still answers after this
 # many times `replace_after_s`, the uplink is fine and the replica is not.
@@ -46,10 +46,16 @@ class Verdict(str, Enum):
     STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
 
 
+# Looking up a member of an Enum takes as long as all else that is asked of a healthy replica.
+_UP, _CONNECTING = LinkState.UP, LinkState.CONNECTING
+_RUNNING, _READY, _GOOD = MachinePhase.RUNNING, Phase.READY, Verdict.GOOD
+
+
 class Judged(NamedTuple):
     """One of our machines with all that is known of it.
 
     Attributes:
+        record: What is remembered of it; None for nothing.
         serving: Its link is up and its services are ready: ending it would be felt.
         may_serve: It served once and nothing proves that it does not serve now.
         why: The verdict's reason in words; empty when good.
@@ -57,6 +63,7 @@ class Judged(NamedTuple):
 
     machine: Machine
     link: LinkReport | None
+    record: Record | None
     phase: Phase
     verdict: Verdict
     serving: bool
@@ -81,6 +88,11 @@ class Health(NamedTuple):
     uplink_suspected: bool
     links_known: bool
 
+    @property
+    def running(self) -> int:
+        """How many have not failed."""
+        return sum(judged.verdict is not Verdict.FAILED for judged in self.replicas)
+
 
 def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
     """Judge what is observed. Machines of other pools are left out."""
@@ -90,40 +102,39 @@ def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -
         for machine in sorted(observed.machines or (), key=by_id)
         if machine.id.pool_uid == pool_uid
     ]
+    serving = [link is not None and is_ready(spec, machine, link) for machine, link, record in ours]
     heard = [
         link
         for machine, link, record in ours
         if link is not None
-        and machine.phase is MachinePhase.RUNNING
-        and machine.id not in observed.ending
+        and machine.phase is _RUNNING
+        and (not observed.ending or machine.id not in observed.ending)
         and was_heard(link, record)
     ]
-    answering = sum(link.state is LinkState.UP for link in heard)
+    answering = _UP in [link.state for link in heard]
     alone = len(heard) == 1
     patience_s = spec.health.replace_after_s * (LONE_SILENCE_FACTOR if alone else 1.0)
     uplink_suspected = bool(heard) and not answering
     if alone and heard[0].silent_for_s > patience_s:
         uplink_suspected = False
     may_doubt = observed.links is not None and not uplink_suspected
-    serving = [is_ready(spec, machine, link) for machine, link, _ in ours]
-    ready_somewhere = any(
+    ready_somewhere = True in serving and any(
         ready and not machine.notice for ready, (machine, _, _) in zip(serving, ours, strict=True)
     )
-    context = _Context(spec, observed, patience_s, may_doubt, ready_somewhere)
-    return Health(
-        replicas=tuple(
-            _judge_one(context, machine, link, record, ready)
-            for ready, (machine, link, record) in zip(serving, ours, strict=True)
-        ),
-        uplink_suspected=uplink_suspected,
-        links_known=observed.links is not None,
-    )
+    context = _Context(spec.health, observed.now, patience_s, may_doubt, ready_somewhere)
+    replicas = [
+        _judge_one(context, machine, link, record, ready)
+        for ready, (machine, link, record) in zip(serving, ours, strict=True)
+    ]
+    return Health(tuple(replicas), uplink_suspected, links_known=observed.links is not None)
 
 
 def was_heard(link: LinkReport, record: Record | None) -> bool:
     """Whether this replica ever answered: by its link, or by an earlier proxy's report."""
+    if link.state is not _CONNECTING:
+        return True
     ever_ready = record is not None and record.first_ready_at is not None
-    return link.state is not LinkState.CONNECTING or (ever_ready and link.silent_for_s > 0)
+    return ever_ready and link.silent_for_s > 0
 
 
 def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
@@ -131,7 +142,7 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
 
     An outdated one was launched for other services, so answering any counts.
     """
-    if link is None or link.state is not LinkState.UP or machine.phase is not MachinePhase.RUNNING:
+    if link is None or link.state is not _UP or machine.phase is not _RUNNING:
         return False
     if machine.spec_hash != replica_hash(spec, machine.id.slot):
         return bool(link.ready)
@@ -140,8 +151,8 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
 
 
 class _Context(NamedTuple):
-    spec: PoolSpec
-    observed: Observed
+    rules: HealthSpec
+    now: float
     patience_s: float
     may_doubt: bool
     ready_somewhere: bool
@@ -154,14 +165,22 @@ def _judge_one(
     record: Record | None,
     serving: bool,
 ) -> Judged:
+    if serving and _is_well(machine, link):  # as nearly all are
+        return Judged(machine, link, record, _READY, _GOOD, True, True)
     verdict, why = _verdict(context, machine, link, record, serving)
-    ever_ready = record is not None and record.first_ready_at is not None
-    answers = link is not None and link.state is LinkState.UP
-    may_serve = serving or (
-        ever_ready and not answers and verdict not in (Verdict.UNRESPONSIVE, Verdict.FAILED)
-    )
+    may_serve = serving
+    if not serving and record is not None and record.first_ready_at is not None:
+        answers = link is not None and link.state is _UP
+        may_serve = not answers and verdict not in (Verdict.UNRESPONSIVE, Verdict.FAILED)
     phase = _phase(machine, verdict, serving)
-    return Judged(machine, link, phase, verdict, serving, may_serve, why)
+    return Judged(machine, link, record, phase, verdict, serving, may_serve, why)
+
+
+def _is_well(machine: Machine, link: LinkReport | None) -> bool:
+    """Whether nobody says a word against one that serves."""
+    if machine.notice or link is None:
+        return False
+    return not (link.draining or link.disagrees or link.at_risk)
 
 
 def _phase(machine: Machine, verdict: Verdict, serving: bool) -> Phase:
@@ -181,7 +200,7 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     record: Record | None,
     serving: bool,
 ) -> tuple[Verdict, str]:
-    health, now = context.spec.health, context.observed.now
+    health, now = context.rules, context.now
     if machine.phase is MachinePhase.FAILED:
         return Verdict.FAILED, machine.failure or "error"
     if machine.notice:

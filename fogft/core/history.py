@@ -15,6 +15,7 @@ from bisect import insort
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from operator import itemgetter
 from typing import Any, NamedTuple, TypeVar
 
 from fogft.core.digest import Digest, Lasting, outdate
@@ -22,6 +23,8 @@ from fogft.core.errors import StateError
 from fogft.core.model import supply
 
 T = TypeVar("T")
+S = TypeVar("S")
+_AT = itemgetter(0)
 
 
 class EventKind(str, Enum):
@@ -46,8 +49,7 @@ CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
 _ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """One thing that happened.
 
     Attributes:
@@ -162,8 +164,8 @@ class History:
         self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
         self.version = 0  # of all facts: counts events
         # What follows from failures and proofs of each supply, and from losses at each location.
-        self._of_supplies: dict[Callable[..., Any], Digest[Any]] = {}
-        self._of_losses: dict[Callable[..., Any], Digest[Any]] = {}
+        self._of_supplies: dict[Callable[..., Any], Digest[Any, Any]] = {}
+        self._of_losses: dict[Callable[..., Any], Digest[Any, Any]] = {}
         for event in events:
             self.add(event)
 
@@ -174,8 +176,8 @@ class History:
             self._move(event)
             return
         key = (event.slot, event.generation)
-        latest = self._generations.get(event.slot, 0)
-        self._generations[event.slot] = max(latest, event.generation)
+        if event.generation > self._generations.get(event.slot, -1):
+            self._generations[event.slot] = event.generation
         record = self._records.get(key)
         if record is None:
             record = Record(event.slot, event.generation, event.at, event.location)
@@ -183,7 +185,8 @@ class History:
             self._records[key] = record
         if event.kind is EventKind.LAUNCH:  # a second one: it was thought gone, and is listed
             record.closed, record.ending = None, False
-        self._update(record, event)
+        else:
+            self._update(record, event)
         if record.closed is None:
             self._open[key] = record
         else:
@@ -230,12 +233,14 @@ class History:
 
     def _update(self, record: Record, event: Event) -> None:
         kind = event.kind
-        if kind is EventKind.READY:
+        if kind in CLOSING:
+            self._close(record, event)
+        elif kind is EventKind.READY:
             if record.first_ready_at is None:
                 record.first_ready_at = event.at
             record.unready_since = None
             self._proven_at[record.supply] = event.at
-            if record.supply in self._failures:
+            if self._failures and record.supply in self._failures:
                 outdate(self._of_supplies, record.supply)
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
@@ -248,20 +253,24 @@ class History:
         elif kind is EventKind.FAILED:
             record.failed = True
             self._fail(record, event)
-        elif kind in CLOSING:
-            if kind is EventKind.REFUSED or (kind is EventKind.GONE and died_young(record, event)):
+
+    def _close(self, record: Record, event: Event) -> None:
+        kind = event.kind
+        if kind is EventKind.REFUSED:
+            self._fail(record, event)
+        elif kind is EventKind.GONE:
+            if died_young(record, event):
                 self._fail(record, event)
-            if kind is EventKind.GONE:
-                insort(self._losses.setdefault(record.location, []), event.at)
-                outdate(self._of_losses, record.location)
-            record.closed = kind
-            record.closed_at = event.at
+            insort(self._losses.setdefault(record.location, []), event.at)
+            outdate(self._of_losses, record.location)
+        record.closed = kind
+        record.closed_at = event.at
 
     def _fail(self, record: Record, event: Event) -> None:
-        outdate(self._of_supplies, record.supply)
+        supply = record.supply
+        outdate(self._of_supplies, supply)
         cause = event.detail.split(":")[0].split(" ")[0] or "error"
-        failures = self._failures.setdefault(record.supply, [])
-        insort(failures, Failure(event.at, cause), key=lambda failure: failure.at)
+        insort(self._failures.setdefault(supply, []), Failure(event.at, cause), key=_AT)
 
     def record(self, slot: int, generation: int) -> Record | None:
         """Return what is known of a launch."""
@@ -295,34 +304,43 @@ class History:
         return self._proven_at.get(supply, float("-inf"))
 
     def of_supplies(
-        self, work_out: Callable[[History, str, float], Lasting[T | None]], now: float
-    ) -> Mapping[str, T]:
-        """Return what follows from the failures and proofs of each supply; None is left out.
+        self,
+        work_out: Callable[[History, str, float], Lasting[T | None]],
+        sum_up: Callable[[Mapping[str, T]], S],
+        now: float,
+    ) -> S:
+        """Return what follows from the failures and proofs of each supply, summed up.
 
         Args:
             work_out: Pure, and looks at nothing else of a history. It is asked again only when
-                it may say something else.
+                it may say something else. None says nothing.
+            sum_up: Pure; always the same for one `work_out`.
             now: Seconds since the epoch.
         """
-        return self._follows(self._of_supplies, self._failures, work_out, now)
+        return self._follows(self._of_supplies, self._failures, work_out, sum_up, now)
 
     def of_losses(
-        self, work_out: Callable[[History, str, float], Lasting[T | None]], now: float
-    ) -> Mapping[str, T]:
+        self,
+        work_out: Callable[[History, str, float], Lasting[T | None]],
+        sum_up: Callable[[Mapping[str, T]], S],
+        now: float,
+    ) -> S:
         """Return what follows from the losses at each location; likewise."""
-        return self._follows(self._of_losses, self._losses, work_out, now)
+        return self._follows(self._of_losses, self._losses, work_out, sum_up, now)
 
     def _follows(
         self,
-        digests: dict[Callable[..., Any], Digest[Any]],
+        digests: dict[Callable[..., Any], Digest[Any, Any]],
         places: Iterable[str],
         work_out: Callable[[History, str, float], Lasting[T | None]],
+        sum_up: Callable[[Mapping[str, T]], S],
         now: float,
-    ) -> Mapping[str, T]:
+    ) -> S:
         digest = digests.get(work_out)
         if digest is None:
-            digest = digests[work_out] = Digest(set(places))
-        return digest.at(now, lambda place: work_out(self, place, now))
+            digest = digests[work_out] = Digest(set(places), sum_up)
+        whole: S = digest.at(now, lambda place: work_out(self, place, now))
+        return whole
 
     @property
     def losses(self) -> Mapping[str, list[float]]:
@@ -338,16 +356,25 @@ def died_young(record: Record, event: Event) -> bool:
     return record.first_ready_at is None or event.at - record.first_ready_at < YOUNG_S
 
 
-def compacted(events: Iterable[Event], now: float, keep_s: float = 86_400.0) -> list[Event]:
+def compacted(
+    events: Iterable[Event],
+    now: float,
+    keep_s: float = 86_400.0,
+    *,
+    history: History | None = None,
+) -> list[Event]:
     """Drop what no decision needs any more.
 
     Kept whole: launches that are open, or to which something happened within `keep_s`.
     Kept in part: the latest launch of each slot, so that generations stay used. Of a
     kept launch's comings and goings of readiness the first READY and the last two stay. That the
     clock was set is never forgotten, that the machine slept only with all that was before.
+
+    Args:
+        history: What follows from these very events, where that is known already.
     """
     events = list(events)
-    history = History(events)
+    history = history or History(events)
     kept = {(r.slot, r.generation) for r in history.open()}
     later_s = 0.0
     for event in reversed(events):

@@ -24,7 +24,11 @@ _WITHOUT_OFFER = itemgetter(slice(0, 7))
 
 
 class Row(NamedTuple):
-    """An offer with what its rank is made of, in the order that decides between equals."""
+    """An offer with what its rank is made of, in the order that decides between equals.
+
+    Attributes:
+        supply: See `Placement.supply`.
+    """
 
     score: float
     usd_per_hour: float
@@ -34,11 +38,7 @@ class Row(NamedTuple):
     instance: str
     spot: bool
     offer: Offer
-
-    @property
-    def supply(self) -> str:
-        """See `Placement.supply`."""
-        return self.location if self.spot else supply(self.location, on_demand=True)
+    supply: str
 
 
 @dataclass(frozen=True)
@@ -154,13 +154,15 @@ def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:
                 scale.of_distance(scale.latency(place)),
             )
         region, far = regions[key]
+        location = f"{region}/{place.zone}"
         yield Row(
             scale.of_price(offer.usd_per_hour) + far,
             offer.usd_per_hour,
             place.cloud,
             region,
-            f"{region}/{place.zone}",
+            location,
             place.instance,
             place.spot,
             offer,
+            location if place.spot else supply(location, on_demand=True),
         )

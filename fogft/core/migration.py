@@ -19,16 +19,16 @@ Not here: carrying it out, which is a replacement like any other (`needs`, `buyi
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 from fogft.core.buying import Buyer
 from fogft.core.endings import Census, Standing
 from fogft.core.health import Health
 from fogft.core.listing import catalogue
+from fogft.core.model import ReplicaId
 from fogft.core.needs import home
-from fogft.core.placement import Choice, crowding, domains
+from fogft.core.placement import Choice, Crowd, crowding, domains
 from fogft.core.score import gain
 
 RETURN_AFTER_S = 600.0
@@ -54,15 +54,24 @@ class Move:
     urgency: tuple[float, ...]
 
 
-def is_restless(buyer: Buyer) -> bool:
-    """Whether anybody would move if no location rested or were avoided, and all had stayed.
+def restless(buyer: Buyer) -> frozenset[ReplicaId]:
+    """Return who would move if no location rested or were avoided, and all had stayed.
 
-    Else nobody moves before something happens, however long that takes: what a location that
-    rests no longer sells has been in question already.
+    Nobody else moves before something happens, however long that takes: what a location that
+    rests no longer sells has been in question already. Neither time nor events come into it, so
+    the last answer is kept: a quiet pool asks the same again and again.
     """
-    if buyer.spec.migration is None:
-        return False
-    return any(_would_move(buyer, standing) for standing in buyer.census.good)
+    spec, observed = buyer.spec, buyer.observed
+    if spec.migration is None:
+        return frozenset()
+    machines = [standing.judged.machine for standing in buyer.census.good]
+    question = buyer.groups, machines, buyer.budget, {**observed.rtt_s}, buyer.intent.excluded
+    offers, asked, answer = spec.derived.get("restless", ((), None, frozenset()))
+    if offers is not observed.offers or asked != question:
+        answer = frozenset(s.id for s in buyer.census.good if _would_move(buyer, s))
+        spec.derived["restless"] = observed.offers, question, answer
+    found: frozenset[ReplicaId] = answer
+    return found
 
 
 def has_stand_ins(buyer: Buyer) -> bool:
@@ -85,12 +94,12 @@ def _would_move(buyer: Buyer, standing: Standing) -> bool:
     return _is_better(buyer, standing, choice, count) is not None
 
 
-def mover(buyer: Buyer, now: float) -> Move | None:
+def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | None:
     """Return the replica that should move; None when all are well where they are.
 
     The pool is quiet. The one that gains most goes first.
     """
-    found = [*_returns(buyer, now), *_moves(buyer, now)]
+    found = [*_returns(buyer, now), *_moves(buyer, now, restless)]
     return min(found, key=lambda move: (move.urgency, move.standing.id), default=None)
 
 
@@ -108,13 +117,13 @@ def _returns(buyer: Buyer, now: float) -> Iterator[Move]:
             yield Move(standing, why, (-1.0,))
 
 
-def _moves(buyer: Buyer, now: float) -> Iterator[Move]:
+def _moves(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Iterator[Move]:
     """Yield those that would be better off elsewhere, with how much."""
     rules = buyer.spec.migration
     if rules is None:
         return
     for standing in buyer.census.good:
-        if not _stayed(standing, rules.stay_s, now):
+        if standing.id not in restless or not _stayed(standing, rules.stay_s, now):
             continue
         placement = standing.judged.machine.placement
         kind = buyer.kind(home(buyer.groups, standing.slot), standing)
@@ -127,9 +136,7 @@ def _moves(buyer: Buyer, now: float) -> Iterator[Move]:
             yield move
 
 
-def _is_better(
-    buyer: Buyer, standing: Standing, choice: Choice, count: Counter[str]
-) -> Move | None:
+def _is_better(buyer: Buyer, standing: Standing, choice: Choice, count: Crowd) -> Move | None:
     """Return the move to a place if that is so much better."""
     rules, placement = buyer.spec.migration, standing.judged.machine.placement
     offer, (avoided, *there) = choice.offer, choice.rank
@@ -146,9 +153,7 @@ def _is_better(
     return None
 
 
-def _best(
-    buyer: Buyer, standing: Standing, count: Counter[str], *, at_leisure: bool = False
-) -> Choice:
+def _best(buyer: Buyer, standing: Standing, count: Crowd, *, at_leisure: bool = False) -> Choice:
     group = home(buyer.groups, standing.slot)
     market = buyer.market(group, buyer.kind(group, standing), at_leisure=at_leisure)
     return market.choose(count, budget_usd_per_hour=buyer.budget)

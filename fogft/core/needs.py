@@ -50,23 +50,26 @@ def needed_launches(
     history: History,
     *,
     settling: bool = False,
-) -> Iterator[Need]:
-    """Yield the launches called for, over all groups.
+) -> list[Need]:
+    """Return the launches called for, over all groups.
 
     Args:
         settling: A newcomer has yet to prove itself: no further one is replaced meanwhile.
     """
-    missing = [
-        need
-        for group, wanted in zip(groups, counts, strict=True)
-        for need in _missing(group, wanted, part(census, groups, group), history)
-    ]
-    yield from missing
-    if not census.replaced:
-        return
-    one_is_coming = any(not s.ever_ready for s in census.good)
-    if missing or one_is_coming or census.ending or settling:
-        return
+    needs: list[Need] = []
+    for group, wanted in zip(groups, counts, strict=True):
+        here = part(census, groups, group)
+        if wanted > len(here.good) + len(here.replaced):
+            needs += _missing(group, wanted, here, history)
+    if needs or not census.replaced or census.ending or settling:
+        return needs
+    if any(not s.ever_ready for s in census.good):  # one is coming
+        return []
+    return _replacement(groups, counts, census)
+
+
+def _replacement(groups: Sequence[Group], counts: Sequence[int], census: Census) -> list[Need]:
+    """Return the launch of one successor; none where none is called for."""
     for standing in census.replaced:
         group = home(groups, standing.slot)
         here = part(census, groups, group)
@@ -76,14 +79,12 @@ def needed_launches(
             taken = {s.slot for s in here.good}
             free = standing.slot not in taken and group.owns(standing.slot)
             slot = standing.slot if free else _lowest_free(group, used)
-            yield Need(slot, f"replaces {standing.short}: {standing.why}", group, standing)
-            return
+            return [Need(slot, f"replaces {standing.short}: {standing.why}", group, standing)]
+    return []
 
 
 def _missing(group: Group, wanted: int, census: Census, history: History) -> Iterator[Need]:
     missing = wanted - len(census.good) - len(census.replaced)
-    if missing <= 0:
-        return
     used = {s.slot for s in (*census.good, *census.replaced)}
     vacant = [s for s in census.lost if s.slot not in used and group.owns(s.slot)]
     lost_slots = {s.slot for s in vacant}

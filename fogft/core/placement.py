@@ -13,7 +13,6 @@ Not here: the order within a rank (`listing`, `score`), how long a location rest
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -45,13 +44,21 @@ def domains(placement: Placement) -> tuple[str, str, str]:
     return placement.domains
 
 
-def crowding(taken: Iterable[Placement]) -> Counter[str]:
+class Crowd(dict[str, int]):
+    """How many replicas each failure domain holds: none where it is not named."""
+
+    def __missing__(self, domain: str) -> int:
+        return 0
+
+
+def crowding(taken: Iterable[Placement]) -> Crowd:
     """Count replicas in each failure domain."""
-    count: Counter[str] = Counter()
+    crowd = Crowd()
+    count = crowd.get
     for placement in taken:
         for domain in placement.domains:
-            count[domain] += 1
-    return count
+            crowd[domain] = count(domain, 0) + 1
+    return crowd
 
 
 class Market:
@@ -80,8 +87,8 @@ class Market:
         self.rows, self._clouds = listing.rows, listing.clouds
         asleep = listing.supplies.intersection(rests) if rests else frozenset()
         if asleep:
-            self.rows = tuple(row for row in self.rows if row.supply not in asleep)
-            self._clouds = frozenset(row.cloud for row in self.rows)
+            self.rows = tuple([row for row in self.rows if row.supply not in asleep])
+            self._clouds = frozenset([row.cloud for row in self.rows])
         if EVERYWHERE in rests:
             rest = rests[EVERYWHERE]
             self._nothing = f"waiting after {rest.failures} failed launches ({rest.cause})"
@@ -92,7 +99,7 @@ class Market:
 
     def choose(
         self,
-        taken: Iterable[Placement] | Counter[str],
+        taken: Iterable[Placement] | Crowd,
         *,
         avoid: Collection[str] = (),
         budget_usd_per_hour: float | None = None,
@@ -106,10 +113,10 @@ class Market:
         """
         if self._nothing:
             return Choice(None, self._nothing)
-        count = taken if isinstance(taken, Counter) else crowding(taken)
+        count = (taken if isinstance(taken, Crowd) else crowding(taken)).get
         avoided = self._avoid.union(avoid)
         limit = math.inf if budget_usd_per_hour is None else budget_usd_per_hour + EPSILON_USD
-        ideal = (False, min(count[cloud] for cloud in self._clouds), 0, 0)
+        ideal = (False, min([count(cloud, 0) for cloud in self._clouds]), 0, 0)
         best: Row | None = None
         best_rank: Rank | None = None
         for row in self.rows:  # by score, so the first of a rank is the best of it
@@ -117,9 +124,9 @@ class Market:
                 continue
             rank = (
                 row.location in avoided,
-                count[row.cloud],
-                count[row.region],
-                count[row.location],
+                count(row.cloud, 0),
+                count(row.region, 0),
+                count(row.location, 0),
             )
             if best_rank is None or rank < best_rank:
                 best, best_rank = row, rank

@@ -12,15 +12,15 @@ is missing (`needs`), where it goes (`buying`, `placement`), who moves (`migrati
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from fogft.core import migration, rollout
 from fogft.core.buying import Buyer, PlannedLaunch
 from fogft.core.census import take_census
 from fogft.core.endings import Census, Endings, Standing, choose_endings
-from fogft.core.health import Health, Verdict, judge
+from fogft.core.health import Health, judge
 from fogft.core.history import History
 from fogft.core.intent import Intent
 from fogft.core.model import Observed, ReplicaId
@@ -37,16 +37,14 @@ DRAIN_LIMIT_S = 10.0
 MOST_PASSES = 8
 
 
-@dataclass(frozen=True)
-class PlannedEnd:
+class PlannedEnd(NamedTuple):
     """End a machine."""
 
     id: ReplicaId
     reason: str
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """What to do now, and what is worth knowing.
 
     Attributes:
@@ -56,7 +54,7 @@ class Plan:
         health: What the plan was based on; None when the cloud could not tell.
         closed: It is known without trying that planning again while it is under way adds nothing.
         waits: For a location's rest to end: a launch that is needed, or a stand-in's return.
-        restless: Somebody would move if he had stayed long enough and no location rested.
+        restless: Who would move if they had stayed long enough and no location rested.
     """
 
     wanted: int
@@ -67,7 +65,7 @@ class Plan:
     health: Health | None = None
     closed: bool = False
     waits: bool = False
-    restless: bool = False
+    restless: frozenset[ReplicaId] = frozenset()
 
 
 def plan(
@@ -94,8 +92,10 @@ def plan(
         drain_limit_s: The longest that a replica to be ended is waited for.
         health: What `judge` makes of these very arguments, where that is known already.
     """
-    step = functools.partial(_plan_once, pool_uid, spec, intent, drain_limit_s=drain_limit_s)
-    decided = latest = step(observed, history, health=health)
+    health = health or judge(pool_uid, spec, observed, history)
+    decided = latest = _plan_once(
+        spec, intent, observed, history, health=health, drain_limit_s=drain_limit_s
+    )
     if observed.machines is None:
         return decided
     for _ in range(MOST_PASSES):
@@ -110,17 +110,17 @@ def plan(
             ends={end.id for end in decided.terminations},
             draining=decided.draining,
         )
-        latest = step(world, memory)
+        health = judge(pool_uid, spec, world, memory)
+        latest = _plan_once(spec, intent, world, memory, health=health, drain_limit_s=drain_limit_s)
         is_done = not latest.launches and not latest.terminations
         is_done = is_done and set(latest.draining) == set(decided.draining)
-        decided = replace(
-            decided,
+        decided = decided._replace(
             launches=decided.launches + latest.launches,
             terminations=decided.terminations + latest.terminations,
             draining=latest.draining,
             notes=tuple(dict.fromkeys(decided.notes + latest.notes)),
             waits=decided.waits or latest.waits,
-            restless=decided.restless or latest.restless,
+            restless=decided.restless | latest.restless,
         )
         if is_done:
             break
@@ -131,46 +131,45 @@ def _changes(decided: Plan, history: History) -> bool:
     """Whether a plan makes any difference to what the next one is based on."""
     if decided.launches or decided.terminations:
         return True
+    if not decided.draining:
+        return False
     marked = {(r.slot, r.generation) for r in history.open() if r.draining_since is not None}
     return not marked.issuperset((id.slot, id.generation) for id in decided.draining)
 
 
 def _plan_once(
-    pool_uid: str,
     spec: PoolSpec,
     intent: Intent,
     observed: Observed,
     history: History,
     *,
+    health: Health,
     drain_limit_s: float,
-    health: Health | None = None,
 ) -> Plan:
     if observed.machines is None:
         known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
         return Plan(known, notes=("the cloud cannot be reached: nothing is changed",))
-    health = health or judge(pool_uid, spec, observed, history)
     if intent.stopping:
         ends = [PlannedEnd(j.id, "down") for j in health.replicas if j.id not in observed.ending]
         return Plan(0, terminations=tuple(ends), notes=("stopping",), health=health)
 
-    running = sum(j.verdict is not Verdict.FAILED for j in health.replicas)
-    sized = size(spec, intent, observed, running)
-    census = take_census(spec, intent, observed, history, health=health, size=sized)
+    sized = size(spec, intent, observed, health.running if spec.availability else 0)
+    census = take_census(spec, intent, observed, health=health, size=sized)
     counts, excess = _within_cap(sized, census)
     wanted = sum(counts)
     buyer = Buyer(spec, intent, observed, history, census, sized.groups, sized.max_usd_per_hour)
-    settling = rollout.is_settling(census, observed.now)
-    needs = list(needed_launches(sized.groups, counts, census, history, settling=settling))
+    settling = bool(census.replaced) and rollout.is_settling(census, observed.now)
+    needs = needed_launches(sized.groups, counts, census, history, settling=settling)
     may_move = not needs and len(census.good) == wanted and spec.max_surge > 0
     may_move = may_move and migration.is_quiet(census, health)
     waits = may_move and migration.has_stand_ins(buyer)
-    restless = may_move and migration.is_restless(buyer)
+    restless = migration.restless(buyer) if may_move else frozenset()
     if waits or restless:
-        found = migration.mover(buyer, observed.now)
+        found = migration.mover(buyer, observed.now, restless)
         if found is not None:
             census.good.remove(found.standing)
             census.replaced.append(replace(found.standing, reason=found.why))
-            needs = list(needed_launches(sized.groups, counts, census, history))
+            needs = needed_launches(sized.groups, counts, census, history)
     room = wanted + spec.max_surge - census.live
     first: Standing | None = None
     for need in needs:
@@ -178,7 +177,9 @@ def _plan_once(
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
             waits = True
             break
-    held = [s.id for s in census.replaced if rollout.is_outdated(s) and not s.draining_since]
+    held: Sequence[ReplicaId] = ()
+    if settling:
+        held = [s.id for s in census.replaced if rollout.is_outdated(s) and not s.draining_since]
     endings = Endings()
     for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
         makes_room = first is not None and home(sized.groups, first.slot) is group
@@ -191,7 +192,7 @@ def _plan_once(
                 now=observed.now,
                 drain_limit_s=drain_limit_s,
                 dear_first=bool(excess),
-                held=held if settling else (),
+                held=held,
                 first=first if makes_room else None,
             )
         )

@@ -27,7 +27,8 @@ that jumped back leaves behind, count for nothing.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 from fogft.core.digest import Lasting
@@ -42,6 +43,7 @@ EAGER_S = 60.0
 AVOID_S = 300.0
 AVOID_LIMIT_S = 3600.0
 AVOID_MEMORY_S = 4 * 3600.0
+_AT = itemgetter(0)
 
 
 class Backoff(NamedTuple):
@@ -60,36 +62,80 @@ class Backoff(NamedTuple):
     since: float = 0.0
 
 
+class _Outlook(NamedTuple):
+    """What a supply's failures and proofs say of it.
+
+    Attributes:
+        rest: Whatever was the pool file's fault is left out.
+        rest_changes: When it ends or gets shorter; infinity where there is none.
+        setup: The failures of late that are the pool file's fault.
+        disappointment: It has failed of late, and not proved itself since.
+    """
+
+    rest: Backoff | None
+    rest_changes: float
+    setup: Sequence[Failure]
+    disappointment: Backoff | None
+
+
+class _Supplies(NamedTuple):
+    """The outlooks of all supplies together."""
+
+    resting: Mapping[str, Backoff]
+    rests_change: float
+    setup: Sequence[Failure]
+    disappointing: Mapping[str, Backoff]
+
+
 def resting(history: History, now: float) -> Mapping[str, Backoff]:
     """Return the supplies (`Placement.supply`) that must not be tried now, with the reason.
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """
-    rests = history.of_supplies(_rest, now)
-    everywhere = _everywhere(history, now)
-    return rests if everywhere is None else {**rests, EVERYWHERE: everywhere}
+    supplies = history.of_supplies(_outlook, _summed_up, now)
+    everywhere = _everywhere(history, supplies.setup, now) if supplies.setup else None
+    return supplies.resting if everywhere is None else {**supplies.resting, EVERYWHERE: everywhere}
 
 
-def _rest(history: History, supply: str, now: float) -> Lasting[Backoff | None]:
-    """Return a supply's rest, whatever was the pool file's fault left out."""
+def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
+    """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
+    return history.of_supplies(_outlook, _summed_up, now).disappointing
+
+
+def _outlook(history: History, supply: str, now: float) -> Lasting[_Outlook | None]:
     lately, until = _lately(history.failures[supply], now)
+    if not lately:
+        return Lasting(None, now, until)
     proven_at = history.proven_at(supply)
-    rest = backoff([f for f in lately if f.cause != "setup" and f.at > proven_at], now)
-    return Lasting(rest, now, until if rest is None else min(until, rest.until))
+    bad = lately if lately[0].at > proven_at else [f for f in lately if f.at > proven_at]
+    setup = [f for f in lately if f.cause == "setup"]
+    rest = _backoff([f for f in bad if f.cause != "setup"] if setup else bad, now)
+    rest_changes = NEVER if rest is None else min([rest.until, *_shortened(lately, rest)])
+    disappointment = None
+    if bad:
+        last = bad[-1]
+        disappointment = Backoff(last.at + FORGIVE_S, len(bad), last.cause, since=last.at)
+    until = until if rest is None else min(until, rest.until)
+    return Lasting(_Outlook(rest, rest_changes, setup, disappointment), now, until)
 
 
-def _everywhere(history: History, now: float) -> Backoff | None:
-    setup = [f for found in history.of_supplies(_setup, now).values() for f in found]
-    if not setup:
-        return None
+def _summed_up(outlooks: Mapping[str, _Outlook]) -> _Supplies:
+    resting, disappointing = {}, {}
+    setup: list[Failure] = []
+    change = NEVER
+    for supply, one in outlooks.items():
+        if one.rest is not None:
+            resting[supply] = one.rest
+            change = min(change, one.rest_changes)
+        if one.disappointment is not None:
+            disappointing[supply] = one.disappointment
+        setup += one.setup
+    return _Supplies(resting, change, setup, disappointing)
+
+
+def _everywhere(history: History, setup: Sequence[Failure], now: float) -> Backoff | None:
     proven_at = max(history.proven_at(place) for place in history.failures)
     return backoff([f for f in setup if f.at > proven_at], now)
-
-
-def _setup(history: History, supply: str, now: float) -> Lasting[Sequence[Failure] | None]:
-    """Return the failures of late that are the pool file's fault."""
-    lately, until = _lately(history.failures[supply], now)
-    return Lasting([f for f in lately if f.cause == "setup"] or None, now, until)
 
 
 def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | None:
@@ -102,21 +148,6 @@ def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | 
         return None
     full = [(rest.since, supply) for supply, rest in known if rest.cause == "capacity"]
     return min(full, default=(0.0, None))[1]
-
-
-def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
-    """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
-    return history.of_supplies(_disappointment, now)
-
-
-def _disappointment(history: History, supply: str, now: float) -> Lasting[Backoff | None]:
-    lately, until = _lately(history.failures[supply], now)
-    proven_at = history.proven_at(supply)
-    bad = [f for f in lately if f.at > proven_at]
-    if not bad:
-        return Lasting(None, now, until)
-    last = bad[-1]
-    return Lasting(Backoff(last.at + FORGIVE_S, len(bad), last.cause, since=last.at), now, until)
 
 
 def _lately(failures: Sequence[Failure], now: float) -> tuple[Sequence[Failure], float]:
@@ -137,7 +168,11 @@ def _lately(failures: Sequence[Failure], now: float) -> tuple[Sequence[Failure],
 
 def backoff(failures: list[Failure], now: float) -> Backoff | None:
     """Return the rest that a run of failures earns, or None when it is over."""
-    recent = sorted((f for f in failures if 0 <= now - f.at < FORGIVE_S), key=lambda f: f.at)
+    return _backoff(sorted([f for f in failures if 0 <= now - f.at < FORGIVE_S], key=_AT), now)
+
+
+def _backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
+    """Return the rest that failures earn, of which none is forgiven, in order of time."""
     if not recent:
         return None
     last = recent[-1]
@@ -151,13 +186,26 @@ def rest_s(failures: int) -> float:
     return min(BASE_S * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
 
 
+class _Avoidance(NamedTuple):
+    """Until when a location is avoided, and when that may change, at the latest then."""
+
+    until: float
+    changes: float
+
+
+class _Avoided(NamedTuple):
+    """All locations that are avoided."""
+
+    until: Mapping[str, float]
+    change: float
+
+
 def avoided(history: History, now: float) -> Mapping[str, float]:
     """Return the locations to use only when no other is left, and until when."""
-    return history.of_losses(_avoidance, now)
+    return history.of_losses(_avoidance, _all_avoided, now).until
 
 
-def _avoidance(history: History, location: str, now: float) -> Lasting[float | None]:
-    """Return until when a location is avoided; None if it is not."""
+def _avoidance(history: History, location: str, now: float) -> Lasting[_Avoidance | None]:
     losses = history.losses[location]
     first = bisect_right(losses, now - AVOID_MEMORY_S)
     end = bisect_right(losses, now, lo=first)
@@ -165,10 +213,16 @@ def _avoidance(history: History, location: str, now: float) -> Lasting[float | N
     if first == end:
         return Lasting(None, now, holds)
     until = losses[end - 1] + min(AVOID_S * 2.0 ** min(end - first - 1, 16), AVOID_LIMIT_S)
-    holds = min(holds, losses[first] + AVOID_MEMORY_S)
+    forgotten = losses[first] + AVOID_MEMORY_S
+    holds = min(holds, forgotten)
     if until <= now:
         return Lasting(None, now, holds)
-    return Lasting(until, now, min(holds, until))
+    return Lasting(_Avoidance(until, min(until, forgotten)), now, min(holds, until))
+
+
+def _all_avoided(locations: Mapping[str, _Avoidance]) -> _Avoided:
+    change = min([one.changes for one in locations.values()], default=NEVER)
+    return _Avoided({location: one.until for location, one in locations.items()}, change)
 
 
 def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:
@@ -178,26 +232,32 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
         waits: For the end of a rest; see `Plan`.
         restless: Somebody could be better off elsewhere.
     """
+    supplies = history.of_supplies(_outlook, _summed_up, now)
     times: list[float] = []
-    rests = resting(history, now)
-    if waits and rests:
-        times.append(max(rest.since for rest in rests.values()) + EAGER_S)
-    for supply, rest in rests.items():
-        if waits or supply == EVERYWHERE:
-            times += [rest.until, *_shortened(history, supply, rest, now)]
+    if supplies.setup:
+        times += _everywhere_changes(history, supplies.setup, now)
+    if waits:
+        rests = resting(history, now)
+        last = max([rest.since for rest in rests.values()], default=-NEVER)
+        times += [supplies.rests_change, last + EAGER_S]
     if restless:
-        times += [rest.until for rest in disappointing(history, now).values()]
+        times += [rest.until for rest in supplies.disappointing.values()]
     if waits or restless:  # a stand-in does not return to where one was just lost
-        for location, until in avoided(history, now).items():
-            forgotten = (at + AVOID_MEMORY_S for at in history.losses[location])
-            times += [until, *(at for at in forgotten if at < until)]
-    return min((at for at in times if at > now), default=NEVER)
+        times.append(history.of_losses(_avoidance, _all_avoided, now).change)
+    return min([at for at in times if at > now], default=NEVER)
 
 
-def _shortened(history: History, supply: str, rest: Backoff, now: float) -> Iterator[float]:
-    """Yield when failures are forgiven by which a rest may end early."""
-    places = list(history.failures) if supply == EVERYWHERE else [supply]
-    lately = [f for place in places for f in _lately(history.failures[place], now)[0]]
+def _everywhere_changes(history: History, setup: Sequence[Failure], now: float) -> Sequence[float]:
+    rest = _everywhere(history, setup, now)
+    if rest is None:
+        return ()
+    lately = [f for failures in history.failures.values() for f in _lately(failures, now)[0]]
+    return (rest.until, *_shortened(lately, rest))
+
+
+def _shortened(lately: Iterable[Failure], rest: Backoff) -> Sequence[float]:
+    """Return when failures are forgiven by which a rest may end early."""
     forgiven = [f.at + FORGIVE_S for f in lately if f.at + FORGIVE_S < rest.until]
     if rest_s(rest.failures - len(forgiven)) < rest.until - rest.since:
-        yield from forgiven
+        return forgiven
+    return ()

@@ -13,8 +13,8 @@ import functools
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.core import lifetime
@@ -58,8 +58,7 @@ Distances = Callable[
 BuildOrder = Callable[[Identity, PoolSpec, PlannedLaunch], Launch]
 
 
-@dataclass(frozen=True)
-class Tick:
+class Tick(NamedTuple):
     """What one tick saw and decided.
 
     Attributes:
@@ -180,8 +179,8 @@ class Reconciler:
             intent = replace(intent, stopping=True)
         decided = plan(identity.uid, spec, intent, observed, history, health=health)
         if over:
-            ends = tuple(replace(end, reason="`max_hours` is over") for end in decided.terminations)
-            decided = replace(decided, terminations=ends)
+            ends = tuple(end._replace(reason="`max_hours` is over") for end in decided.terminations)
+            decided = decided._replace(terminations=ends)
         update = None
         if decided.health is not None and not intent.stopping:
             update = self._updating.settle(
@@ -189,7 +188,7 @@ class Reconciler:
             )
         trouble += [update.told] if update is not None else []
         if trouble:
-            decided = replace(decided, notes=(*decided.notes, *trouble))
+            decided = decided._replace(notes=(*decided.notes, *trouble))
         if observed.machines is not None:
             self._apply(identity, spec, observed, decided, history)
         return Tick(
@@ -295,11 +294,14 @@ class Reconciler:
         by_hand = self._by_hand() if found is not Found.BY_CLOUD else frozenset()
         gateways = self._gateways() if spec.topology else {}
         ending = {end.id for end in plan.terminations} | observed.ending
-        cause = spec, observed.machines, plan.draining, ending, revoked, by_hand, gateways
+        machines = observed.machines or ()
+        if found is Found.BY_CLOUD:  # others can be found by nobody
+            machines = tuple([m for m in machines if m.endpoint is not None])
+        cause = spec, machines, plan.draining, ending, revoked, by_hand, gateways
         if cause == self._published_for:
             return
         members = members_of(
-            observed.machines or (),
+            machines,
             pool_uid=identity.uid,
             draining=plan.draining,
             ending=ending,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from fogft.core.health import Health, Verdict
+from fogft.core.health import Health, Judged, Verdict
 from fogft.core.history import Event, EventKind, History
 from fogft.core.model import LinkState, Observed, ReplicaId
 from fogft.pool.store import Store
@@ -64,10 +64,14 @@ class Remembering:
                 self.add(kind, id, at=observed.now)
 
     def health(self, health: Health, history: History, now: float) -> None:
-        """Note who became ready, stopped to be, or failed, as observed at `now`."""
+        """Note who became ready, stopped to be, or failed, as observed at `now`.
+
+        Args:
+            health: Judged by this very history.
+        """
         for judged in health.replicas:
-            id, machine = judged.id, judged.machine
-            record = history.record(id.slot, id.generation)
+            machine, record = judged.machine, judged.record
+            id = machine.id
             if record is None or record.closed is not None:  # the cloud's list is the record
                 place = machine.placement
                 self.add(
@@ -80,13 +84,17 @@ class Remembering:
                 record = history.record(id.slot, id.generation)
             if record is None:
                 continue
-            up = judged.link is not None and judged.link.state is LinkState.UP
-            if judged.serving and (record.first_ready_at is None or record.unready_since):
-                log.info("replica_ready replica=%s zone=%s", id.short, record.location)
-                self.add(EventKind.READY, id, at=now)
-            elif up and not judged.serving and record.first_ready_at and not record.unready_since:
+            if judged.serving:
+                if record.first_ready_at is None or record.unready_since:
+                    log.info("replica_ready replica=%s zone=%s", id.short, record.location)
+                    self.add(EventKind.READY, id, at=now)
+            elif record.first_ready_at and not record.unready_since and _answers(judged):
                 log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
                 self.add(EventKind.UNREADY, id, at=now)
             if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
                 log.warning("replica_failed replica=%s reason=%r", id.short, judged.why)
                 self.add(EventKind.FAILED, id, detail=judged.why, at=now)
+
+
+def _answers(judged: Judged) -> bool:
+    return judged.link is not None and judged.link.state is LinkState.UP

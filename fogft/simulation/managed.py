@@ -92,7 +92,7 @@ class Memory:
         """Forget what no decision needs, as the store on disk does from time to time."""
         if self._appended > _COMPACT_AFTER:
             self._appended = 0
-            self.events = compacted(self.events, now)
+            self.events = compacted(self.events, now, history=self._history)
             self._history = History(self.events)
 
 
@@ -113,8 +113,11 @@ class Managed:
         self.store = Memory(replace(spec, max_hours=None), world.now)  # a run is as long as asked
         health = spec.health
         patience_s = health.replace_after_s
-        silences = (health.suspect_after_s, patience_s, patience_s * LONE_SILENCE_FACTOR)
-        world.silences = [silence_s + TICK_S for silence_s in silences]
+        world.silences = [
+            (health.suspect_after_s + TICK_S, self._is_suspicion_felt),
+            (patience_s + TICK_S, lambda: True),
+            (patience_s * LONE_SILENCE_FACTOR + TICK_S, lambda: True),
+        ]
         self._ready = frozenset(service.name for service in spec.services)
         self._reconciler = Reconciler(
             world, self.store, clock=lambda: world.now, links=self._links, submit=self._submit
@@ -133,10 +136,11 @@ class Managed:
     def _next_timer(self, tick: Tick) -> float:
         history, now = self.store.history(), tick.observed.now
         health = tick.spec.health
-        restless = tick.plan.restless
-        times = [quarantine.next_change(history, now, waits=tick.plan.waits, restless=restless)]
+        waits, restless = tick.plan.waits, {(id.slot, id.generation) for id in tick.plan.restless}
+        times = [quarantine.next_change(history, now, waits=waits, restless=bool(restless))]
         if tick.spec.schedule is not None:
             times.append(schedule.next_change(tick.spec.schedule, now))
+        stay_s = tick.spec.migration.stay_s if tick.spec.migration else NEVER
         for record in history.open():
             if record.draining_since is not None:
                 ends = (DRAIN_SETTLE_S, DRAIN_LIMIT_S)
@@ -144,16 +148,23 @@ class Managed:
             if record.first_ready_at is None:
                 times.append(record.launched_at + health.start_limit_s + TICK_S)
                 continue
-            if restless or tick.plan.waits:
-                stays = [migration.RETURN_AFTER_S] if record.on_demand else []
-                stays += [tick.spec.migration.stay_s] if tick.spec.migration else []
-                times += [record.first_ready_at + stay_s for stay_s in stays]
-        times += [
-            machine.launched_at + health.start_limit_s + TICK_S
-            for machine in tick.observed.machines or ()
-            if machine.phase is MachinePhase.PROVISIONING
-        ]
-        return min((at for at in times if at > now), default=NEVER)
+            if (record.slot, record.generation) in restless:
+                times.append(record.first_ready_at + stay_s)
+            if waits and record.on_demand:
+                times.append(record.first_ready_at + migration.RETURN_AFTER_S)
+        for machine in tick.observed.machines or ():
+            if machine.phase is MachinePhase.PROVISIONING:
+                times.append(machine.launched_at + health.start_limit_s + TICK_S)
+        return min([at for at in times if at > now], default=NEVER)
+
+    def _is_suspicion_felt(self) -> bool:
+        """Whether anything can follow from it that one more link is suspect.
+
+        That one serves no more holds endings and moves back, and calls for nothing: it matters
+        only where one is to go, or another is silent too.
+        """
+        gone = sum([vm.gone_at < NEVER for vm in self.world.vms.values()])
+        return gone > 1 or any(r.draining_since is not None for r in self.store.history().open())
 
     def _submit(self, call: Callable[[], None]) -> None:
         """Make a call of the cloud. That it accepts an order makes no difference until it boots."""

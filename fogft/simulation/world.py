@@ -92,8 +92,10 @@ class World:
         self.vms: dict[ReplicaId, Vm] = {}
         self.meter = Meter(EPOCH + settle_s, keep_curve)
         self.asked = 0  # how often the policy was
-        # A policy that goes by links sees that a machine is gone so long after; else at once.
-        self.silences: Sequence[float] = ()
+        # A policy that goes by links can notice so long after that a machine is gone, if it then
+        # says so; any other one sees it at once.
+        self.silences: Sequence[tuple[float, Callable[[], bool]]] = ()
+        self._sold: list[tuple[Mapping[str, Any], Sequence[Offer]]] = []  # answers, by question
         self._until = EPOCH + length_s
         self._chance = random.Random(f"machines {seed}")
         self._capacity: dict[str, int] = {}
@@ -144,13 +146,17 @@ class World:
 
     def _pass_until(self, moment: float, policy: Policy) -> None:
         if moment > self.now:
-            alive = [vm for vm in self.vms.values() if vm.gone_at == NEVER]
+            ready, usd_per_hour = 0, 0.0
+            for vm in self.vms.values():
+                if vm.gone_at == NEVER:
+                    ready += vm.ready
+                    usd_per_hour += vm.order.usd_per_hour
             self.meter.pass_time(
                 moment,
                 moment - self.now,
-                ready=sum(vm.ready for vm in alive),
+                ready=ready,
                 wanted=policy.wanted(self.now),
-                usd_per_hour=sum(vm.order.usd_per_hour for vm in alive),
+                usd_per_hour=usd_per_hour,
             )
             self.now = moment
 
@@ -185,10 +191,13 @@ class World:
             return UNSEEN  # it was ended before
         vm.gone_at, vm.ready = self.now, False
         self.meter.preemptions += self.meter.counts(self.now)
-        for silence_s in self.silences:
-            self.after(silence_s, lambda: None if vm.id in self.vms else UNSEEN)
+        for silence_s, is_felt in self.silences:
+            self.after(silence_s, partial(self._fall_silent, vm, is_felt))
         self.after(self.market.timing.detect_s, lambda: self._forget(vm))
         return UNSEEN if self.silences else None
+
+    def _fall_silent(self, vm: Vm, is_felt: Callable[[], bool]) -> object:
+        return None if vm.id in self.vms and is_felt() else UNSEEN
 
     def _forget(self, vm: Vm) -> object:
         return UNSEEN if self.vms.pop(vm.id, None) is None else None
@@ -205,7 +214,11 @@ class World:
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """List what the market sells; full locations too."""
-        return self.market.offers(resources)
+        for asked, sold in self._sold:
+            if asked == resources:
+                return sold
+        self._sold.append((resources, self.market.offers(resources)))
+        return self._sold[-1][1]
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         """List the machines, those lost and not yet missed included."""

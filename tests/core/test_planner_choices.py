@@ -402,7 +402,7 @@ def test_where_all_rest_the_one_resting_longest_is_tried_once_a_minute():
     assert "this location longest" in launch.reason
     again = replace(world, events=(*world.events, *refused("b/r/1", 59.0, generation=21)))
     assert not again.plan().launches
-    quota = tuple(replace(e, detail=e.detail.replace("capacity", "quota")) for e in world.events)
+    quota = tuple(e._replace(detail=e.detail.replace("capacity", "quota")) for e in world.events)
     assert not replace(world, events=quota).plan().launches
 
 

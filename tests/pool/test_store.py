@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -64,7 +63,7 @@ def test_full_disk_is_an_error_and_nothing_has_happened(
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
         with pytest.raises(StateError, match="No space left"):
-            pool.store.append(replace(LAUNCH, generation=2))
+            pool.store.append(LAUNCH._replace(generation=2))
     assert pool.store.history().generation(0) == 1
     assert store_of(pool.home).recent() == [LAUNCH]
 
