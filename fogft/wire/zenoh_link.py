@@ -24,8 +24,9 @@ import zenoh
 from fogft.core import names
 from fogft.core.errors import CredentialError, WireError
 from fogft.core.model import LinkState, doubted_after_s
-from fogft.wire import config, diagnosis, frame
+from fogft.wire import config, diagnosis, probe_frames
 from fogft.wire.compression import ZLIB, ZLIB_ANSWERS
+from fogft.wire.frame import FrameError
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.wire.recalls import Recalls
@@ -412,7 +413,9 @@ class ZenohLink:
             self._wake.set()
 
         try:
-            connection.probe(self._probe_key, frame.encode_probe(probe), _PROBE_TIMEOUT_S, heard)
+            connection.probe(
+                self._probe_key, probe_frames.encode_probe(probe), _PROBE_TIMEOUT_S, heard
+            )
         except zenoh.ZError as error:
             connection.lost_because = f"sending failed: {error}"
             return
@@ -438,8 +441,8 @@ class ZenohLink:
     def _take(self, connection: Connection, heard: _Heard) -> None:
         id = self._peer.id
         try:
-            answer = frame.decode_probe_answer(heard.content)
-        except frame.FrameError as error:
+            answer = probe_frames.decode_probe_answer(heard.content)
+        except FrameError as error:
             raise WireError(f"`{self._peer.endpoint}` answers probes with {error}") from error
         if (answer.slot, answer.generation) != (id.slot, id.generation):
             raise WireError(

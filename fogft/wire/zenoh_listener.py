@@ -31,7 +31,7 @@ from fogft.core.model import ReplicaId
 from fogft.core.record_set import RecordSet, Verdict
 from fogft.core.records import RecordError, SignedRecord
 from fogft.core.repeats import worth_logging
-from fogft.wire import batch_frames, config, frame, record_frames
+from fogft.wire import batch_frames, config, frame, probe_frames, record_frames
 from fogft.wire.compression import ACCEPTED, unpack
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.doorkeeper import Doorkeeper
@@ -263,7 +263,7 @@ class ZenohListener:
         self._counters.add("probes")
         attachment = query.attachment
         try:
-            probe = frame.decode_probe(query.payload.to_bytes() if query.payload else b"")
+            probe = probe_frames.decode_probe(query.payload.to_bytes() if query.payload else b"")
             greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
         except frame.FrameError as error:
             self._malformed(error, query, turn)
@@ -354,7 +354,7 @@ class ZenohListener:
             return
         try:
             answer = replace(on_probe(probe), accepts=ACCEPTED)
-            content = frame.encode_probe_answer(answer)
+            content = probe_frames.encode_probe_answer(answer)
             query.reply(query.key_expr, content, express=True)
         finally:
             self._end_aside(greeting, query, turn)

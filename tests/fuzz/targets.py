@@ -31,7 +31,7 @@ from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.record_set import RecordSet
 from fogft.core.records import RecordError, RecordKind, SignedRecord
 from fogft.pool import bundle, credentials, joining
-from fogft.wire import batch_frames, compression, frame, record_frames, topic_frames
+from fogft.wire import batch_frames, compression, frame, probe_frames, record_frames, topic_frames
 from fogft.wire.frame import FrameError, Greeting
 from fogft.wire.guests import Guests, NotAdmittedError
 from fogft.wire.port import Behind, Probe, ProbeAnswer
@@ -258,11 +258,13 @@ def targets() -> dict[str, Target]:
         "answer": Target(frame.decode_answer, framed, (frame.encode_answer(ID),)),
         "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(ID, "lost"),)),
         "cancel": Target(frame.decode_cancel, framed, (frame.encode_cancel([ID, ID]),)),
-        "probe": Target(frame.decode_probe, framed, (frame.encode_probe(Probe("ada", 1.0)),)),
+        "probe": Target(
+            probe_frames.decode_probe, framed, (probe_frames.encode_probe(Probe("ada", 1.0)),)
+        ),
         "probe answer": Target(
-            frame.decode_probe_answer,
+            probe_frames.decode_probe_answer,
             framed,
-            (frame.encode_probe_answer(answer), frame.encode_probe_answer(gateway)),
+            (probe_frames.encode_probe_answer(answer), probe_frames.encode_probe_answer(gateway)),
         ),
         "compressed payload": Target(
             lambda data: compression.unpack(data, 1 << 16),

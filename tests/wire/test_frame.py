@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.core.definitions import Definition
-from fogft.wire import frame
+from fogft.wire import frame, probe_frames
 from fogft.wire.frame import FrameError
 from fogft.wire.port import Probe, ProbeAnswer
 
@@ -47,8 +47,8 @@ DECODERS: list[Callable[[bytes], Any]] = [
     frame.decode_request,
     frame.decode_answer,
     frame.decode_refusal,
-    frame.decode_probe,
-    frame.decode_probe_answer,
+    probe_frames.decode_probe,
+    probe_frames.decode_probe_answer,
     frame.decode_greeting,
     frame.decode_cancel,
 ]
@@ -99,13 +99,13 @@ def test_a_cancellation_comes_back(cancelled: list[bytes]) -> None:
 @given(probe=probes)
 def test_a_probe_comes_back(probe: Probe) -> None:
     """Decoding undoes encoding."""
-    assert frame.decode_probe(frame.encode_probe(probe)) == probe
+    assert probe_frames.decode_probe(probe_frames.encode_probe(probe)) == probe
 
 
 @given(answer=answers)
 def test_a_probe_answer_comes_back(answer: ProbeAnswer) -> None:
     """Decoding undoes encoding."""
-    assert frame.decode_probe_answer(frame.encode_probe_answer(answer)) == answer
+    assert probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer)) == answer
 
 
 @pytest.mark.parametrize("decode", DECODERS)
@@ -127,7 +127,7 @@ json_values = st.recursive(
 )
 
 
-@pytest.mark.parametrize("decode", [frame.decode_probe, frame.decode_probe_answer])
+@pytest.mark.parametrize("decode", [probe_frames.decode_probe, probe_frames.decode_probe_answer])
 @given(data=st.data())
 def test_json_of_the_wrong_shape_is_a_frame_error_or_a_frame(
     decode: Callable[[bytes], Any], data: st.DataObject
@@ -198,7 +198,7 @@ def test_an_impossible_remaining_time_is_refused(remaining_s: float) -> None:
 def test_a_hostile_probe_is_refused(content: bytes) -> None:
     """Depth, NaN, infinity, lone surrogates, a missing version, too much: all are FrameErrors."""
     with pytest.raises(FrameError):
-        frame.decode_probe(content)
+        probe_frames.decode_probe(content)
 
 
 @pytest.mark.parametrize("robot", ["", "x" * 65, "a\nb", "\u00e4" * 33])
@@ -211,8 +211,8 @@ def test_a_robot_name_that_cannot_travel_is_refused_at_once(robot: str) -> None:
 def test_a_long_detail_is_cut_and_the_answer_still_travels() -> None:
     """Detail is for people; it never costs the probe."""
     answer = ProbeAnswer(0, 1, "i", detail="\ud800" + "x" * 100_000)
-    decoded = frame.decode_probe_answer(frame.encode_probe_answer(answer))
-    assert len(decoded.detail) == frame.DETAIL_LIMIT
+    decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
+    assert len(decoded.detail) == probe_frames.DETAIL_LIMIT
 
 
 def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels() -> None:
@@ -221,7 +221,7 @@ def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels()
     small = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
     for types, told in ((large, {}), (small, small)):
         answer = ProbeAnswer(0, 1, "i", frozenset({"/s"}), types=types, offered={"/s": "a/srv/B"})
-        decoded = frame.decode_probe_answer(frame.encode_probe_answer(answer))
+        decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
         assert (decoded.types, decoded.ready) == (told, {"/s"})
         assert decoded.offered == {"/s": "a/srv/B"}
 
@@ -230,10 +230,10 @@ def test_too_many_services_for_a_frame_are_an_error_at_the_sender() -> None:
     """A frame that nobody could read is not sent."""
     answer = ProbeAnswer(0, 1, "i", ready=frozenset(f"/{n:0100}" for n in range(1000)))
     with pytest.raises(ValueError, match="probe's answer"):
-        frame.encode_probe_answer(answer)
+        probe_frames.encode_probe_answer(answer)
 
 
 def test_a_probe_answer_nested_without_end_is_refused() -> None:
     """The parser's own recursion limit is a FrameError like any other."""
     with pytest.raises(FrameError):
-        frame.decode_probe_answer(b"[" * 60_000)
+        probe_frames.decode_probe_answer(b"[" * 60_000)
