@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +23,10 @@ hypothesis.settings.load_profile("fogft")
 
 # Set before any test imports rclpy; child processes inherit it.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+# The tests start some thousand processes: half of what each costs is compiling the package anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # `pyzeros` makes a folder for what it compiles where it is imported, else in the working folder.
 os.environ.setdefault("CYDR_CACHE_DIR", f"{tempfile.gettempdir()}/fogft-test-cydr-{os.getuid()}")
