@@ -66,9 +66,11 @@ def _next(calls: Sequence[Call], done: int) -> list[int]:
     """Return the calls that may take effect next: none that is left ended before they began."""
     first_end = math.inf
     found = []
-    for i, call in enumerate(calls):
-        if done >> i & 1:
-            continue
+    left = ~done & (1 << len(calls)) - 1
+    while left:
+        lowest = left & -left
+        left ^= lowest
+        call = calls[i := lowest.bit_length() - 1]
         if call.began > first_end:
             break  # sorted: nor may any later one
         found.append(i)

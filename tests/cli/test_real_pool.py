@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from fogft import app
 from fogft.cloud.local import processes
 from tests.cli.pools import lay_down
 
@@ -50,7 +51,7 @@ def wait_for(look: Callable[[], dict], good: Callable[[dict], bool]) -> dict:
 
 def test_a_pool_from_init_to_down(fogft, home, tmp_path):
     def look() -> dict:
-        return json.loads(fogft("status", "--json").stdout)
+        return app.status("echo").to_json()
 
     def ready(status: dict) -> dict[int, int]:
         return {r["slot"]: r["generation"] for r in status["replicas"] if r["phase"] == "ready"}
@@ -64,6 +65,7 @@ def test_a_pool_from_init_to_down(fogft, home, tmp_path):
     assert status["manager_alive"]
     assert status["services"][0]["ready_replicas"] == 2
     uid = status["uid"]
+    assert json.loads(fogft("status", "--json").stdout)["uid"] == uid
 
     fogft("chaos", "freeze", "1")
     wait_for(look, lambda s: any(r["link"] == "suspect" for r in s["replicas"]))

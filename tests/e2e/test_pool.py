@@ -18,11 +18,14 @@ def flawless(result: dict) -> bool:
 
 @pytest.mark.parametrize("seed", [20261])
 def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
-    """Requests for 26 s and more under kills and freezes, one replica always spared at a time."""
+    """Requests for 16 s and more under kills and freezes, one replica always spared at a time.
+
+    `scripts/soak` goes on for as long as one likes.
+    """
     pool.up()
     client = pool.client(120, 25)
     chance = random.Random(seed)
-    end = time.monotonic() + 26
+    end = time.monotonic() + 16
     faults = []
     while time.monotonic() < end or len({kind for kind, _ in faults}) < 2:
         ready = [r["slot"] for r in pool.status()["replicas"] if r["phase"] == "ready"]
@@ -37,7 +40,7 @@ def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
                 pool.fogft("chaos", "thaw", str(slot), ok=False)
         time.sleep(chance.uniform(0.5, 2.0))
     result = client.finish()
-    assert result["requests"] > 500
+    assert result["requests"] > 300
     assert flawless(result), (result, faults)
     pool.wait(lambda: pool.ready() == 3)
     pool.fogft("down")
