@@ -13,6 +13,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests.dealing import dealt
 from tests.wire.namespaces import Namespaces, why_not
 from tests.wire.rmw_router import Router, running
 
@@ -36,6 +37,18 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 DOMAINS = range(60, 101)  # above 101 the ports of a domain reach Linux's ephemeral ones
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Among several workers, let the long tests begin first: see `dealing`."""
+
+    def limit_s(item: pytest.Item) -> float:
+        marker = item.get_closest_marker("timeout")
+        return float(marker.args[0]) if marker and marker.args else 0.0
+
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if workers > 1:
+        items[:] = dealt(items, limit_s, workers)
 
 
 def _lock_domain(taken: dict[int, int]) -> int:

@@ -21,6 +21,7 @@ from fogft.proxy.config import read_client
 from tests.wire.rendezvous_pool import Party, Rendezvous
 from tests.wire.wire_pool import POOL_UID, Authority, wait_for
 
+pytestmark = pytest.mark.timeout(180)
 NOW = 2e9
 PASSPHRASE = "correct-horse-battery"
 SPEC = PoolSpec("pool", (ServiceSpec("/s", "std_srvs/srv/SetBool"),), task={"run": "exec serve"})

@@ -18,6 +18,8 @@ from fogft.wire.port import Refusal
 from tests.proxy.by_hand import LIMIT_S, ROOT, Parts, wait_for
 from tests.proxy.fakes import Clock, FakeLink
 
+pytestmark = pytest.mark.timeout(180)
+
 
 class Numbers:
     """Responses that are numbers in text."""

@@ -20,6 +20,8 @@ from tests.wire.namespaces import inside
 from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
 from tests.wire.wire_pool import POOL_UID, SERVICE, request_id, wait_for
 
+pytestmark = pytest.mark.timeout(180)
+
 PLACE, ROBOT, MANAGER = "10.77.1.1", "10.77.1.2", "10.77.2.2"
 
 

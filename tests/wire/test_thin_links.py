@@ -32,6 +32,7 @@ from tests.wire.wire_pool import (
     wait_for,
 )
 
+pytestmark = pytest.mark.timeout(180)
 MEGABYTE = os.urandom(1_000_000)
 ROBOT, REPLICA = "10.81.1.1", "10.81.1.2"
 LONG_S = 90.0
