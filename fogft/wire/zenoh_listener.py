@@ -321,10 +321,7 @@ class ZenohListener:
         self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query, turn: int
     ) -> None:
         """Judge records by their own signatures: whoever brings them has no say in them."""
-        try:
-            self._guests.greet(greeting)
-        except NotAdmittedError as error:
-            self._turn_away(Reply(query, _NO_REQUEST, b"", error.refusal, turn=turn), str(error))
+        if not self._greeted(greeting, query, turn):
             return
         try:
             for one in offered:
@@ -347,10 +344,7 @@ class ZenohListener:
         query: zenoh.Query,
         turn: int,
     ) -> None:
-        try:
-            self._guests.greet(greeting)
-        except NotAdmittedError as error:
-            self._turn_away(Reply(query, _NO_REQUEST, b"", error.refusal, turn=turn), str(error))
+        if not self._greeted(greeting, query, turn):
             return
         try:
             answer = replace(on_probe(probe), accepts=ACCEPTED)
@@ -358,6 +352,15 @@ class ZenohListener:
             query.reply(query.key_expr, content, express=True)
         finally:
             self._end_aside(greeting, query, turn)
+
+    def _greeted(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> bool:
+        """Whether this is somebody who is let in; else it is told why not."""
+        try:
+            self._guests.greet(greeting)
+        except NotAdmittedError as error:
+            self._turn_away(Reply(query, _NO_REQUEST, b"", error.refusal, turn=turn), str(error))
+            return False
+        return True
 
     def _end_aside(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> None:
         """End a query in its robot's own thread: unlike the answer, that queues behind replies."""
