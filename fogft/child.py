@@ -1,10 +1,12 @@
-"""Start a program that cannot outlive the process that started it."""
+"""Start programs: one that cannot outlive this process, or one that does not depend on it."""
 
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 # Asks the kernel for the signal, then becomes the program. A program of its own and not a
 # `preexec_fn`, which is unsafe in a process with threads. 1 is PR_SET_PDEATHSIG.
@@ -24,3 +26,36 @@ def tied(command: Sequence[str]) -> list[str]:
     as long as the process does, the main thread.
     """
     return [sys.executable, "-IS", "-c", _PROGRAM, str(os.getpid()), *command]
+
+
+def detached(
+    command: Sequence[str],
+    log: Path,
+    *,
+    folder: Path | None = None,
+    environ: Mapping[str, str] | None = None,
+) -> subprocess.Popen[bytes]:
+    """Start a process in a session of its own, its output appended to a log (0600).
+
+    Args:
+        command: The program and its arguments.
+        log: Made if it is not there.
+        folder: Where it starts; this process's own unless told.
+        environ: Likewise its environment.
+
+    Raises:
+        OSError: It cannot be started, or the log not be written.
+    """
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    try:
+        return subprocess.Popen(
+            list(command),
+            cwd=folder,
+            env=environ,
+            stdin=subprocess.DEVNULL,
+            stdout=descriptor,
+            stderr=descriptor,
+            start_new_session=True,
+        )
+    finally:
+        os.close(descriptor)

@@ -1,7 +1,7 @@
-"""Start processes that outlive us, find who holds a lock, and end a process for sure.
+"""Find who holds a lock, and end a process for sure.
 
-Owns: detaching, and ending by process id. Never by name: only a process that holds one of
-our locks is ever signalled.
+Owns: ending by process id. Never by name: only a process that holds one of our locks is ever
+signalled.
 """
 
 from __future__ import annotations
@@ -10,29 +10,13 @@ import contextlib
 import os
 import select
 import signal
-import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from fogft import disk
 
 POLL_S = 0.05
-
-
-def start_detached(command: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
-    """Start a process in a session of its own, its output appended to a log (0600)."""
-    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
-    try:
-        return subprocess.Popen(
-            list(command),
-            stdin=subprocess.DEVNULL,
-            stdout=descriptor,
-            stderr=descriptor,
-            start_new_session=True,
-        )
-    finally:
-        os.close(descriptor)
 
 
 def lock_holder(lock: Path) -> int | None:

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from fogft import disk
-from fogft.pool import process_control
+from fogft.child import detached
 from fogft.pool.paths import PoolPaths
 
 log = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ class ProxySupervisor:
         if self._clock() < self._next_at:
             return False
         self._started_at = self._clock()
-        self._child = process_control.start_detached(self._command, self._paths.proxy_log)
+        self._child = detached(self._command, self._paths.proxy_log)
         log.info("proxy_started pid=%d", self._child.pid)
         return True
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fogft import disk, logfile
+from fogft.child import detached
 from fogft.core import intent as intents
 from fogft.core import lifetime
 from fogft.core.errors import FogftError, PoolBusy, PoolNotFound, SpecError
@@ -123,7 +124,7 @@ def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None =
         return False
     name = paths.folder.name
     words = command(name) if command else [sys.executable, "-m", "fogft", "manager", name]
-    child = process_control.start_detached(words, paths.manager_log)
+    child = detached(words, paths.manager_log)
     end = time.monotonic() + MANAGER_LIMIT_S
     while time.monotonic() < end:
         if read_pid(paths) == child.pid:

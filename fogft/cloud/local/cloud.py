@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fogft.child import detached
 from fogft.cloud.local import ending, faults, processes, regions_file
 from fogft.cloud.local import folder as folders
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Zone
@@ -208,20 +209,8 @@ class LocalCloud:
         if package.name not in ("site-packages", "dist-packages"):  # a checkout
             paths = (str(package), environ.get("PYTHONPATH", ""))
             environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        output = os.open(folder.log, flags, 0o600)
-        try:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "fogft.cloud.local.machine", str(folder.path)],
-                cwd=folder.path,
-                env=environ,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                start_new_session=True,
-            )
-        finally:
-            os.close(output)
+        command = [sys.executable, "-m", "fogft.cloud.local.machine", str(folder.path)]
+        process = detached(command, folder.log, folder=folder.path, environ=environ)
         with self._spawned_lock:
             self._spawned.append(process)
 
