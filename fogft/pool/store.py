@@ -1,35 +1,30 @@
 """What a pool remembers on disk, as the manager and the commands read and write it.
 
-Owns: identity, spec, intent, history, lease and membership: their files and their order
-of writing. A launch is in the history, on disk, before the cloud is asked.
-Not here: what to remember (`fogft.core`) and how a file is replaced (`fogft.disk`).
+Owns: identity, spec, intent and membership: their files.
+Not here: what to remember (`fogft.core`), what happened (`history_file`) and how a file is replaced
+(`fogft.disk`).
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import os
-import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from fogft import disk
 from fogft.core import intent as intents
 from fogft.core import membership as memberships
 from fogft.core.errors import PoolNotFound, SpecError, StateError
-from fogft.core.history import Event, History, compacted
+from fogft.core.history import Event, History
 from fogft.core.intent import Intent
 from fogft.core.model import Membership
 from fogft.core.names import POOL_UID_PATTERN
 from fogft.core.rollout import Trial
 from fogft.core.spec import PoolSpec
 from fogft.pool import discovered
+from fogft.pool.history_file import HistoryFile
 from fogft.pool.paths import PoolPaths
-
-COMPACT_AFTER = 20_000
 
 
 @dataclass(frozen=True)
@@ -106,10 +101,7 @@ class PoolStore:
     ) -> None:
         self.paths = paths
         self._parse = parse
-        self._clock = clock
-        self._lock = threading.Lock()
-        self._history: History | None = None
-        self._appended = 0
+        self._events = HistoryFile(paths.history, clock)
         self._spec: tuple[bytes, PoolSpec] | None = None
         self._good: tuple[bytes, PoolSpec] | None = None
 
@@ -220,10 +212,7 @@ class PoolStore:
 
     def history(self) -> History:
         """Return what happened so far."""
-        with self._lock:
-            if self._history is None:
-                self._history = History(self._load())
-            return self._history
+        return self._events.history()
 
     def append(self, event: Event) -> None:
         """Remember an event, on disk before this returns.
@@ -231,33 +220,11 @@ class PoolStore:
         Raises:
             StateError: It cannot be written. The event did not happen.
         """
-        history = self.history()
-        with self._lock:
-            line = json.dumps(event.to_json()) + "\n"
-            try:
-                _append_durably(self.paths.history, line.encode())
-            except OSError as error:
-                raise StateError(
-                    f"`{self.paths.history}` cannot be written: {error.strerror}",
-                    "check the disk's free space and the folder's owner",
-                ) from error
-            history.add(event)
-            self._appended += 1
-            if self._appended >= COMPACT_AFTER:
-                self._history = History(self._load())
+        self._events.append(event)
 
     def recent(self, count: int = 20) -> list[Event]:
         """Return the last events, oldest first."""
-        return _read_events(self.paths.history)[-count:]
-
-    def _load(self) -> list[Event]:
-        events = _read_events(self.paths.history)
-        kept = compacted(events, self._clock())
-        self._appended = 0
-        if len(kept) < len(events):
-            lines = "".join(json.dumps(event.to_json()) + "\n" for event in kept)
-            disk.write_whole(self.paths.history, lines)
-        return kept
+        return self._events.recent(count)
 
     def membership(self) -> Membership | None:
         """Return the membership as last written; None where it is missing or damaged."""
@@ -305,43 +272,3 @@ def read_identity(paths: PoolPaths) -> Identity:
 def write_identity(paths: PoolPaths, identity: Identity) -> None:
     """Store what a pool is; the caller holds `intent_lock`."""
     disk.write_json(paths.identity, asdict(identity))
-
-
-def _append_durably(path: Path, line: bytes) -> None:
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
-    try:
-        size = os.fstat(descriptor).st_size
-        if size and os.pread(descriptor, 1, size - 1) != b"\n":
-            line = b"\n" + line  # a crash left a torn last line: it stays alone on its own
-        if os.write(descriptor, line) != len(line):
-            os.ftruncate(descriptor, size)
-            raise OSError(28, "No space left on device")
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _read_events(path: Path) -> list[Event]:
-    """Return the events of a file, without a torn last line and what else is damaged.
-
-    A line that cannot be read is skipped but its generation cannot be: the cloud's list
-    then still keeps generations from being used twice.
-    """
-    try:
-        lines = path.read_bytes().splitlines()
-    except FileNotFoundError:
-        return []
-    events: list[Event] = []
-    for line in lines:
-        event = _event(line)
-        if event is not None:
-            events.append(event)
-    return events
-
-
-def _event(line: bytes) -> Event | None:
-    try:
-        value: Any = json.loads(line)
-        return Event.from_json(value)
-    except (ValueError, StateError):
-        return None

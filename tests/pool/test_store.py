@@ -14,7 +14,7 @@ from fogft.core.errors import PoolNotFound, StateError
 from fogft.core.history import Event, EventKind
 from fogft.core.intent import Intent
 from fogft.core.model import Membership
-from fogft.pool import store as stores
+from fogft.pool import history_file
 from fogft.pool.store import read_identity
 from tests.pool.scene import Scene, store_of
 
@@ -82,7 +82,7 @@ def test_half_written_event_is_taken_back(pool: Scene, monkeypatch: pytest.Monke
 
 def test_history_is_compacted_as_it_grows(pool: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A year of flapping does not fill the disk, and keeps generations and readiness."""
-    monkeypatch.setattr(stores, "COMPACT_AFTER", 50)
+    monkeypatch.setattr(history_file, "COMPACT_AFTER", 50)
     monkeypatch.setattr(os, "fsync", lambda _: None)
     pool.store.append(LAUNCH)
     for at in range(200):
