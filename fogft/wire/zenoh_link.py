@@ -11,7 +11,6 @@ replica's silence means for the pool (`fogft.core`).
 from __future__ import annotations
 
 import logging
-import socket
 import threading
 import time
 from collections.abc import Mapping
@@ -24,10 +23,11 @@ import zenoh
 from fogft.core import names
 from fogft.core.errors import CredentialError, WireError
 from fogft.core.model import LinkState, doubted_after_s
-from fogft.wire import config, diagnosis, probe_frames
+from fogft.wire import config, probe_frames
 from fogft.wire.compression import ZLIB, ZLIB_ANSWERS
 from fogft.wire.frame import FrameError
 from fogft.wire.leaving import see_off
+from fogft.wire.opening import Opening
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.wire.recalls import Recalls
 from fogft.wire.silence import Silence
@@ -43,8 +43,6 @@ _FIRST_PROBES_EVERY_S = 0.1
 _UNREADY_PROBES_EVERY_S = 0.25  # a replica that is there gets requests soon after it is ready
 _PROBE_TIMEOUT_S = 60.0  # on a thin uplink it waits behind what is large
 _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
-_EXPLAIN_EVERY_S = 5.0
-_EXPLAIN_TIMEOUT_S = 0.5
 _RENEW_AGAIN_S = 5.0
 _LOOK_EVERY_S = 0.1  # while something large is sent
 
@@ -88,12 +86,11 @@ class ZenohLink:
         self._rtt_s: float | None = None
         self._doubted = False
         self._detail = "not reached yet"
+        self._opening = Opening(peer, dialer.settings)
         self._opened = 0
-        self._timed_out = 0  # tries in a row
         self._renew = threading.Event()
         self._renew_at: float | None = None
         self._retiring: list[Connection] = []  # succeeded, with requests under way
-        self._explained_at = float("-inf")
         self._thread = threading.Thread(
             target=self._keep, name=f"fogft-keep-{peer.id.short}", daemon=True
         )
@@ -270,7 +267,7 @@ class ZenohLink:
         began = time.monotonic()
         try:
             connection = Connection(
-                config.to_zenoh({**self._config, **config.open_within(self._open_timeout_s())}),
+                config.to_zenoh({**self._config, **config.open_within(self._opening.timeout_s)}),
                 self._peer,
                 self._dialer.robot,
                 self._services,
@@ -288,32 +285,14 @@ class ZenohLink:
             self._say(error.message)
             return None
         except zenoh.ZError as error:
-            took_s = time.monotonic() - began
-            self._timed_out = self._timed_out + 1 if took_s >= self._open_timeout_s() * 0.9 else 0
-            self._say(self._explain(took_s) or self._detail or str(error))
+            if not self._closed:
+                now = time.monotonic()
+                why = self._opening.failed(now - began, now, self._dialer.credentials)
+                self._say(why or self._detail or str(error))
             return None
         self._opened += 1
-        self._timed_out = 0
+        self._opening.done()
         return connection
-
-    def _open_timeout_s(self) -> float:
-        """Every third time-out in a row is a long one: the replica may be there, and slow."""
-        settings = self._dialer.settings
-        patient = self._timed_out % 3 == 2
-        return settings.long_open_timeout_s if patient else settings.open_timeout_s
-
-    def _explain(self, took_s: float) -> str:
-        """Find words for a failed opening; empty when that was done lately."""
-        interface = self._peer.interface
-        if interface and interface not in {name for _, name in socket.if_nameindex()}:
-            return f"there is no network interface `{interface}` here"
-        if took_s >= self._dialer.settings.open_timeout_s * 0.9:
-            return f"`{self._peer.endpoint}` does not answer: frozen, blackholed or overloaded"
-        now = time.monotonic()
-        if self._closed or now - self._explained_at < _EXPLAIN_EVERY_S:
-            return ""
-        self._explained_at = now
-        return diagnosis.explain(self._peer, self._dialer.credentials, _EXPLAIN_TIMEOUT_S)
 
     def _attend(self, connection: Connection, *, until_up: bool = False) -> bool:
         """Probe a connection until it is lost, suspect or not wanted; return whether it was up.
