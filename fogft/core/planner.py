@@ -164,8 +164,10 @@ def _plan_once(
     may_move = may_move and migration.is_quiet(census, health)
     waits = may_move and migration.has_stand_ins(buyer)
     restless = migration.restless(buyer) if may_move else frozenset()
+    moves = False
     if waits or restless:
         found = migration.mover(buyer, observed.now, restless)
+        moves = found is not None
         if found is not None:
             census.good.remove(found.standing)
             census.replaced.append(replace(found.standing, reason=found.why))
@@ -210,7 +212,9 @@ def _plan_once(
         notes=tuple(dict.fromkeys(notes)),
         health=health,
         # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
-        closed=not (ends or endings.draining or census.replaced or census.ending or excess),
+        # Who moves is not to go before the one that comes serves: all others do, and are needed.
+        closed=not (ends or endings.draining or census.ending or excess)
+        and (moves or not census.replaced),
         waits=waits,
         restless=restless,
     )

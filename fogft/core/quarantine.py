@@ -68,7 +68,7 @@ class _Outlook(NamedTuple):
     Attributes:
         rest: Whatever was the pool file's fault is left out.
         rest_changes: When it ends or gets shorter; infinity where there is none.
-        setup: The failures of late that are the pool file's fault.
+        setup: The failures that are the pool file's fault, those of late among them.
         disappointment: It has failed of late, and not proved itself since.
     """
 
@@ -98,7 +98,10 @@ def resting(history: History, now: float) -> Mapping[str, Backoff]:
 
 
 def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
-    """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
+    """Return the supplies that failed within FORGIVE_S and have not proved themselves since.
+
+    Only the last failure is told.
+    """
     return history.of_supplies(_outlook, _summed_up, now).disappointing
 
 
@@ -114,8 +117,10 @@ def _outlook(history: History, supply: str, now: float) -> Lasting[_Outlook | No
     disappointment = None
     if bad:
         last = bad[-1]
-        disappointment = Backoff(last.at + FORGIVE_S, len(bad), last.cause, since=last.at)
-    until = until if rest is None else min(until, rest.until)
+        disappointment = Backoff(last.at + FORGIVE_S, 1, last.cause, since=last.at)
+    if history.failures[supply][-1].at <= now:  # to forgive the others changes a rest at most
+        until = lately[-1].at + FORGIVE_S
+    until = min(until, rest_changes)
     return Lasting(_Outlook(rest, rest_changes, setup, disappointment), now, until)
 
 

@@ -82,4 +82,5 @@ class Operations(Generic[T]):
             error = unexpected
         with self._lock:
             self._outcomes.append(Outcome(id, subject, error))
+        del error  # its traceback holds this frame: neither is to keep the other alive
         self._on_done()

@@ -42,12 +42,13 @@ def simulation(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
                 days=5.0,
                 seeds=tuple(range(5 if quick else 20)),
             )
+            make = policies(scenario)["fogft"]
             speeds, asked = [], 0
             for seed in scenario.seeds:
                 began = time.process_time()
                 world = World(scenario.market(seed), seed=seed, length_s=scenario.length_s)
                 with unlogged():
-                    world.run(policies(scenario)["fogft"](world))
+                    world.run(make(world))
                 days = scenario.length_s / DAY_S
                 speeds.append(days / (time.process_time() - began) * 60)
                 asked += world.asked
