@@ -259,13 +259,8 @@ class _Chooser:
 
     def _superseded(self, standing: Standing, history: History) -> bool:
         """Whether a later launch of its slot has served: its own turn is over."""
-        return standing.verdict is Verdict.UNRESPONSIVE and any(
-            (record := history.record(standing.slot, generation)) is not None
-            and record.first_ready_at is not None
-            for generation in range(
-                standing.id.generation + 1, history.generation(standing.slot) + 1
-            )
-        )
+        later = history.served(standing.slot) > standing.id.generation
+        return later and standing.verdict is Verdict.UNRESPONSIVE
 
     def end_some(
         self, standings: Iterable[Standing], count: int, reason: str, *, coming: int = 0

@@ -158,6 +158,7 @@ class History:
         self._records: dict[tuple[int, int], Record] = {}
         self._open: dict[tuple[int, int], Record] = {}
         self._generations: dict[int, int] = {}
+        self._served: dict[int, int] = {}  # slot -> the highest generation that was ever ready
         self._failures: dict[str, list[Failure]] = {}
         self._proven_at: dict[str, float] = {}
         self._losses: dict[str, list[float]] = {}
@@ -220,7 +221,7 @@ class History:
         later._generations = dict(self._generations)
         # Launches and marks change none of these.
         later._failures, later._proven_at = self._failures, self._proven_at
-        later._losses = self._losses
+        later._losses, later._served = self._losses, self._served
         later._of_supplies, later._of_losses = self._of_supplies, self._of_losses
         for event in events:
             if event.kind not in _ORDERS:
@@ -239,6 +240,8 @@ class History:
             if record.first_ready_at is None:
                 record.first_ready_at = event.at
             record.unready_since = None
+            if record.generation > self._served.get(record.slot, 0):
+                self._served[record.slot] = record.generation
             self._proven_at[record.supply] = event.at
             if self._failures and record.supply in self._failures:
                 outdate(self._of_supplies, record.supply)
@@ -288,6 +291,10 @@ class History:
     def generation(self, slot: int) -> int:
         """Return the highest generation ever used in a slot; 0 for none."""
         return self._generations.get(slot, 0)
+
+    def served(self, slot: int) -> int:
+        """Return the highest generation of a slot that was ever ready; 0 for none."""
+        return self._served.get(slot, 0)
 
     @property
     def generations(self) -> Mapping[int, int]:
