@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from fogft.core import planner
 from fogft.core.history import EventKind
 from fogft.core.spec_choices import OnDemandSpec, ScheduleSpec, WindowSpec
 from fogft.simulation import arithmetic
@@ -94,6 +95,17 @@ def test_asking_only_when_something_can_change_changes_nothing(seed):
     assert jumping.store.events == ticking.store.events
     assert lazily.outcome().available == pytest.approx(eagerly.outcome().available)
     assert lazily.outcome().usd_per_hour == pytest.approx(eagerly.outcome().usd_per_hour)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_planning_on_adds_nothing_to_a_plan_that_is_said_to_be_closed(seed, monkeypatch):
+    """The same events as when each plan that changes anything is planned on while under way."""
+    wanted = any_scenario(seed, days=0.2)
+    trusting = run(wanted, seed=seed)[0].store.events
+    once = planner._plan_once
+    doubted = lambda *args, **options: once(*args, **options)._replace(closed=False)  # noqa: E731
+    monkeypatch.setattr(planner, "_plan_once", doubted)
+    assert run(wanted, seed=seed)[0].store.events == trusting
 
 
 def test_a_pool_is_whole_when_its_window_opens():
