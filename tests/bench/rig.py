@@ -105,6 +105,7 @@ class Rig:
         rmw: How proxies, services and callers speak ROS.
         environ: More of the environment for every process.
         graph: Whether topics and an action pass as well.
+        bare: Whether the same services are also to be had the barest way, in `bare_domain`.
     """
 
     def __init__(
@@ -122,6 +123,7 @@ class Rig:
         rmw: str = "rclpy",
         environ: Mapping[str, str] = MappingProxyType({}),
         graph: bool = False,
+        bare: bool = False,
     ) -> None:
         self._folder = folder
         self._uid = secrets.token_hex(8)
@@ -136,12 +138,13 @@ class Rig:
         self._topics = [topics.to_plain(topic) for topic in TOPICS] if graph else []
         self._stateful = stateful
         self._policy: dict[str, Any] = policy or {}
-        self.robot_domain, *domains = free_domains(replicas + 1)
-        self.domains = domains
+        self.robot_domain, self.bare_domain, *domains = free_domains(2 + 2 * replicas)
+        self.domains, self._bare_domains = domains[:replicas], domains[replicas:]
         credentials.create_authority(folder / "ca", self._uid)
         self.replicas = [self._replica(slot, slot in relayed) for slot in range(replicas)]
         self.floor_port = self._floor()
         self.proxy = self._client_proxy()
+        self.bare = self._bare() if bare else []
         self.follow(range(replicas))
 
     def __enter__(self) -> Rig:
@@ -288,6 +291,27 @@ class Rig:
         self._wait(lambda: "ready" in log.read_text(), "the bare replier")
         return port
 
+    def _bare(self) -> list[subprocess.Popen[bytes]]:
+        """Start services of its own, the replicas' ends, and the robot's, which is the first."""
+        ports, domains = free_ports(len(self.domains)), self._bare_domains
+        started = []
+        for number, (domain, port) in enumerate(zip(domains, ports, strict=True)):
+            name = f"bare-service-{number}"
+            environ = {"ROS_DOMAIN_ID": str(domain), SPEAKS: self._rmw}
+            words = self._arguments[number].split()
+            started.append(self._start(name, "tests.bench.service", *words, environ=environ))
+            started.append(self._bare_end(f"bare-{number}", "replica", domain, [port]))
+        return [self._bare_end("bare-robot", "robot", self.bare_domain, ports), *started]
+
+    def _bare_end(
+        self, name: str, side: str, domain: int, ports: Sequence[int]
+    ) -> subprocess.Popen[bytes]:
+        words = [side, str(self.floor_folder), str(domain), *map(str, ports)]
+        process = self._start(name, "tests.bench.bare", *words)
+        log = self._folder / f"{name}.log"
+        self._wait(lambda: "ready" in log.read_text(), f"the bare {side}")
+        return process
+
     @property
     def floor_folder(self) -> Path:
         """Where the bare round trip's certificates are."""
@@ -304,8 +328,14 @@ class Rig:
             return [{**s, "state": _state(str(s["name"])).to_plain()} for s in services]
         return services
 
-    def _start(self, name: str, module: str, *arguments: str) -> subprocess.Popen[bytes]:
-        environ = {**child_environment(), "PYTHONPATH": str(ROOT), **self._environ}
+    def _start(
+        self,
+        name: str,
+        module: str,
+        *arguments: str,
+        environ: Mapping[str, str] = MappingProxyType({}),
+    ) -> subprocess.Popen[bytes]:
+        environ = {**child_environment(), "PYTHONPATH": str(ROOT), **self._environ, **environ}
         environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         with (self._folder / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(

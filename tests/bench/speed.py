@@ -5,14 +5,15 @@ from __future__ import annotations
 import gc
 import os
 import random
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from fogft.core.middleware import Speaks
 from tests.bench import machine
-from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.caller import Caller, Flood, milliseconds, payloads
 from tests.bench.floor import Floor
 from tests.bench.rig import Rig
 from tests.bench.service import FLAG, MAP
@@ -40,17 +41,23 @@ def overhead(
     """Compare direct calls, proxied calls and bare round trips, in turns, in one run."""
     sizes = {FLAG[0]: (300 if quick else 1500, "flag"), MAP[0]: (80 if quick else 300, "map")}
     rows = []
-    with Rig(folder, replicas, rmw=speaks.value, environ=environ) as rig:
+    has_bare = speaks is Speaks.RCLPY
+    with Rig(folder, replicas, rmw=speaks.value, environ=environ, bare=has_bare) as rig:
         of_caller = {"speaks": speaks, "environ": environ}
         direct = Caller(rig.domains[0], "bench_direct", **of_caller)
         proxied = Caller(rig.robot_domain, "bench_proxied", **of_caller)
+        bare = Caller(rig.bare_domain, "bench_bare", **of_caller) if has_bare else None
         floor = Floor(rig.floor_folder, rig.floor_port)
         direct.wait()
         proxied.wait()
+        if bare is not None:
+            bare.wait()
         for (service, (rounds, key)), payload in zip(
             sizes.items(), payloads().values(), strict=True
         ):
             sides: dict[str, list[float]] = {"direct": [], "proxied": [], "get": []}
+            if bare is not None:
+                sides["bare"] = []
             gc.collect()
             for number in range(_WARM_UP + rounds):
                 took = {
@@ -58,6 +65,8 @@ def overhead(
                     "proxied": proxied.call(service, payload),
                     "get": floor.call(key, payload),
                 }
+                if bare is not None:
+                    took["bare"] = bare.call(service, payload)
                 if number >= _WARM_UP:
                     for side, seconds in took.items():
                         sides[side].append(seconds)
@@ -67,7 +76,7 @@ def overhead(
                 proxied.call(service, payload)
             row["cpu_ms_per_request"] = _cpu_per_request(before, rig, rounds)
             rows.append(row)
-        for caller in (direct, proxied):
+        for caller in filter(None, (direct, proxied, bare)):
             caller.close()
         floor.close()
     return rows
@@ -89,14 +98,18 @@ def _row(
             estimate({side: sample}, lambda s, side=side: median(s[side]), source, resamples=500)
         )
         row[f"{side}_p99_ms"] = percentile(sample, 99)
-    row["overhead_ratio"] = _interval(
-        estimate(
-            in_ms,
-            lambda s: overhead_ratio(median(s["direct"]), median(s["proxied"]), median(s["get"])),
-            source,
-            resamples=500,
-        )
-    )
+    for way, name in (("proxied", "overhead_ratio"), ("bare", "bare_ratio")):
+        if way in in_ms:
+            row[name] = _interval(
+                estimate(
+                    in_ms,
+                    lambda s, way=way: overhead_ratio(
+                        median(s["direct"]), median(s[way]), median(s["get"])
+                    ),
+                    source,
+                    resamples=500,
+                )
+            )
     return row
 
 
@@ -111,6 +124,7 @@ def _cpu_used(rig: Rig) -> dict[str, float]:
         "client_proxy": [rig.proxy.pid],
         "server_proxies": [r.process.pid for r in rig.replicas],
         "services": [r.service_pid() for r in rig.replicas],
+        "bare": [process.pid for process in rig.bare],
     }
     return {role: sum(map(machine.cpu_s, pids)) for role, pids in roles.items()}
 
@@ -121,34 +135,49 @@ def _cpu_per_request(before: dict[str, float], rig: Rig, requests: int) -> dict[
 
 
 def throughput(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
-    """Count SetBool calls per second with 64 in flight: direct, and through two replicas."""
+    """Count SetBool calls per second with 64 in flight: direct, and through two replicas.
+
+    Through the proxies, and the barest way (`bare`); these take turns.
+    """
     count = 3_000 if quick else 20_000
-    rows = []
-    with Rig(folder, 2) as rig:
+    with Rig(folder, 2, bare=True) as rig:
         payload = payloads()[FLAG[0]]
-        for way, domain in (("direct", rig.domains[0]), ("proxied", rig.robot_domain)):
-            caller = Caller(domain, f"bench_{way}")
-            caller.wait()
-            caller.flood(FLAG[0], payload, 500, _IN_FLIGHT)
-            before = _cpu_used(rig)
-            repeats = [caller.flood(FLAG[0], payload, count, _IN_FLIGHT) for _ in range(3)]
-            cpu_ms = _cpu_per_request(before, rig, count * len(repeats))
-            caller.close()
-            per_s = [r.answered / r.seconds for r in repeats]
-            rows.append(
-                {
-                    "way": way,
-                    "replicas": 2,
-                    "in_flight": _IN_FLIGHT,
-                    "requests": count * len(repeats),
-                    "unanswered": count * len(repeats) - sum(r.answered for r in repeats),
-                    "per_s": median(per_s),
-                    "per_s_low": min(per_s),
-                    "per_s_high": max(per_s),
-                    "cpu_ms_per_request": cpu_ms,
-                }
-            )
-    return rows
+        ways = {
+            "direct": rig.domains[0],
+            "bare": rig.bare_domain,
+            "proxied": rig.robot_domain,
+        }
+        floods: dict[str, list[Flood]] = {way: [] for way in ways}
+        used: dict[str, Counter[str]] = {way: Counter() for way in ways}
+        for _ in range(3):
+            for way, domain in ways.items():
+                # One at a time: DDS sends every response to all clients of a service.
+                caller = Caller(domain, f"bench_{way}")
+                caller.wait()
+                caller.flood(FLAG[0], payload, 500, _IN_FLIGHT)
+                before = _cpu_used(rig)
+                floods[way].append(caller.flood(FLAG[0], payload, count, _IN_FLIGHT))
+                used[way].update(_cpu_per_request(before, rig, 3 * count))
+                caller.close()
+    return [_throughput_row(way, floods[way], count, dict(used[way])) for way in ways]
+
+
+def _throughput_row(
+    way: str, floods: Sequence[Flood], count: int, cpu_ms: dict[str, float]
+) -> dict[str, Any]:
+    per_s = [flood.answered / flood.seconds for flood in floods]
+    requests = count * len(floods)
+    return {
+        "way": way,
+        "replicas": 2,
+        "in_flight": _IN_FLIGHT,
+        "requests": requests,
+        "unanswered": requests - sum(flood.answered for flood in floods),
+        "per_s": median(per_s),
+        "per_s_low": min(per_s),
+        "per_s_high": max(per_s),
+        "cpu_ms_per_request": cpu_ms,
+    }
 
 
 def memory(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
