@@ -80,6 +80,27 @@ def test_a_frozen_replica_is_suspected_and_comes_back(
     assert owner.of(1)[1].payload == b"once more"
 
 
+def test_a_frozen_replica_is_given_up_without_delay_for_another(
+    start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """Its link is ended with megabytes in it; nobody waits for Zenoh to close that."""
+    frozen, healthy = (start_replica(slot=slot, reply_bytes=16) for slot in (0, 1))
+    # In one process, as a robot's links are. Zenoh would wait for 10 s.
+    links = [
+        dial(replica.endpoint, slot=slot, suspect_after_s=7.0)
+        for slot, replica in enumerate((frozen, healthy))
+    ]
+    wait_for(lambda: all(link.usable for link in links))
+    frozen.signal(signal.SIGSTOP)
+    for number in range(20):
+        links[0].offer(SERVICE, request_id(number), MEGABYTE, 60.0)
+    wait_for(lambda: not links[0].usable)
+    probes = healthy.count("probes")
+    wait_for(lambda: healthy.count("probes") >= probes + 2)
+    assert (1, LinkState.SUSPECT) not in owner.states
+    assert links[1].status().reopened == 0
+
+
 ROBOT = """
 import json, sys, time
 from pathlib import Path
