@@ -12,15 +12,14 @@ from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 S = TypeVar("S")
-_SINCE, _UNTIL = attrgetter("since"), attrgetter("until")
+_UNTIL = attrgetter("until")
 
 
 @dataclass
 class Lasting(Generic[T]):
-    """Something that is so from `since` until before `until`, unless something happens."""
+    """Something that is so until before `until`, unless something happens."""
 
     value: T
-    since: float
     until: float
 
 
@@ -41,16 +40,15 @@ class Digest(Generic[T, S]):
 
     def at(self, now: float, work_out: Callable[[str], Lasting[T | None]]) -> S:
         """Return what is so at a time, all places summed up; None at a place is left out."""
-        if not self._since <= now < self._until:
-            self.outdated.update(
-                place for place, one in self._known.items() if not one.since <= now < one.until
-            )
+        if now < self._since:  # the clock was set back
+            self.outdated.update(self._known)
+        elif now >= self._until:
+            self.outdated.update(place for place, one in self._known.items() if now >= one.until)
         if self.outdated:
             for place in self.outdated:
                 self._known[place] = work_out(place)
             self.outdated.clear()
-            self._since = max(map(_SINCE, self._known.values()))
-            self._until = min(map(_UNTIL, self._known.values()))
+            self._since, self._until = now, min(map(_UNTIL, self._known.values()))
             self._whole = self._sum_up(
                 {place: one.value for place, one in self._known.items() if one.value is not None}
             )

@@ -97,20 +97,18 @@ class Health(NamedTuple):
 def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
     """Judge what is observed. Machines of other pools are left out."""
     links = {report.id: report for report in observed.links or ()}
-    ours = [
-        (machine, links.get(machine.id), history.record(machine.id.slot, machine.id.generation))
-        for machine in sorted(observed.machines or (), key=by_id)
-        if machine.id.pool_uid == pool_uid
-    ]
-    serving = [link is not None and is_ready(spec, machine, link) for machine, link, record in ours]
-    heard = [
-        link
-        for machine, link, record in ours
-        if link is not None
-        and machine.phase is _RUNNING
-        and (not observed.ending or machine.id not in observed.ending)
-        and was_heard(link, record)
-    ]
+    ours, heard = [], []
+    for machine in sorted(observed.machines or (), key=by_id):
+        id = machine.id
+        if id.pool_uid != pool_uid:
+            continue
+        link, record = links.get(id), history.record(id.slot, id.generation)
+        serving = link is not None and is_ready(spec, machine, link)
+        ours.append((machine, link, record, serving))
+        if link is None or machine.phase is not _RUNNING or id in observed.ending:
+            continue
+        if was_heard(link, record):
+            heard.append(link)
     answering = _UP in [link.state for link in heard]
     alone = len(heard) == 1
     patience_s = spec.health.replace_after_s * (LONE_SILENCE_FACTOR if alone else 1.0)
@@ -118,15 +116,10 @@ def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -
     if alone and heard[0].silent_for_s > patience_s:
         uplink_suspected = False
     may_doubt = observed.links is not None and not uplink_suspected
-    ready_somewhere = True in serving and any(
-        ready and not machine.notice for ready, (machine, _, _) in zip(serving, ours, strict=True)
-    )
+    ready_somewhere = any(serving and not machine.notice for machine, _, _, serving in ours)
     context = _Context(spec.health, observed.now, patience_s, may_doubt, ready_somewhere)
-    replicas = [
-        _judge_one(context, machine, link, record, ready)
-        for ready, (machine, link, record) in zip(serving, ours, strict=True)
-    ]
-    return Health(tuple(replicas), uplink_suspected, links_known=observed.links is not None)
+    replicas = tuple([_judge_one(context, *one) for one in ours])
+    return Health(replicas, uplink_suspected, links_known=observed.links is not None)
 
 
 def was_heard(link: LinkReport, record: Record | None) -> bool:

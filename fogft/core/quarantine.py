@@ -108,7 +108,7 @@ def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
 def _outlook(history: History, supply: str, now: float) -> Lasting[_Outlook | None]:
     lately, until = _lately(history.failures[supply], now)
     if not lately:
-        return Lasting(None, now, until)
+        return Lasting(None, until)
     proven_at = history.proven_at(supply)
     bad = lately if lately[0].at > proven_at else [f for f in lately if f.at > proven_at]
     setup = [f for f in lately if f.cause == "setup"]
@@ -121,7 +121,7 @@ def _outlook(history: History, supply: str, now: float) -> Lasting[_Outlook | No
     if history.failures[supply][-1].at <= now:  # to forgive the others changes a rest at most
         until = lately[-1].at + FORGIVE_S
     until = min(until, rest_changes)
-    return Lasting(_Outlook(rest, rest_changes, setup, disappointment), now, until)
+    return Lasting(_Outlook(rest, rest_changes, setup, disappointment), until)
 
 
 def _summed_up(outlooks: Mapping[str, _Outlook]) -> _Supplies:
@@ -216,13 +216,13 @@ def _avoidance(history: History, location: str, now: float) -> Lasting[_Avoidanc
     end = bisect_right(losses, now, lo=first)
     holds = losses[end] if end < len(losses) else NEVER
     if first == end:
-        return Lasting(None, now, holds)
+        return Lasting(None, holds)
     until = losses[end - 1] + min(AVOID_S * 2.0 ** min(end - first - 1, 16), AVOID_LIMIT_S)
     forgotten = losses[first] + AVOID_MEMORY_S
     holds = min(holds, forgotten)
     if until <= now:
-        return Lasting(None, now, holds)
-    return Lasting(_Avoidance(until, min(until, forgotten)), now, min(holds, until))
+        return Lasting(None, holds)
+    return Lasting(_Avoidance(until, min(until, forgotten)), min(holds, until))
 
 
 def _all_avoided(locations: Mapping[str, _Avoidance]) -> _Avoided:

@@ -152,8 +152,9 @@ class Managed:
                 times.append(record.first_ready_at + stay_s)
             if waits and record.on_demand:
                 times.append(record.first_ready_at + migration.RETURN_AFTER_S)
+        provisioning = MachinePhase.PROVISIONING
         for machine in tick.observed.machines or ():
-            if machine.phase is MachinePhase.PROVISIONING:
+            if machine.phase is provisioning:
                 times.append(machine.launched_at + health.start_limit_s + TICK_S)
         return min([at for at in times if at > now], default=NEVER)
 
