@@ -122,22 +122,26 @@ time.sleep(600)
 
 
 @pytest.fixture
-def frozen_robot(authority: Authority) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
-    """Start a robot that asks for 60 answers, to be frozen by the test."""
+def freeze_robot(authority: Authority) -> Iterator[Callable[[ReplicaProcess], None]]:
+    """Start a robot that asks a replica for 60 answers, and freeze it before they come."""
     started: list[subprocess.Popen[str]] = []
 
-    def start(endpoint: str) -> subprocess.Popen[str]:
+    def start(replica: ReplicaProcess) -> None:
         files = authority.robot("frozen")
         paths = [str(files.ca), str(files.certificate), str(files.key)]
         started.append(
             subprocess.Popen(
-                [sys.executable, "-c", ROBOT, *paths, endpoint, json.dumps(asdict(STUCK))],
+                [sys.executable, "-c", ROBOT, *paths, replica.endpoint, json.dumps(asdict(STUCK))],
                 stdout=subprocess.PIPE,
                 text=True,
                 cwd=Path(__file__).parents[2],
             )
         )
-        return started[-1]
+        stdout = started[-1].stdout
+        assert stdout is not None
+        assert stdout.readline() == "offered\n"
+        wait_for(lambda: replica.count("requests") == 60)
+        started[-1].send_signal(signal.SIGSTOP)
 
     yield start
     for process in started:
@@ -151,18 +155,14 @@ def test_a_frozen_robot_does_not_delay_another_robots_replies(
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
     owner: Owner,
-    frozen_robot: Callable[[str], subprocess.Popen[str]],
+    freeze_robot: Callable[[ReplicaProcess], None],
 ) -> None:
     """60 MB of replies wait for a robot that takes none; the other's 1 MB replies all arrive.
 
     Nor is its link suspected meanwhile: probes have a way of their own.
     """
     replica = start_replica(delay_s=1.0, reply_bytes=1 << 20, settings=STUCK)
-    robot = frozen_robot(replica.endpoint)
-    assert robot.stdout is not None
-    assert robot.stdout.readline() == "offered\n"
-    wait_for(lambda: replica.count("requests") == 60)
-    robot.send_signal(signal.SIGSTOP)
+    freeze_robot(replica)
     link = dial(replica.endpoint)
     wait_for(lambda: link.usable)
     wait_for(lambda: replica.count("replies") >= 60)
@@ -178,16 +178,12 @@ def test_a_frozen_robot_is_given_up_without_delay_for_another(
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
     owner: Owner,
-    frozen_robot: Callable[[str], subprocess.Popen[str]],
+    freeze_robot: Callable[[ReplicaProcess], None],
 ) -> None:
     """Its link is ended with megabytes in it; nobody waits for Zenoh to close that."""
     settings = LinkSettings(stuck_after_s=0.5)
     replica = start_replica(delay_s=1.0, reply_bytes=1 << 20, settings=settings)
-    robot = frozen_robot(replica.endpoint)
-    assert robot.stdout is not None
-    assert robot.stdout.readline() == "offered\n"
-    wait_for(lambda: replica.count("requests") == 60)
-    robot.send_signal(signal.SIGSTOP)
+    freeze_robot(replica)
     link = dial(replica.endpoint, suspect_after_s=7.0)  # Zenoh would wait for 10 s
     wait_for(lambda: link.usable)
     wait_for(lambda: replica.count("stuck_links"))
