@@ -27,6 +27,7 @@ from fogft.core.holders import Role, holder_of
 from fogft.core.model import ReplicaId
 from fogft.core.records import RecordError, Verify
 from fogft.core.repeats import worth_logging
+from fogft.wire import first_message
 from fogft.wire import record_frames as frames
 from fogft.wire.reply_queue import Counters
 from fogft.wire.splice import Tunnel, hang_up, keep_alive
@@ -128,20 +129,12 @@ class DialIn:
             self._wait(id, _Waiting(link))
 
     def _greet(self, link: socket.socket, host: str) -> ReplicaId:
-        until = time.monotonic() + _GREETING_TIMEOUT_S
         keep_alive(link)
         link.settimeout(_GREETING_TIMEOUT_S)
         nonce = secrets.token_bytes(frames.NONCE_BYTES)
         link.sendall(frames.challenge(nonce, host))
-        unframer = frames.Unframer(limit=16 << 10)
-        messages: list[dict[str, object]] = []
-        while not messages:
-            link.settimeout(max(0.01, until - time.monotonic()))
-            data = link.recv(4096)
-            if not data:
-                raise EOFError("it left without a greeting")
-            messages = list(unframer.feed(data))
-        certificate, signature = frames.read_greeting(messages[0])
+        message = first_message.receive(link, 16 << 10, _GREETING_TIMEOUT_S)
+        certificate, signature = frames.read_greeting(message)
         proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
         writer = self._verify(certificate, signature, proof)
         try:

@@ -14,9 +14,9 @@ import socket
 import threading
 import time
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from fogft.core.records import RecordError, Sign
+from fogft.wire import first_message
 from fogft.wire import record_frames as frames
 from fogft.wire.dial_in import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
 from fogft.wire.splice import Tunnel, hang_up, keep_alive
@@ -107,15 +107,10 @@ class DialOut:
         link = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_TIMEOUT_S)
         try:
             keep_alive(link)
+            nonce, _ = frames.read_challenge(
+                first_message.receive(link, 4 << 10, _GREETING_TIMEOUT_S)
+            )
             link.settimeout(_GREETING_TIMEOUT_S)
-            unframer = frames.Unframer(limit=4 << 10)
-            messages: list[dict[str, Any]] = []
-            while not messages:
-                data = link.recv(4096)
-                if not data:
-                    raise EOFError("the door was shut")
-                messages = list(unframer.feed(data))
-            nonce, _ = frames.read_challenge(messages[0])
             proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
             link.sendall(frames.greeting(*self._sign(proof)))
         except BaseException:
