@@ -241,8 +241,9 @@ def test_the_strategy_reaches_what_it_should() -> None:
     )
 
     @settings(
-        max_examples=3000, database=None, derandomize=True, phases=[hypothesis.Phase.generate]
-    )
+        max_examples=3000, database=None, derandomize=True, phases=[hypothesis.Phase.generate],
+        report_multiple_bugs=False,
+    )  # fmt: skip
     @given(worlds())
     def look(world: World) -> None:
         planned = world.plan()
