@@ -24,7 +24,7 @@ TIMEOUT_S = 40.0
 # How long a caller waits: longer than the proxy, but where the proxy itself was killed.
 GIVE_UP_S, GIVE_UP_KILLED_S = 50.0, 3.0
 # Between an answer and the next question: most calls overlap others, and none waits for a core.
-PAUSE_S = 0.03
+PAUSE_S = 0.05
 NODE = ROOT / "tests/proxy/nodes/stateful_node.py"
 _END = "type: nav_msgs/srv/{}Map, field: map.data"
 
