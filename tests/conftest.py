@@ -13,6 +13,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests import own_process
 from tests.dealing import dealt
 from tests.wire.namespaces import Namespaces, why_not
 from tests.wire.rmw_router import Router, running
@@ -40,20 +41,21 @@ DOMAINS = range(60, 101)  # above 101 the ports of a domain reach Linux's epheme
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Among several workers, let the long tests begin first: see `dealing`.
-
-    Not those with networks of their own: where Zenoh runs in one, its threads may stay there.
-    """
+    """Among several workers, let the long tests begin first: see `dealing`."""
 
     def limit_s(item: pytest.Item) -> float:
-        if "net" in getattr(item, "fixturenames", ()):
-            return 0.0
         marker = item.get_closest_marker("timeout")
         return float(marker.args[0]) if marker and marker.args else 0.0
 
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
         items[:] = dealt(items, limit_s, workers)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is marked so in a process of its own."""
+    return own_process.run(pyfuncitem) or None
 
 
 def _lock_domain(taken: dict[int, int]) -> int:

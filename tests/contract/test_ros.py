@@ -85,7 +85,7 @@ def _zenoh(router: Router) -> World:
 @pytest.fixture(
     params=[
         "memory",
-        pytest.param("zenoh", marks=pytest.mark.timeout(300)),  # early: before `net` (conftest)
+        "zenoh",
         pytest.param("rcl", marks=pytest.mark.ros),
         pytest.param("converted", marks=pytest.mark.ros),
     ]

@@ -13,7 +13,7 @@ import pytest
 from tests.proxy.by_hand import LIMIT_S, Parts, Replica, Robot, wait_for
 from tests.wire.rmw_router import Router
 
-pytestmark = pytest.mark.timeout(300)  # early: before `net` (conftest)
+pytestmark = pytest.mark.timeout(180)
 if importlib.util.find_spec("pyzeros") is None:
     pytest.skip("pyzeros is not installed (Python 3.11 and `fogft[ros-test]`)",
                 allow_module_level=True)  # fmt: skip

@@ -7,12 +7,9 @@ import ctypes
 import functools
 import json
 import os
-import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-
-from fogft.wire import config
 
 _CLONE_NEWNET = 0x40000000
 _ETHERNET_HEADER_BYTES = 14
@@ -37,30 +34,10 @@ def why_not() -> str:
     return ""
 
 
-@functools.cache
-def _start_zenoh() -> None:
-    """Start Zenoh's threads outside: they serve all later sessions, too, and stay where they began.
-
-    They begin with the process's first session, which may be one in a namespace.
-    """
-    import zenoh
-
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    alone = {"mode": "peer", "scouting/multicast/enabled": False, "listen/endpoints": []}
-    with (
-        zenoh.open(config.to_zenoh({**alone, "listen/endpoints": [endpoint]})),
-        zenoh.open(config.to_zenoh({**alone, "connect/endpoints": [endpoint]})),
-    ):
-        pass
-
-
 class Namespaces:
     """A few namespaces, joined by pairs of virtual cables."""
 
     def __init__(self) -> None:
-        _start_zenoh()
         self._names: list[str] = []
         self._cables = 0
 

@@ -21,8 +21,6 @@ from fogft.wire import rmw_session
 from fogft.wire.rmw_node import RmwZenohNode
 from tests.wire.rmw_router import Router
 
-pytestmark = pytest.mark.timeout(300)  # early: before `net` (conftest)
-
 TYPE = "my_msgs/srv/Grasp"
 HASH, OTHER = "RIHS01_" + "a" * 64, "RIHS01_" + "b" * 64
 KEY = f"7/arm/grasp/my_msgs::srv::dds_::Grasp_/{HASH}"

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import pytest
+
 from fogft.wire.config import LinkSettings
 from fogft.wire.ways import Ways
 from fogft.wire.zenoh_dialer import ZenohDialer
@@ -117,6 +119,7 @@ def test_a_service_that_wants_none_gets_none(
         relay.close()
 
 
+@pytest.mark.own_process
 def test_over_a_thin_cable(authority: Authority, net: Namespaces, owner: Owner) -> None:
     robot_at, replica_at = net.add("r"), net.add("p")
     _, far = net.join(robot_at, ROBOT, replica_at, REPLICA)

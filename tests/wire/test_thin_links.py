@@ -52,6 +52,7 @@ def never_given_up(owner: Owner, links: list[ZenohLink], asked: int) -> None:
     assert LinkState.SUSPECT not in [state for _, state in owner.states]
 
 
+@pytest.mark.own_process
 @pytest.mark.parametrize(("mbit", "reply_bytes"), [(1, 16), (2, 16), (5, -1)])
 def test_a_megabyte_gets_through_a_thin_uplink(authority, net, owner, mbit, reply_bytes):
     """At 1, 2 and 5 Mbit/s, up, and down at 5; so much silence would be suspected."""
@@ -77,6 +78,7 @@ def test_a_megabyte_gets_through_a_thin_uplink(authority, net, owner, mbit, repl
             replica.kill()
 
 
+@pytest.mark.own_process
 def test_a_blackhole_on_a_thin_uplink_is_told_from_a_slow_one(authority, net, owner):
     """What flows is let flow; what stands still is given up, and comes back with the path."""
     robot_at, replica_at = net.add("r"), net.add("p")

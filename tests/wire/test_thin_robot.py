@@ -11,6 +11,8 @@ import statistics
 import time
 from collections.abc import Callable
 
+import pytest
+
 from fogft.core.model import LinkState
 from fogft.wire.port import Answer, Link
 from fogft.wire.zenoh_dialer import ZenohDialer
@@ -111,6 +113,7 @@ def test_a_robot_behind_a_thin_relay_does_not_delay_another(
     assert beside < AS_LONG * alone, (alone, beside)
 
 
+@pytest.mark.own_process
 def test_a_robot_on_a_thin_cable_does_not_delay_another(authority: Authority, net) -> None:
     replica_at, thin_at, healthy_at = net.add("p"), net.add("t"), net.add("h")
     _, far = net.join(thin_at, "10.83.1.1", replica_at, "10.83.1.2")
