@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -65,13 +66,16 @@ def test_time_was_stolen_in_contended_trials_and_in_no_other(condition):
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_contended_server_searches_much_slower(scene):
-    """In checks a second: time was not only stolen while the planner waited."""
+    """In checks a second of the request; time was not only stolen while the planner waited."""
     rows = FOUND["planning"][Condition(scene, 1, contended=True).name]
-    slow, normal = (
-        p50([row["checks"] / row["search_s"] for row in rows if bool(row["contended"]) == stolen])
-        for stolen in (True, False)
-    )
-    assert slow * 3 < normal
+    stolen, spared = ([row for row in rows if bool(row["contended"]) == is_so] for is_so in (1, 0))
+
+    def rates(rows: list[Any], during: str) -> list[float]:
+        return [row["checks"] / row[during] for row in rows]
+
+    assert max(rates(stolen, "latency_s")) * 3 < p50(rates(spared, "latency_s"))
+    # A search of 10 ms may fall between two thefts: not every one is hit itself.
+    assert min(rates(stolen, "search_s")) * 3 < p50(rates(spared, "search_s"))
 
 
 @pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
