@@ -98,7 +98,7 @@ class Markets(Defaults):
             plotting.curve(axis, REPLICAS, means, colour, label)
         axis.set_xticks(REPLICAS)
         axis.set_xlabel("replicas", fontsize=8)
-        axis.set_ylabel("percent of time with an answer", fontsize=8)
+        axis.set_ylabel("% of time with an answer", fontsize=8)
         axis.legend(fontsize=7)
         return {"any-of-n": figure}
 

@@ -12,6 +12,7 @@ from tests.evaluation import plotting
 from tests.evaluation.experiment import Row
 
 FRAMES = 10
+_LINE_POINTS = 11  # a short phase and the next have their words above one another
 
 
 def draw(rows: Sequence[Row], phases: Mapping[str, str]) -> Mapping[str, Any]:
@@ -22,6 +23,7 @@ def draw(rows: Sequence[Row], phases: Mapping[str, str]) -> Mapping[str, Any]:
 def timeline(rows: Sequence[Row], phases: Mapping[str, str]) -> Any:
     """Draw a point for each request, in the colour of who answered first."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     axis = figure.subplots()
@@ -30,13 +32,17 @@ def timeline(rows: Sequence[Row], phases: Mapping[str, str]) -> Any:
         won = [row for row in rows if str(row["winner"]) == str(slot)]
         x, y = ([float(row[k]) for row in won] for k in ("at_s", "latency_s"))
         plotting.series(axis, x, y, colour, f"#{slot + 1} answered first")
-    for phase, word in phases.items():
+    for number, (phase, word) in enumerate(phases.items()):
         at = [float(row["at_s"]) for row in rows if row["phase"] == phase]
         if at:
             axis.axvline(at[0], color="#999999", linewidth=0.7)
-            axis.text(at[0], 1.0, f" {phase}: {word}", transform=axis.get_xaxis_transform(),
-                      fontsize=8, va="bottom")  # fmt: skip
+            axis.annotate(f" {phase}: {word}", (at[0], 1.0), xycoords=axis.get_xaxis_transform(),
+                          xytext=(0, 2 + _LINE_POINTS * (number % 2)), fontsize=8,
+                          textcoords="offset points")  # fmt: skip
     axis.set_yscale("log")
+    axis.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+    for ticks in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+        ticks("{x:g}")
     axis.set_xlabel("seconds", fontsize=8)
     axis.set_ylabel("latency, s", fontsize=8)
     axis.legend(fontsize=7, loc="upper right")
