@@ -221,17 +221,21 @@ class ZenohListener:
                 self._count("malformed", "request_malformed", error)
                 self._refuse(header, stream, Refusal.MALFORMED)
                 continue
-            on_request(
-                ZenohIncoming(
-                    service,
-                    header,
-                    request,
-                    stream=stream,
-                    queues=self._queues,
-                    chores=self._chores,
-                    thin=self._thin,
-                )
+            incoming = ZenohIncoming(
+                service,
+                header,
+                request,
+                stream=stream,
+                queues=self._queues,
+                chores=self._chores,
+                thin=self._thin,
             )
+            try:
+                on_request(incoming)
+            except Exception:  # the others that came with it go on
+                self._counters.add("failed")
+                log.exception("request_not_taken service=%s", service)
+                incoming.refuse(Refusal.LOST)
 
     def _refuse_all(
         self, requests: list[tuple[frame.RequestHeader, bytes]], stream: zenoh.Query, reason: str

@@ -307,6 +307,43 @@ def test_refusals_and_answers_share_a_message_and_stay_apart(
     assert max(sizes) > 1
 
 
+def test_one_that_is_not_taken_does_not_take_the_others_with_it(
+    authority: Authority, dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """At either end: an error of whoever takes it is logged, and ends that one only."""
+    taken, told = [], owner.answered
+
+    def take(incoming: Incoming) -> None:
+        if incoming.payload == b"1":
+            raise RuntimeError("of the proxy")
+        taken.append(incoming)
+
+    def hear(link: Any, answer: Any) -> None:
+        if answer.request_id == request_id(2):
+            raise RuntimeError("of the robot")
+        told(link, answer)
+
+    owner.answered = hear  # type: ignore[method-assign]
+    listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
+    listener.serve(keys(0), take, lambda probe: ProbeAnswer(0, 1, "i", frozenset({SERVICE})))
+    try:
+        link = dial(listener.endpoint)
+        wait_for(lambda: link.usable)
+        for number in range(5):
+            assert link.offer(SERVICE, request_id(number), b"%d" % number, 60.0, more=True)
+        link.send()
+        wait_for(lambda: len(taken) == 4)
+        for one in taken:
+            one.reply(one.payload)
+        wait_for(lambda: all(owner.of(number) for number in (0, 1, 3, 4)))
+        assert [owner.of(n)[0].payload for n in (0, 3, 4)] == [b"0", b"3", b"4"]
+        assert owner.of(1)[0].refusal == Refusal.LOST
+        assert listener.counters().get("failed") == 1
+        assert link.status().reopened == 0
+    finally:
+        listener.close()
+
+
 def test_a_batch_of_a_stranger_or_of_garbage_is_not_taken(
     authority: Authority, listener: ZenohListener, arrived: list[Incoming]
 ) -> None:
