@@ -18,14 +18,11 @@ def flawless(result: dict) -> bool:
 
 @pytest.mark.parametrize("seed", [20261])
 def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
-    """Requests for 16 s and more under kills and freezes, one replica always spared at a time.
-
-    `scripts/soak` goes on for as long as one likes.
-    """
+    """Requests for 30 s and more under kills and freezes, one replica always spared at a time."""
     pool.up()
     client = pool.client(120, 25)
     chance = random.Random(seed)
-    end = time.monotonic() + 16
+    end = time.monotonic() + 30
     faults = []
     while time.monotonic() < end or len({kind for kind, _ in faults}) < 2:
         ready = [r["slot"] for r in pool.status()["replicas"] if r["phase"] == "ready"]
@@ -40,7 +37,7 @@ def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
                 pool.fogft("chaos", "thaw", str(slot), ok=False)
         time.sleep(chance.uniform(0.5, 2.0))
     result = client.finish()
-    assert result["requests"] > 150
+    assert result["requests"] > 500
     assert flawless(result), (result, faults)
     pool.wait(lambda: pool.ready() == 3)
     pool.fogft("down")
@@ -51,7 +48,7 @@ def test_the_replacement_is_launched_at_the_notice_and_not_at_the_death(pool):
     """A machine has 60 s left; long before they are over its successor serves, and none is lost."""
     pool.write(replicas=2)
     pool.up()
-    client = pool.client(60, 10)
+    client = pool.client(60, 20)
     pool.fogft("chaos", "preempt", "0", "--notice", "60")
     pool.wait(
         lambda: any(
@@ -85,7 +82,7 @@ def test_traffic_outlives_the_manager_and_the_next_one_adopts_the_pool(pool):
     pool.write(replicas=2)
     pool.up()
     before = {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
-    client = pool.client(60, 10)
+    client = pool.client(60, 20)
     os.kill(pool.status()["manager_pid"], signal.SIGKILL)
     time.sleep(1)
     pool.fogft("up", str(pool.file), "--yes")
@@ -97,7 +94,7 @@ def test_traffic_outlives_the_manager_and_the_next_one_adopts_the_pool(pool):
 def test_scale_up_and_down_under_load(pool):
     pool.write(replicas=1)
     pool.up()
-    client = pool.client(60, 10)
+    client = pool.client(60, 20)
     pool.fogft("scale", "up", "2")
     pool.wait(lambda: pool.ready() == 3)
     pool.fogft("scale", "down", "2")

@@ -108,7 +108,7 @@ def load_until(caller: Caller, condition: Callable[[], object], limit_s: float =
     while not condition():
         assert time.monotonic() < end, "what was awaited under load never came"
         caller.ask()
-        caller.spin(0.05)
+        caller.spin(0.01)
 
 
 def links_by_id(robot: Robot) -> dict[tuple[int, int], str]:

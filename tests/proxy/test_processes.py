@@ -93,7 +93,7 @@ def test_a_membership_change_under_load_loses_nothing(parts, call):
         while robot.ready() != ready:
             assert time.monotonic() < end, f"{ready} are never ready"
             caller.ask()
-            caller.spin(0.05)
+            caller.spin(0.01)
 
     robot.follow(old, new)
     load_until([0, 1])

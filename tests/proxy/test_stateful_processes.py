@@ -23,8 +23,6 @@ environment.prepare(os.environ)
 TIMEOUT_S = 40.0
 # How long a caller waits: longer than the proxy, but where the proxy itself was killed.
 GIVE_UP_S, GIVE_UP_KILLED_S = 50.0, 3.0
-# Between an answer and the next question: most calls overlap others, and none waits for a core.
-PAUSE_S = 0.05
 NODE = ROOT / "tests/proxy/nodes/stateful_node.py"
 _END = "type: nav_msgs/srv/{}Map, field: map.data"
 
@@ -74,7 +72,7 @@ class Client:
         return self
 
     def _run(self) -> None:
-        while not self._stop.wait(PAUSE_S):
+        while not self._stop.is_set():
             self.ask(self._question())
 
     def ask(self, asked: Any, limit_s: float | None = None) -> Any:

@@ -14,18 +14,14 @@ import time
 
 import rclpy
 from nav_msgs.srv import GetPlan
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
 
 class PlanClient(Node):
     def __init__(self, rate_hz: float, limit_s: float) -> None:
         super().__init__("plan_client")
-        # By default a client loses answers whenever a busy machine holds it up for ten of them.
-        keeps_all = QoSProfile(history=HistoryPolicy.KEEP_ALL)
-        self._plan_client = self.create_client(GetPlan, "/plan", qos_profile=keeps_all)
+        self._plan_client = self.create_client(GetPlan, "/plan")
         self._limit_s = limit_s
         self._period_s = 1 / rate_hz
         self.open: dict[int, float] = {}
@@ -68,18 +64,16 @@ class PlanClient(Node):
         self.wrong += not right
 
     def run(self, seconds: float) -> None:
-        executor = SingleThreadedExecutor()
-        executor.add_node(self)
         end = time.monotonic() + seconds
         due = time.monotonic()
         while time.monotonic() < end and not self.enough:
             if time.monotonic() >= due:
                 self.ask()
-                due = max(due + self._period_s, time.monotonic())  # never a burst
-            executor.spin_once(timeout_sec=max(0.0, due - time.monotonic()))
+                due += self._period_s
+            rclpy.spin_once(self, timeout_sec=max(0.0, due - time.monotonic()))
             self.give_up()
         while self.open:
-            executor.spin_once(timeout_sec=0.05)
+            rclpy.spin_once(self, timeout_sec=0.05)
             self.give_up()
 
     def give_up(self) -> None:
