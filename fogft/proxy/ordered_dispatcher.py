@@ -113,7 +113,7 @@ class OrderedDispatcher:
         return self._order.ready
 
     def burst(self, begins: bool) -> None:
-        """Do nothing: what was put in order leaves together anyway."""
+        """Do nothing: each request is put in order, and sent, by itself."""
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request, number it, and order it applied by every replica."""
