@@ -14,6 +14,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fogft.ros import environment
@@ -48,14 +49,13 @@ def answer(name: str) -> None:
     rclpy.try_shutdown(context=context)
 
 
-def ask(name: str) -> dict[str, float]:
-    """Call that service; return how long discovery and the call took, in seconds.
+def ask(name: str) -> int:
+    """Call that service; print how long discovery and the call took, in seconds, or what failed.
 
-    Raises:
-        TimeoutError: Discovery did not find it, or it did not answer.
+    That is printed before the node is taken down: Fast DDS now and then crashes there, which
+    is no answer to the question.
     """
     import rclpy
-    from rcl_interfaces.srv import ListParameters
     from rclpy.executors import SingleThreadedExecutor
 
     context = rclpy.Context()
@@ -65,38 +65,61 @@ def ask(name: str) -> dict[str, float]:
     )
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    client: Any = node.create_client(ListParameters, f"/{name}/list_parameters")
     try:
-        started = time.monotonic()
-        while not client.service_is_ready():
-            if time.monotonic() - started > _LIMIT_S:
-                raise TimeoutError("discovery")
-            executor.spin_once(timeout_sec=0.02)
-        found = time.monotonic()
-        future = client.call_async(ListParameters.Request())
-        executor.spin_until_future_complete(future, timeout_sec=_LIMIT_S)
-        if not future.done():
-            raise TimeoutError("call")
-        return {"discovery_s": found - started, "call_s": time.monotonic() - found}
+        return _tell(lambda: _call(name, node, executor))
     finally:
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown(context=context)
 
 
+def _call(name: str, node: Any, executor: Any) -> dict[str, float]:
+    """Find the service and call it once.
+
+    Raises:
+        TimeoutError: Discovery did not find it, or it did not answer.
+    """
+    from rcl_interfaces.srv import ListParameters
+
+    client: Any = node.create_client(ListParameters, f"/{name}/list_parameters")
+    started = time.monotonic()
+    while not client.service_is_ready():
+        if time.monotonic() - started > _LIMIT_S:
+            raise TimeoutError("discovery")
+        executor.spin_once(timeout_sec=0.02)
+    found = time.monotonic()
+    future = client.call_async(ListParameters.Request())
+    executor.spin_until_future_complete(future, timeout_sec=_LIMIT_S)
+    if not future.done():
+        raise TimeoutError("call")
+    return {"discovery_s": found - started, "call_s": time.monotonic() - found}
+
+
+def _tell(find: Callable[[], Mapping[str, Any]]) -> int:
+    """Print what is found, or the error that stood in its way; return the exit status."""
+    try:
+        print(json.dumps(find()), flush=True)
+    except Exception as error:
+        return _tell_error(error)
+    return 0
+
+
+def _tell_error(error: Exception) -> int:
+    print(json.dumps({"error": str(error), "kind": type(error).__name__}), flush=True)
+    return 1
+
+
 def main(arguments: list[str]) -> int:
-    """Run one of the three; print its result."""
+    """Run one of the three; it prints its result."""
     environment.prepare(os.environ)
     try:
-        if arguments[0] == "answer":
-            answer(arguments[1])
-        else:
-            describing = arguments[0] == "describe"
-            result = environment.describe() if describing else ask(arguments[1])
-            print(json.dumps(result), flush=True)
+        if arguments[0] == "describe":
+            return _tell(environment.describe)
+        if arguments[0] == "ask":
+            return ask(arguments[1])
+        answer(arguments[1])
     except Exception as error:
-        print(json.dumps({"error": str(error), "kind": type(error).__name__}), flush=True)
-        return 1
+        return _tell_error(error)
     return 0
 
 

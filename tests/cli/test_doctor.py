@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -152,6 +153,21 @@ def test_two_processes_find_each_other(tmp_path, monkeypatch, ros_domain):
     found = the_only(ros.discovery(situation(tmp_path)))
     assert found.verdict is Verdict.OK, found
     assert "was found in" in found.text
+
+
+@pytest.mark.ros
+def test_what_was_found_is_told_though_taking_the_node_down_crashes(
+    tmp_path, monkeypatch, ros_domain
+):
+    crash = (
+        "import os, sys; from rclpy.node import Node; from fogft.ros import self_test\n"
+        "if sys.argv[1] == 'ask': Node.destroy_node = lambda _: os.kill(os.getpid(), 11)\n"
+        "sys.exit(self_test.main(sys.argv[1:]))\n"
+    )
+    monkeypatch.setattr(ros, "_command", lambda *words: [sys.executable, "-c", crash, *words])
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+    found = the_only(ros.discovery(situation(tmp_path)))
+    assert found.verdict is Verdict.OK, found
 
 
 @pytest.mark.ros
