@@ -21,7 +21,7 @@ from fogft.core import names
 from fogft.core.errors import FogftError, PoolBusy, StateError
 from fogft.core.middleware import Speaks
 from fogft.core.spec import Part, ServiceSpec
-from fogft.proxy import measures, middleware
+from fogft.proxy import measures, middleware, start
 from fogft.proxy.actions import Actions
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.config import ClientProxyConfig, read_client
@@ -92,6 +92,7 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
         PoolBusy: This pool's client proxy runs already.
         FogftError: The configuration, the credentials or ROS cannot be used.
     """
+    start.begin()
     start_log()
     stop = stop_on_signal()
     config = read_client(config_path, metrics)
@@ -134,6 +135,7 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
     try:
         parts = _Parts(proxy, following, sign, dialer, seen, scrape, metrics, joined.node)
+        start.settle()
         _loop(config_path, config, parts, stop)
     finally:
         scrape.close()

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from fogft.core.definitions import Definition
 from fogft.core.errors import RosError
 from fogft.core.middleware import Speaks
+from fogft.proxy import start
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
 
@@ -44,6 +45,7 @@ def prepare(speaks: Speaks) -> None:
     """Prepare this process for ROS. Before anything else of it."""
     if speaks is Speaks.RCLPY:
         environment.prepare(os.environ)
+        start.load_numpy()
     memory_tuning.tune()
 
 

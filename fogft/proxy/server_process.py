@@ -14,7 +14,7 @@ from pathlib import Path
 
 from fogft.cloud import notice
 from fogft.core.definitions import Definition
-from fogft.proxy import measures, middleware
+from fogft.proxy import measures, middleware, start
 from fogft.proxy.announcing import Presence
 from fogft.proxy.config import ServerProxyConfig, read_server
 from fogft.proxy.process import start_log, stop_on_signal
@@ -54,6 +54,7 @@ def run(
     Raises:
         FogftError: The configuration, the credentials or ROS cannot be used.
     """
+    start.begin()
     config = read_server(
         config_path,
         listen=listen,
@@ -74,6 +75,7 @@ def run(
         proxy.start()
         scrape.at(config.metrics)
         presence = Presence(config, proxy.endpoint)
+        start.settle()
         _loop(config, proxy, presence, stop)
     finally:
         scrape.close()
