@@ -40,6 +40,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 DOMAINS = range(60, 101)  # above 101 the ports of a domain reach Linux's ephemeral ones
 
 
+# Folders of tests that start no process, open no connection and wait for nothing.
+COMPUTING = {"core", "docs", "evaluation", "examples", "fuzz", "simulation"}
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Among several workers, let the long tests begin first: see `dealing`."""
 
@@ -47,9 +51,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         marker = item.get_closest_marker("timeout")
         return float(marker.args[0]) if marker and marker.args else 0.0
 
+    def computes(item: pytest.Item) -> bool:
+        return item.path.parent.name in COMPUTING
+
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
-        items[:] = dealt(items, limit_s, workers)
+        items[:] = dealt(items, limit_s, computes, workers)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -2,7 +2,10 @@
 
 `pytest-xdist --dist worksteal` gives each worker a block of the list, and later what others have
 left at the end of theirs. A long test at the end would be waited for alone. Long is a test that
-sets a time limit of its own.
+sets a time limit of its own: it starts a whole pool.
+
+The last block has no long test: beside pools, it waits for what else needs no processor. What does
+nothing but compute comes when the pools have gone.
 """
 
 from __future__ import annotations
@@ -13,21 +16,29 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def dealt(tests: Sequence[T], limit_s: Callable[[T], float], workers: int) -> list[T]:
+def dealt(
+    tests: Sequence[T],
+    limit_s: Callable[[T], float],
+    computes: Callable[[T], bool],
+    workers: int,
+) -> list[T]:
     """Return the tests, so that each worker's block begins with its share of the long ones.
 
     Args:
-        tests: All of them. The others stay in their order: they share fixtures with neighbours.
+        tests: All of them. Others than the long ones stay beside their neighbours, with whom
+            they share fixtures.
         limit_s: A test's own time limit; 0 if it sets none.
+        computes: Whether a test waits for nothing.
         workers: How many blocks.
     """
     long = sorted(filter(limit_s, tests), key=limit_s, reverse=True)
-    others = [test for test in tests if not limit_s(test)]
+    others = sorted((test for test in tests if not limit_s(test)), key=computes, reverse=True)
+    for_long = max(1, workers - 1)
     out: list[T] = []
     for worker in range(workers):
         block = (len(tests) - len(out)) // (workers - worker)
-        share = long[workers - 1 - worker :: workers]  # later blocks are not smaller, as xdist's
-        room = block - len(share)
-        out += share + others[:room]
+        share = long[worker::for_long] if worker < for_long else []
+        room = max(0, block - len(share))
+        out += share + (others[:room] if worker < workers - 1 else others)
         del others[:room]
     return out

@@ -8,16 +8,20 @@ from hypothesis import strategies as st
 from tests.dealing import dealt
 
 
-@given(st.lists(st.sampled_from([0, 0, 0, 120, 240]), max_size=60), st.integers(1, 6))
-def test_no_test_is_lost_or_run_twice(limits: list[int], workers: int) -> None:
-    order = dealt(range(len(limits)), limits.__getitem__, workers)
-    assert sorted(order) == list(range(len(limits)))
+@given(
+    st.lists(st.tuples(st.sampled_from([0, 0, 0, 120, 240]), st.booleans()), max_size=60),
+    st.integers(1, 6),
+)
+def test_no_test_is_lost_or_run_twice(tests: list[tuple[int, bool]], workers: int) -> None:
+    order = dealt(range(len(tests)), lambda i: tests[i][0], lambda i: tests[i][1], workers)
+    assert sorted(order) == list(range(len(tests)))
 
 
-def test_each_block_begins_with_its_share_of_the_long_ones() -> None:
-    """And all else stays beside its neighbours."""
-    limits = {"a": 0, "b": 0, "c": 0, "d": 0, "long": 120, "longest": 240, "e": 0, "f": 0}
-    assert dealt(list(limits), limits.__getitem__, 2) == [
-        *("long", "a", "b", "c"),
-        *("longest", "d", "e", "f"),
+def test_all_blocks_but_the_last_begin_with_their_share_of_the_long_ones() -> None:
+    """What waits is in the last one, what computes is not; all stay beside their neighbours."""
+    limits = dict.fromkeys("abcdefghi", 0) | {"long": 120, "longer": 180, "longest": 240}
+    assert dealt(list(limits), limits.__getitem__, set("cdg").__contains__, 3) == [
+        *("longest", "long", "c", "d"),
+        *("longer", "g", "a", "b"),
+        *("e", "f", "h", "i"),
     ]
