@@ -65,11 +65,15 @@ class FlowWatch:
         """Whether a queue stands still, as of the last look; see `Drain.stalled`."""
         return self._drain.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
 
-    def end_if_stuck(self, *, sending: bool = False) -> None:
-        """End the connection if a queue is left in it: Zenoh would wait ten seconds for that.
+    def end_if_busy(self, *, sending: bool, asked: bool) -> None:
+        """End the connection where something large may be on its way, either way.
+
+        Ended in order by Zenoh it would hold up all links of the process that sends: see
+        `sockets`.
 
         Args:
             sending: More is being sent, whether or not the kernel has it already.
+            asked: Answers may come.
         """
         connection = self._socket.borrow()
         if connection is None:
@@ -77,4 +81,6 @@ class FlowWatch:
         with connection:
             flow = sockets.flow(connection)
             if sending or (flow is not None and flow.outstanding >= BULK_BYTES):
-                sockets.end(connection)
+                sockets.end_sending(connection)
+            elif asked:
+                sockets.abort(connection)

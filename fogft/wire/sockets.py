@@ -9,11 +9,13 @@ Owns: finding and reading sockets. Not here: what follows from it (`doorkeeper`,
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import fcntl
 import os
 import socket
 import struct
 import termios
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,6 +33,9 @@ _COUNT = struct.Struct("@i")
 _TCP_NOTSENT_LOWAT = 25
 _UNSENT_BYTES = 16 << 10
 _AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing waits for nothing, and resets
+_NOWHERE = bytes(16)  # struct sockaddr of AF_UNSPEC: to connect there resets a connection
+_libc = ctypes.CDLL(None)
+_LOOK_AGAIN_S = 0.005
 
 
 def address(endpoint: str) -> Address:
@@ -151,12 +156,58 @@ def keep_short(connection: socket.socket) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
 
 
-def end(connection: socket.socket) -> None:
-    """End a connection at both of its ends, whatever Zenoh is doing with it.
+def end_sending(connection: socket.socket) -> None:
+    """Send nothing more on a connection, whatever Zenoh is doing with it.
 
-    What its peer has not taken is dropped: Zenoh's one thread closes the socket, and would wait
-    for that peer up to 10 s (Zenoh's own SO_LINGER), and with it every link of this process.
+    What its peer has not taken is dropped when the socket is closed: that is done by Zenoh's one
+    thread, which would wait for that peer up to 10 s (Zenoh's own SO_LINGER), and with it every
+    link of this process.
+
+    Not both directions: where Zenoh hears of an end before it fails to send, its thread waits for
+    whoever waits for room to send more, and he for that thread (`docs/design/links.md`).
     """
     with contextlib.suppress(OSError):  # it ended by itself
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
-        connection.shutdown(socket.SHUT_RDWR)
+        connection.shutdown(socket.SHUT_WR)
+
+
+def abort(connection: socket.socket) -> None:
+    """End a connection without a farewell: nothing more is taken, and its peer fails to send.
+
+    Not where something is sent: see `end_sending`.
+    """
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+    _libc.connect(connection.fileno(), _NOWHERE, len(_NOWHERE))
+
+
+def abort_all(port: int, within_s: float) -> None:
+    """Abort the connections whose own end is at a port, once what was sent was taken.
+
+    Args:
+        port: The port.
+        within_s: Wait no longer for peers that take nothing.
+    """
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline and any(map(_left, _closing(port))):
+        time.sleep(_LOOK_AGAIN_S)
+    for connection in _closing(port):
+        (end_sending if _left(connection) else abort)(connection)
+
+
+def _closing(port: int) -> Iterator[socket.socket]:
+    for _, connection in connections(port):
+        with connection:
+            yield connection
+
+
+def _left(connection: socket.socket) -> bool:
+    counted = flow(connection)
+    return counted is not None and counted.outstanding > 0
+
+
+def end(connection: socket.socket) -> None:
+    """End a connection at both of its ends. One on which much is sent: `end_sending` first."""
+    end_sending(connection)
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RD)

@@ -532,7 +532,9 @@ class Connection:
         """End it: what is open is lost. Returns at once; the sender thread closes the session."""
         ended = self.window.close()
         # A large send that goes on is for nobody any more, and may block for minutes.
-        self.flow.end_if_stuck(sending=self._sending_since is not None)
+        self.flow.end_if_busy(
+            sending=self._sending_since is not None, asked=len(self._unanswered) > 0
+        )
         see_off(self._thread)
         self._queue.put(None)
         for attempt in ended:

@@ -31,7 +31,7 @@ from fogft.core.model import ReplicaId
 from fogft.core.record_set import RecordSet, Verdict
 from fogft.core.records import RecordError, SignedRecord
 from fogft.core.repeats import worth_logging
-from fogft.wire import batch_frames, config, frame, probe_frames, record_frames
+from fogft.wire import batch_frames, config, frame, probe_frames, record_frames, sockets
 from fogft.wire.compression import ACCEPTED, unpack
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.doorkeeper import Doorkeeper
@@ -102,6 +102,10 @@ class ZenohListener:
         self._services: dict[str, str] = {}  # key -> service
 
     @property
+    def _port(self) -> int:
+        return int(self._endpoint.rpartition(":")[2])
+
+    @property
     def endpoint(self) -> str:
         """``host:port`` as bound."""
         return self._endpoint
@@ -127,7 +131,7 @@ class ZenohListener:
             ) from error
         threading.Thread(target=self._do_chores, name="fogft-probes", daemon=True).start()
         self._doorkeeper = Doorkeeper(
-            int(self._endpoint.rpartition(":")[2]),
+            self._port,
             self._peers,
             lambda: self._guests.revoked,
             self._counters,
@@ -403,6 +407,7 @@ class ZenohListener:
         if self._doorkeeper is not None:
             self._doorkeeper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)
+        sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
         self._chores.put(None)
         closer = threading.Thread(
             target=_close, args=(session,), name="fogft-close-listener", daemon=True

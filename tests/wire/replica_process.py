@@ -107,6 +107,7 @@ def main() -> None:
         state.update(command)
         last = {"manager_age_s": managers[-1]} if managers else {}
         print(json.dumps({**listener.counters(), **last}), flush=True)
+    listener.close()
 
 
 if __name__ == "__main__":

@@ -160,6 +160,11 @@ class ReplicaProcess:
         assert line, "the replica's process has ended"
         return dict(json.loads(line))
 
+    def stop(self) -> None:
+        """Have it close its listener and end. Does not wait for that."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+
     def ask(self, **command: object) -> dict[str, object]:
         """Send a command: `ready`, `draining`, `delay_s`, `revoke`; none asks for its counters."""
         assert self._process.stdin is not None
