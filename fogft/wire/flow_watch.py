@@ -6,12 +6,17 @@ Owns: a connection's socket and its `Drain`. Not here: the judgement (`drain`), 
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
 from fogft.wire import sockets
 from fogft.wire.drain import BULK_BYTES, Drain
 from fogft.wire.sockets import Address, OwnSocket
 
 # Below, what is large is kept short in the kernel: 16 KiB take longer than 10 ms.
 THIN_BYTES_PER_S = 2_000_000.0
+_LOOK_AGAIN_S = 0.002
+_QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
 
 
 class FlowWatch:
@@ -65,16 +70,40 @@ class FlowWatch:
         """Whether a queue stands still, as of the last look; see `Drain.stalled`."""
         return self._drain.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
 
-    def end_if_busy(self, *, sending: bool, asked: bool) -> None:
-        """End the connection where something large may be on its way, either way.
+    def end_when_safe(
+        self, sending: Callable[[], bool], asked: Callable[[], bool], within_s: float
+    ) -> None:
+        """End the connection where something large may be on its way, either way; may block.
 
-        Ended in order by Zenoh it would hold up all links of the process that sends: see
-        `sockets`.
+        Zenoh's thread and a sender may wait for each other where an end meets a flow: see
+        `docs/design/links.md`. So what flows fast is let through, and what is stuck is ended.
 
         Args:
-            sending: More is being sent, whether or not the kernel has it already.
-            asked: Answers may come.
+            sending: Whether something large is being sent.
+            asked: Whether answers may come.
+            within_s: Wait no longer.
         """
+        deadline = time.monotonic() + within_s
+        received, quiet_since = -1, 0.0
+        while time.monotonic() < deadline:
+            connection = self._socket.borrow()
+            if connection is None:
+                return
+            with connection:
+                flow = sockets.flow(connection)
+                if flow is None or not (sending() or asked()):
+                    break
+                if sending():
+                    if not sockets.takes_more(connection):
+                        break
+                elif flow.received != received:
+                    received, quiet_since = flow.received, time.monotonic()
+                elif time.monotonic() - quiet_since > _QUIET_S:
+                    break
+            time.sleep(_LOOK_AGAIN_S)
+        self._end(sending=sending(), asked=asked())
+
+    def _end(self, *, sending: bool, asked: bool) -> None:
         connection = self._socket.borrow()
         if connection is None:
             return

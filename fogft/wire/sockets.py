@@ -12,6 +12,7 @@ import contextlib
 import ctypes
 import fcntl
 import os
+import select
 import socket
 import struct
 import termios
@@ -35,7 +36,7 @@ _UNSENT_BYTES = 16 << 10
 _AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing waits for nothing, and resets
 _NOWHERE = bytes(16)  # struct sockaddr of AF_UNSPEC: to connect there resets a connection
 _libc = ctypes.CDLL(None)
-_LOOK_AGAIN_S = 0.005
+_LOOK_AGAIN_S = 0.01
 
 
 def address(endpoint: str) -> Address:
@@ -150,6 +151,13 @@ def flow(connection: socket.socket) -> Flow | None:
     )
 
 
+def takes_more(connection: socket.socket) -> bool:
+    """Whether the kernel would take more of what is sent now."""
+    waiting = select.poll()
+    waiting.register(connection, select.POLLOUT)
+    return bool(waiting.poll(0))
+
+
 def keep_short(connection: socket.socket) -> None:
     """Let little wait in the kernel, so that probes overtake what is large."""
     with contextlib.suppress(OSError):
@@ -182,28 +190,34 @@ def abort(connection: socket.socket) -> None:
 
 
 def abort_all(port: int, within_s: float) -> None:
-    """Abort the connections whose own end is at a port, once what was sent was taken.
+    """Abort the connections whose own end is at a port, as soon as nothing flows there.
 
     Args:
         port: The port.
-        within_s: Wait no longer for peers that take nothing.
+        within_s: Wait no longer for that.
     """
     deadline = time.monotonic() + within_s
-    while time.monotonic() < deadline and any(map(_left, _closing(port))):
+    seen: list[Flow | None] = []
+    while time.monotonic() < deadline:
+        before, seen = seen, [flow(connection) for connection in _at(port)]
+        idle = [one is None or one.outstanding == 0 for one in seen]
+        if all(idle) and _received(seen) == _received(before):
+            break
         time.sleep(_LOOK_AGAIN_S)
-    for connection in _closing(port):
-        (end_sending if _left(connection) else abort)(connection)
+    for connection in _at(port):
+        counted = flow(connection)
+        busy = counted is not None and counted.outstanding > 0
+        (end_sending if busy else abort)(connection)
 
 
-def _closing(port: int) -> Iterator[socket.socket]:
+def _at(port: int) -> Iterator[socket.socket]:
     for _, connection in connections(port):
         with connection:
             yield connection
 
 
-def _left(connection: socket.socket) -> bool:
-    counted = flow(connection)
-    return counted is not None and counted.outstanding > 0
+def _received(flows: list[Flow | None]) -> list[int]:
+    return [one.received for one in flows if one is not None]
 
 
 def end(connection: socket.socket) -> None:

@@ -62,6 +62,8 @@ _STUCK_S = 0.1
 _ZENOH_HOLDS_BYTES = 2 * 65535
 # How long the keeper looks often after the last large request began to leave.
 _WATCH_S = 5.0
+# How long a closed connection may still flow.
+_END_WITHIN_S = 1.0
 # For as long as the connection: Zenoh ends the query when the session closes.
 _ANSWERS_TIMEOUT_S = 1e9
 
@@ -531,15 +533,22 @@ class Connection:
     def close(self) -> None:
         """End it: what is open is lost. Returns at once; the sender thread closes the session."""
         ended = self.window.close()
-        # A large send that goes on is for nobody any more, and may block for minutes.
-        self.flow.end_if_busy(
-            sending=self._sending_since is not None, asked=len(self._unanswered) > 0
-        )
         see_off(self._thread)
-        self._queue.put(None)
+        # A large send that goes on is for nobody any more, and may block for minutes.
+        threading.Thread(target=self._end_flow, name="fogft-end-link", daemon=True).start()
         for attempt in ended:
             attempt.payload = None
             self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
+
+    def _end_flow(self) -> None:
+        try:
+            self.flow.end_when_safe(
+                lambda: self._sending_since is not None,
+                lambda: len(self._unanswered) > 0,
+                _END_WITHIN_S,
+            )
+        finally:
+            self._queue.put(None)
 
     def join(self, timeout_s: float) -> None:
         """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
