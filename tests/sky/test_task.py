@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -231,6 +232,21 @@ def test_a_hanging_setup_is_ended_by_the_machine_itself(vm: Path):
     apart = int((vm / "apart").read_text())
     state = Path(f"/proc/{apart}/stat")
     assert not state.exists() or ") Z " in state.read_text(), "what it started lives on"
+
+
+def test_what_a_hanging_setup_is_just_starting_is_killed_too(tmp_path: Path):
+    """Whenever the limit strikes: what it starts in that moment has no parent to find it by."""
+
+    def hang(n: int) -> subprocess.CompletedProcess[str]:
+        home = tmp_path / str(n)
+        (home / ".fogft").mkdir(parents=True)
+        limit = f"read -rt {task.SETUP_LIMIT_S} "
+        return shell(home, script.replace(limit, f"read -rt {0.001 * (n + 1):.3f} "))
+
+    script = built({"setup": HANGING})["setup"]
+    with ThreadPoolExecutor(8) as several:
+        ended = list(several.map(hang, range(32)))
+    assert all("it is ended" in one.stdout and one.returncode != 0 for one in ended)
 
 
 def test_a_setup_that_ends_in_time_leaves_no_guard_behind(vm: Path):
