@@ -39,7 +39,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 DOMAINS = range(60, 101)  # above 101 the ports of a domain reach Linux's ephemeral ones
 
-
 # Folders of tests that start no process, open no connection and wait for nothing.
 COMPUTING = {"core", "docs", "evaluation", "examples", "fuzz", "simulation"}
 

@@ -18,7 +18,7 @@ Not here: whom to ask (`hedging`), sending, locks and clocks (`fogft.proxy.dispa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, TypeVar
@@ -226,6 +226,16 @@ class FirstResponse(Generic[T]):
             pending.waits.pop(replica, None)
             if replica not in pending.open and replica not in pending.barred:
                 self._short[request] = None
+
+    def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
+        """A replica has begun anew what some requests are about: what it said before is void."""
+        for request, pending in self._pending.items():
+            if about(pending.item):
+                pending.barred.discard(replica)
+                pending.failures.pop(replica, None)
+                pending.waits.pop(replica, None)
+                if replica not in pending.open:
+                    self._short[request] = None
 
     def reconsider(self) -> None:
         """Put every request before the policy again: there is another one."""

@@ -21,7 +21,7 @@ from fogft.core.uplinks import UplinkPolicy
 
 LONGEST_S = 1e7  # what a request's header can carry
 # What a replica must know; the rest is the robot's.
-REPLICA_KEYS = ("name", "type", "concurrency", "cancel", "freshness", "state")
+REPLICA_KEYS = ("name", "type", "concurrency", "cancel", "freshness", "state", "part")
 _NOT_THE_PROXIES = ("replicas", "traffic")
 _ALWAYS = ("name", "type", "timeout_s")
 

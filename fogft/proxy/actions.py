@@ -4,138 +4,172 @@ The goal that a client makes goes to every replica, and to those that come while
 way: a goal outlives the replicas that it was given to. The first that succeeds is the result;
 the others are then told to cancel. What a client cancels is cancelled everywhere.
 
-Owns: how the parts of an action differ from plain services (`dispatcher`) and what they
-share. Not here: feedback and status (`topics_robot`).
+Owns: how goals and results differ from plain services (`dispatcher`). Not here: cancelling
+(`action_cancel`), feedback and status (`topics_robot`).
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import os
-import threading
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from fogft.core import goals
-from fogft.core.first_response import Pending
-from fogft.core.goals import Goals
+from fogft.core.goals import Had, Took
 from fogft.core.model import ReplicaId
 from fogft.core.names import REQUEST_ID_BYTES
 from fogft.core.spec import Part, ServiceSpec
-from fogft.proxy.dispatcher import Dispatcher, key_of
+from fogft.proxy.action_cancel import CancelDispatcher
+from fogft.proxy.action_part import PartDispatcher, ReachingAll, Shared
+from fogft.proxy.dispatcher import key_of
 from fogft.proxy.request import Request
 from fogft.wire.port import Answer, Link, Refusal
 
 log = logging.getLogger(__name__)
 
-_CANCEL_S = 10.0
-
-
-class Shared:
-    """What the three services of one action share: its goals, under a lock."""
-
-    def __init__(self) -> None:
-        self.goals = Goals()
-        self.lock = threading.Lock()
-
-
-class PartDispatcher(Dispatcher):
-    """A part of an action: its own idea of a success.
-
-    Args:
-        spec: The service.
-        respond: Sends a response to the caller of a handle.
-        shared: What the action's parts share.
-        others: As for `Dispatcher`.
-    """
-
-    def __init__(
-        self,
-        spec: ServiceSpec,
-        respond: Callable[[Any, bytes], None],
-        shared: Shared,
-        **others: Any,
-    ) -> None:
-        self._shared = shared
-        self._part = spec.part
-        super().__init__(spec, respond, **others)
-
-    def _check(self, ok_field: str) -> Callable[[bytes], bool]:
-        return lambda response: goals.is_success(self._part, response)
-
-
-class ReachingAll(PartDispatcher):
-    """`cancel_goal`: every replica gets each request, whoever was first."""
-
-    def _forget(self, request: bytes, replicas: Iterable[int]) -> None:
-        """Let the others go on: they shall all have it."""
+_MAY_HAVE_LOST_ITS_GOALS = frozenset({Refusal.CRASHED, Refusal.NOT_READY, Refusal.LOST})
 
 
 class GoalDispatcher(ReachingAll):
-    """`send_goal`: an accepted goal also goes to replicas that come before it has its result."""
+    """`send_goal`: until a goal has its result, each replica is given it that does not have it."""
+
+    def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
+        """Take a client's goal, and note who is given it."""
+        goal, until = goals.goal_of(payload), self._clock() + timeout_s
+        with self._shared.lock:
+            self._shared.goals.made(payload, request, tuple(self._links), until)
+        taken = super().forward(request, payload, handle, timeout_s)
+        if not taken:
+            self._is_over(goal)
+        return taken
+
+    def _declined(self, request: bytes, replica: int) -> None:
+        with self._shared.lock:
+            self._shared.goals.failed(request, replica, self._clock())
+        super()._declined(request, replica)
 
     def answered(self, link: Link, answer: Answer) -> None:
-        """Take the end of an attempt; remember what was accepted."""
-        pending, payload = self._requests.get(answer.request_id), answer.payload
-        if pending is not None and payload is not None and goals.is_success(Part.GOAL, payload):
-            with self._shared.lock:  # before its client can know, and ask for the result
-                self._shared.goals.accepted(pending.item.payload)
+        """Take the end of an attempt; remember who has the goal."""
+        replica = key_of(link)
+        took = self._took(answer, replica)  # before its client can know, and ask for the result
+        if took is not None and took.goal is not None:
+            if not took.in_vain:
+                self._shared.began(took.goal, replica)
+            else:
+                with self._shared.lock:
+                    self._shared.cancel(took.goal, (replica,), self._clock())
+                self._wake()
         super().answered(link, answer)
+
+    def _took(self, answer: Answer, replica: int) -> Took | None:
+        id, payload, now = answer.request_id, answer.payload, self._clock()
+        with self._shared.lock:
+            if payload is None and answer.refusal != Refusal.MALFORMED:
+                self._shared.goals.failed(id, replica, now)
+                return None
+            accepts = payload is not None and goals.is_success(Part.GOAL, payload)
+            return self._shared.goals.took(id, replica, now, accepts=accepts)
+
+    def _is_over(self, goal: bytes) -> None:
+        """Nobody was asked, or has answered: unless it was accepted, the goal is over, too."""
+        with self._shared.lock:
+            if goal not in self._shared.goals:
+                self._shared.goals.ended(goal)
 
     def route(self, links: Sequence[Link]) -> None:
         """Give replicas that have come the goals that are under way."""
-        before = set(self._links)
-        super().route(links)
-        for link in links:
-            if key_of(link) not in before:
-                self._catch_up(link)
-
-    def _catch_up(self, link: Link) -> None:
+        before, after = dict(self._links), {key_of(link): link for link in links}
+        come = [replica for replica, link in after.items() if before.get(replica) is not link]
         with self._shared.lock:
-            under_way = self._shared.goals.requests
-        for payload in under_way:
-            id = os.urandom(REQUEST_ID_BYTES)
-            if link.offer(self.spec.name, id, payload, self.spec.timeout_s):
-                log.info("goal_sent_again service=%s replica=%s goal=%s", self.spec.name,
-                         link.peer.id.short, goals.goal_of(payload).hex())  # fmt: skip
+            for replica in before.keys() - after.keys():
+                self._shared.goals.left(replica)
+            for goal in self._shared.goals.unwanted():  # it may have missed that
+                self._shared.cancel(goal, come, self._clock())
+        super().route(links)
+        self._catch_up()
+
+    def tick(self) -> float:
+        """Also give each replica the goals that it lacks."""
+        self._catch_up()
+        return super().tick()
+
+    def _catch_up(self) -> None:
+        now = self._clock()
+        for replica, link in tuple(self._links.items()):
+            with self._shared.lock:
+                lacking = self._shared.goals.lacking(replica, now)
+            for payload in lacking:
+                self._give(replica, link, payload)
+
+    def _give(self, replica: int, link: Link, payload: bytes) -> None:
+        id, timeout_s = os.urandom(REQUEST_ID_BYTES), self.spec.timeout_s
+        goal, now = goals.goal_of(payload), self._clock()
+        with self._shared.lock:
+            self._shared.goals.gave(goal, id, replica, now + timeout_s)
+        if link.offer(self.spec.name, id, payload, timeout_s):
+            log.info("goal_sent_again service=%s replica=%s goal=%s", self.spec.name,
+                     link.peer.id.short, goal.hex())  # fmt: skip
+            return
+        with self._shared.lock:
+            self._shared.goals.failed(id, replica, now)
 
 
 class ResultDispatcher(PartDispatcher):
-    """`get_result`: the first replica that succeeds; the others are told to cancel the goal.
+    """`get_result`: the first replica that succeeds; the others are told to cancel the goal."""
 
-    Args:
-        cancel: Name of the action's cancel service.
-        others: As for `PartDispatcher`.
-    """
-
-    def __init__(self, *args: Any, cancel: str, **others: Any) -> None:
+    def __init__(self, *args: Any, **others: Any) -> None:
         super().__init__(*args, **others)
-        self._cancel = cancel
-        self._to_cancel: list[tuple[bytes, int]] = []
+        self._shared.began = self._began
 
-    def submit(self, payload: bytes, handle: Any) -> None:
+    def _began(self, goal: bytes, replica: int) -> None:
+        """A replica has taken a goal, perhaps anew: it may be asked for the result."""
+        with self._lock:
+            self._requests.welcome(replica, partial(_is_about, goal))
+        self._wake()
+
+    def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Take a request for a result; its goal is under way until that comes."""
-        with self._shared.lock:
-            self._shared.goals.awaited(goals.goal_of(payload))
-        super().submit(payload, handle)
+        taken = super().forward(request, payload, handle, timeout_s)
+        if taken:
+            with self._shared.lock:
+                self._shared.goals.awaited(goals.goal_of(payload))
+        return taken
 
     def answered(self, link: Link, answer: Answer) -> None:
-        """Take a result. A replica that got the goal late may not know it yet: ask it again."""
+        """Take a result; where a replica does not know the goal, see why.
+
+        It may be about to be given it, or has lost it: it is asked again. It may have refused it:
+        it is not asked again. Or it has forgotten what became of it: then that is its result.
+        """
         pending, payload = self._requests.get(answer.request_id), answer.payload
-        if payload is None or pending is None:
+        if pending is None:
             super().answered(link, answer)
             return
-        goal = goals.goal_of(pending.item.payload)
-        under_way = goal in self._shared.goals
-        if under_way and goals.is_unknown(payload):
-            super().answered(link, replace(answer, payload=None, refusal=Refusal.NOT_READY))
+        replica, goal = key_of(link), goals.goal_of(pending.item.payload)
+        if payload is None:
+            if answer.refusal in _MAY_HAVE_LOST_ITS_GOALS:
+                with self._shared.lock:
+                    self._shared.goals.lost(goal, replica)
+            super().answered(link, answer)
             return
+        asked_at = pending.open.get(replica, -math.inf)
+        with self._shared.lock:
+            under_way = goal in self._shared.goals
+            had = self._shared.goals.had(goal, replica, asked_at)
+        if under_way and goals.is_unknown(payload) and had is not Had.TAKEN:
+            reason = Refusal.FORGOTTEN if had is Had.REFUSED else Refusal.NOT_READY
+            super().answered(link, answer._replace(payload=None, refusal=reason))
+            return
+        with self._shared.lock:
+            losers = (self._shared.goals.takers(goal) | set(self._links)) - {replica}
         super().answered(link, answer)
         won = goals.is_success(Part.RESULT, payload) and answer.request_id not in self._requests
         if under_way and won:
-            with self._lock:
-                self._to_cancel += [(goal, key) for key in self._links if key != key_of(link)]
+            with self._shared.lock:
+                self._shared.cancel(goal, losers, self._clock())
             self._wake()
 
     def _rejected(self, id: ReplicaId, replica: int, request: bytes, payload: bytes) -> None:
@@ -145,28 +179,9 @@ class ResultDispatcher(PartDispatcher):
             payload = pending.rejection
         super()._rejected(id, replica, request, payload)
 
-    def _close(self, request: bytes, pending: Pending[Request]) -> None:
-        super()._close(request, pending)
-        self._ended(pending)
-
-    def _expired(self, request: bytes, pending: Pending[Request]) -> None:
-        super()._expired(request, pending)
-        self._ended(pending)
-
-    def _ended(self, pending: Pending[Request]) -> None:
+    def _is_over(self, goal: bytes) -> None:
         with self._shared.lock:
-            self._shared.goals.ended(goals.goal_of(pending.item.payload))
-
-    def tick(self) -> float:
-        """Also tell the losers to cancel."""
-        with self._lock:
-            due, self._to_cancel = self._to_cancel, []
-        for goal, key in due:
-            link = self._links.get(key)
-            if link is not None:
-                id = os.urandom(REQUEST_ID_BYTES)
-                link.offer(self._cancel, id, goals.cancel_request(goal), _CANCEL_S)
-        return super().tick()
+            self._shared.goals.ended(goal)
 
 
 class Actions:
@@ -184,6 +199,9 @@ class Actions:
         if spec.part is Part.GOAL:
             return GoalDispatcher(spec, respond, shared, wake=wake)
         if spec.part is Part.RESULT:
-            cancel = f"{action}/cancel_goal"
-            return ResultDispatcher(spec, respond, shared, wake=wake, cancel=cancel)
-        return ReachingAll(spec, respond, shared, wake=wake)
+            return ResultDispatcher(spec, respond, shared, wake=wake)
+        return CancelDispatcher(spec, respond, shared, wake=wake)
+
+
+def _is_about(goal: bytes, request: Request) -> bool:
+    return goals.goal_of(request.payload) == goal

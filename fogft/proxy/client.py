@@ -22,7 +22,7 @@ from fogft.core.errors import RosError
 from fogft.core.hedging import NEVER
 from fogft.core.model import LinkState, Member, Membership, ReplicaId
 from fogft.core.records import SignedRecord
-from fogft.core.spec import HedgingMode, ServiceSpec
+from fogft.core.spec import HedgingMode, Part, ServiceSpec
 from fogft.core.topics import TopicSpec
 from fogft.proxy.dispatcher import Dispatcher, key_of
 from fogft.proxy.ordered_dispatcher import OrderedDispatcher
@@ -327,7 +327,9 @@ class ClientProxy:
             ]
             fresh = [link for link in able if not self._draining(link)]
             service.able = bool(able)
-            service.dispatcher.route(fresh or able)
+            # Who is asked to work is not asked of one that leaves; who is told to stop is.
+            told = service.spec.part is Part.CANCEL
+            service.dispatcher.route(able if told else fresh or able)
 
     def _versions(self) -> dict[ReplicaId, str]:
         return {id: member.version for id, member in self._members.items()}

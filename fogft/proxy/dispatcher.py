@@ -19,7 +19,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Any
 
 from fogft.core.adaptive import Adaptive
@@ -210,7 +209,7 @@ class Dispatcher:
             try:
                 ok = is_ok(payload)
             except RosError:  # no response of this type
-                malformed = replace(answer, refusal=Refusal.MALFORMED)
+                malformed = answer._replace(refusal=Refusal.MALFORMED)
                 self._refused(link.peer.id, replica, malformed)
                 return
             if not ok:
@@ -218,23 +217,34 @@ class Dispatcher:
                 return
         request = answer.request_id
         with self._lock:
-            self._outcomes.served(link.peer.id)
             _, pending = self._requests.succeeded(request, now)
             if pending is None:
                 self._hedging.late(request, replica, now, answered=True)
             else:
                 losers = self._hedging.answered(request, pending.open, replica, now)
                 self._close(request, pending)
-                self._outcomes.won(link.peer.id, now - pending.item.arrived, len(payload))
-                note_end(
-                    self._outcomes, request, pending,
-                    outcome="answered", now=now, replica=link.peer.id.short,
-                )  # fmt: skip
         if pending is None:
-            self._outcomes.late()
+            self._count_late(link.peer.id)
             return
-        self._return(pending.item.handle, payload)
+        self._return(pending.item.handle, payload)  # first: what is counted can wait
         self._forget(request, losers)
+        self._count_won(link.peer.id, request, pending, payload, now)
+
+    def _count_late(self, id: ReplicaId) -> None:
+        with self._lock:
+            self._outcomes.served(id)
+        self._outcomes.late()
+
+    def _count_won(
+        self, id: ReplicaId, request: bytes, pending: Pending[Request], payload: bytes, now: float
+    ) -> None:
+        with self._lock:
+            self._outcomes.served(id)
+            self._outcomes.won(id, now - pending.item.arrived, len(payload))
+            note_end(
+                self._outcomes, request, pending,
+                outcome="answered", now=now, replica=id.short,
+            )  # fmt: skip
 
     def late(self, link: Link, request: bytes) -> None:
         """Count an answer that came after its link was told to forget the request."""
@@ -467,6 +477,9 @@ class Dispatcher:
         elif response is not None:
             self._return(pending.item.handle, response)
         self._forget(request, tuple(self._links))
+
+    def close(self) -> None:
+        """It is not used any more."""
 
     # -- what people see ------------------------------------------------------------------
 

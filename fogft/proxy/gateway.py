@@ -211,8 +211,9 @@ class Forwarder:
                 return
             self._take(passage.id)
             self._keep(passage, payload)
+            more = bool(self._open)
         for incoming in passage.copies:
-            incoming.reply(payload)
+            incoming.reply(payload, more=more)
 
     def _keep(self, passage: Passage, payload: bytes) -> None:
         self._kept[passage.id] = (passage.deadline, payload)

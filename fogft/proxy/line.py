@@ -66,6 +66,11 @@ class Line:
         """Let work wait for its turn."""
         self._queue.put(work.id, work.robot, work.deadline, work)
 
+    @property
+    def open(self) -> bool:
+        """Whether work that comes now is passed on at once: nothing waits, and there is room."""
+        return self.at_work < self.limit.limit and not len(self._queue)
+
     def hopeless(self, robot: str, deadline: float, remaining_s: float) -> bool:
         """Whether a request would wait past its deadline, as far as is known."""
         waiting = len(self._queue)
@@ -86,9 +91,13 @@ class Line:
             return None
         work = self._queue.take()
         if work is not None and work.deadline > now:
-            self.at_work += 1
-            work.passed_on, work.begun, work.level = True, now, self.at_work
+            self.begin(work, now)
         return work
+
+    def begin(self, work: Work, now: float) -> None:
+        """Work is passed on. Work that comes while the line is `open` need not wait before."""
+        self.at_work += 1
+        work.passed_on, work.begun, work.level = True, now, self.at_work
 
     def remove(self, work: Work) -> bool:
         """Take work out that waits; whether it did."""

@@ -73,5 +73,4 @@ class ProxiedService:
         for end in (self.server, self.fallback):
             if end is not None:
                 end.close()
-        if isinstance(self.dispatcher, OrderedDispatcher):
-            self.dispatcher.close()
+        self.dispatcher.close()

@@ -21,6 +21,7 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import partial
 
 from fogft.core.errors import RosError, Unreadable
 from fogft.proxy.interruption import Interruptions
@@ -33,6 +34,7 @@ log = logging.getLogger(__name__)
 # The default depth of a service's queue (rmw_qos_profile_services_default). Kept true by
 # tests/proxy/test_processes.py, which sends a burst to an ordinary service.
 OUTSTANDING = 10
+_DEADLINES_KEPT = 1024  # of a service, of work that was forgotten
 
 
 class Responder:
@@ -47,6 +49,8 @@ class Responder:
         outstanding: Requests passed on to one service at once, where no limit is given.
         limits: How many may be at work, by service, where it is not to be learned.
         latest: Services of which the newest request goes first.
+        passing: Whether a service's answer holds for the moment only: it is not kept, and a copy
+            is run anew.
         kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
         kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
         clock: Monotonic seconds.
@@ -71,6 +75,7 @@ class Responder:
         outstanding: int = OUTSTANDING,
         limits: Mapping[str, int] | None = None,
         latest: Collection[str] = (),
+        passing: Callable[[str, bytes], bool] = lambda service, answer: False,
         kept_bytes: int = 16 << 20,
         kept_ids: int = 32768,
         clock: Callable[[], float] = time.monotonic,
@@ -81,6 +86,7 @@ class Responder:
         self._outstanding = outstanding
         self._limits = dict(limits or {})
         self._latest = frozenset(latest)
+        self._passing = passing
         self._kept_bytes_limit = kept_bytes
         self._kept_ids = kept_ids
         self._clock = clock
@@ -139,7 +145,7 @@ class Responder:
         """Take a request from the wire. Never blocks."""
         now = self._clock()
         id = incoming.request_id
-        displaced = None
+        displaced = begun = None
         with self._lock:
             known = self._work.get(id)
             if known is not None:
@@ -153,22 +159,43 @@ class Responder:
                 answer = None
                 reason, displaced = self._reason_to_refuse(incoming, now)
                 if not reason:
-                    self._accept(Work(now + incoming.remaining_s, incoming))
+                    begun = self._accept(incoming, now)
         if displaced is not None:
             self._end(displaced.id, Refusal.OVERLOADED)
-        if answer is not None:
+        if begun is not None:
+            if not self._call(begun):
+                self._pass_on(incoming.service)
+        elif answer is not None:
             incoming.reply(answer)
         elif reason:
             self._refuse(incoming, reason)
         else:
             self._pass_on(incoming.service)
 
-    def _accept(self, work: Work) -> None:
+    def _accept(self, incoming: Incoming, now: float) -> Work | None:
+        """Take a request; return it where it is to be passed on at once."""
+        work = Work(now + incoming.remaining_s, incoming)
+        service = work.service
+        line = self._lines[service]
         self._work[work.id] = work
-        self._deadlines.setdefault(work.service, deque()).append((work.deadline, work.id))
+        deadlines = self._deadlines.get(service)
+        if deadlines is None:
+            deadlines = self._deadlines[service] = deque()
+        deadlines.append((work.deadline, work.id))
+        if len(deadlines) > 2 * len(self._work) + _DEADLINES_KEPT:
+            self._deadlines[service] = self._live(deadlines)
         self._running += 1
         self._held_bytes += work.size
-        self._line(work.service).put(work)
+        if line.open:
+            line.begin(work, now)
+            return work
+        line.put(work)
+        return None
+
+    def _live(self, deadlines: deque[tuple[float, bytes]]) -> deque[tuple[float, bytes]]:
+        """Return the deadlines without those of work that was forgotten or run anew."""
+        live = ((due, self._work.get(due[1])) for due in deadlines)
+        return deque(due for due, work in live if work is not None and work.deadline == due[0])
 
     def _line(self, service: str) -> Line:
         line = self._lines.get(service)
@@ -180,13 +207,14 @@ class Responder:
 
     def _reason_to_refuse(self, incoming: Incoming, now: float) -> tuple[str, Work | None]:
         """Return why a request is not taken, empty if it is, and what gives way to it."""
-        if incoming.remaining_s <= 0:
+        service, remaining_s = incoming.service, incoming.remaining_s
+        if remaining_s <= 0:
             return Refusal.EXPIRED, None
-        if not self._is_ready(incoming.service) or incoming.service not in self._clients:
+        if not self._is_ready(service) or service not in self._clients:
             return Refusal.NOT_READY, None
-        line = self._line(incoming.service)
-        deadline = now + incoming.remaining_s
-        if line.hopeless(incoming.robot, deadline, incoming.remaining_s):
+        line = self._line(service)
+        deadline = now + remaining_s
+        if not line.open and line.hopeless(incoming.robot, deadline, remaining_s):
             return Refusal.OVERLOADED, None
         held_bytes = self._held_bytes + len(incoming.payload)
         if held_bytes > self._held_bytes_limit and self._running:
@@ -242,12 +270,11 @@ class Responder:
             else:
                 self._end(work.id, Refusal.EXPIRED)
 
-    def _call(self, work: Work) -> None:
-        def on_response(payload: bytes) -> None:
-            self._finished(work, payload)
-
+    def _call(self, work: Work) -> bool:
+        """Give the service a request; return whether it was taken. If not, it has ended."""
         try:
             payload, work.payload = work.payload, b""
+            on_response = partial(self._finished, work)
             work.ticket = self._clients[work.service].call(payload, on_response)
         except RosError as error:
             log.warning("request_not_passed_on service=%s reason=%r", work.service, str(error))
@@ -257,27 +284,39 @@ class Responder:
             self._end(work.id, Refusal.NOT_READY)
         else:
             self.ran += 1
+            return True
+        return False
 
     def _finished(self, work: Work, payload: bytes) -> None:
         now = self._clock()
         line = self._lines[work.service]
         with self._lock:
-            line.finished(work, now)
-            self.ran_s += now - work.begun
             waiting, work.waiting = work.waiting or [], None
+            if waiting and self._passing(work.service, payload):
+                self._work.pop(work.id, None)
+            elif waiting and not work.unwanted:
+                self._keep(work, payload)
             if waiting:
                 self._running -= 1
                 self._held_bytes -= work.size
-                if not work.unwanted:
-                    self._keep(work, payload)
-            if not waiting or work.unwanted:
+            more = line.at_work > 1
+        try:
+            for incoming in waiting:
+                if work.unwanted:  # its bytes would be dropped at the other end
+                    self._refuse(incoming, Refusal.LATE)
+                else:
+                    incoming.reply(payload, more=more)
+        finally:
+            self._over(work, line, now, wasted=not waiting or work.unwanted)
+
+    def _over(self, work: Work, line: Line, now: float, *, wasted: bool) -> None:
+        """Give the room of finished work to what waits. After its replies: these cannot wait."""
+        with self._lock:
+            line.finished(work, now)
+            self.ran_s += now - work.begun
+            if wasted:
                 self.wasted += 1
                 self.wasted_s += now - work.begun
-        for incoming in waiting:
-            if work.unwanted:  # its bytes would be dropped at the other end
-                self._refuse(incoming, Refusal.LATE)
-            else:
-                incoming.reply(payload)
         if line:
             self._pass_on(work.service)
 

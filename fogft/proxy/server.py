@@ -21,14 +21,15 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from fogft.cloud.notice_formats import Notice, NoticeKind
-from fogft.core import names
+from fogft.core import goals, names
 from fogft.core.definitions import Definition
 from fogft.core.errors import RosError
 from fogft.core.model import ReplicaId
-from fogft.core.spec import ServiceSpec
+from fogft.core.spec import Part, ServiceSpec
 from fogft.core.spec_choices import Freshness
 from fogft.core.spec_state import StateSpec
 from fogft.core.topics import TopicSpec
+from fogft.proxy.goals_once import GoalsOnce
 from fogft.proxy.interruption import CANCEL_TYPE
 from fogft.proxy.offering import Offering
 from fogft.proxy.ordered_responder import Clients, OrderedResponder, StateBytes
@@ -103,6 +104,12 @@ class ServerProxy:
             max_in_flight=max_in_flight,
             limits=_limits(services),
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
+            passing=_for_the_moment(services),
+            clock=clock,
+        )
+        self._goals = GoalsOnce(
+            [s.name for s in services if s.part is Part.GOAL],
+            lambda name: name in self._ready,
             clock=clock,
         )
 
@@ -111,7 +118,7 @@ class ServerProxy:
         keys = self._keys(self._offering.services) | self._topic_keys()
         self._join_ros()
         # Where no service is stateful there is nothing to choose, and nothing to pay.
-        chosen = self._ordered or self._topics
+        chosen = self._ordered or self._topics or self._goals
         request = self._request if chosen else self.responder.request
         self._listener.serve(keys, request, self._probe, self.responder.cancel)
         self._supervisor.poll()
@@ -131,12 +138,15 @@ class ServerProxy:
         died = self._supervisor.poll()
         if died or self._node is None or not self._node.alive:
             self._ready = frozenset()
+            if died:
+                self._goals.crashed()
             self._crashed()
             self._leave_ros()
             self._join_ros()
         self._take_up_new()
         self._look_for_services()
         self.responder.tick()
+        self._goals.tick()
         self._topics.tick()
         for ordered in self._ordered.values():
             ordered.tick(self._supervisor.alive)
@@ -172,6 +182,7 @@ class ServerProxy:
             if name in self._ordered and self._supervisor.alive:
                 self._supervisor.restart()  # what state it is in, nobody knows
             else:
+                self._goals.crashed(name)
                 self.responder.crashed(name)
 
     def _replaced(self) -> set[str]:
@@ -242,6 +253,7 @@ class ServerProxy:
             self._make_client(service)
         cancels = {s.name: node.client(s.cancel, CANCEL_TYPE) for s in services if s.cancel}
         self.responder.use(self._clients, cancels)
+        self._goals.use(self._clients)
         for service in services:
             if service.name not in self._clients:
                 continue
@@ -268,6 +280,8 @@ class ServerProxy:
     def _leave_ros(self) -> None:
         node, self._node, self._clients = self._node, None, {}
         self.responder.use({})
+        self._goals.left_ros()
+        self._goals.use({})
         self._topics.use(None)
         for ordered in self._ordered.values():
             ordered.use(None)
@@ -277,6 +291,9 @@ class ServerProxy:
     def _request(self, incoming: Incoming) -> None:
         if incoming.service in self._topics:
             self._topics.request(incoming)
+            return
+        if incoming.service in self._goals:
+            self._goals.request(incoming)
             return
         (self._ordered.get(incoming.service) or self.responder).request(incoming)
 
@@ -304,6 +321,7 @@ class ServerProxy:
             at_risk=self._at_risk,
             restarts=max(self._supervisor.restarts, 0),
             in_flight=self.responder.in_flight
+            + self._goals.in_flight
             + sum(ordered.in_flight for ordered in self._ordered.values()),
             detail=self._detail(),
             work=self.responder.report(),
@@ -335,6 +353,7 @@ class ServerProxy:
         """Stop the command, leave the wire and ROS."""
         self._ready = frozenset()
         self._supervisor.stop()
+        self._goals.crashed()
         self._crashed()
         self._listener.close()
         self._leave_ros()
@@ -346,3 +365,13 @@ def _limits(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
     # A cancel service names no request, so it must be clear which one is meant.
     limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
     return {name: limit for name, limit in limits.items() if limit}
+
+
+def _for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool]:
+    """Return what says whether an answer holds for the moment only.
+
+    A replica that comes later is asked for a result as soon as it is given the goal: it may answer
+    that before it knows the goal.
+    """
+    results = {s.name for s in services if s.part is Part.RESULT}
+    return lambda service, answer: service in results and goals.is_unknown(answer)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any, Protocol
 
 from fogft.core.errors import RosError
@@ -55,7 +54,7 @@ class VotingDispatcher(Dispatcher):
         try:
             value = self._comparison.read(payload)
         except RosError:
-            super().answered(link, replace(answer, payload=None, refusal=Refusal.MALFORMED))
+            super().answered(link, answer._replace(payload=None, refusal=Refusal.MALFORMED))
             return
         with self._lock:
             if request not in self._requests and not self._votes.is_final(request):
@@ -69,7 +68,7 @@ class VotingDispatcher(Dispatcher):
                         self.spec.name, link.peer.id.short, self._votes.disagreed[replica],
                     )  # fmt: skip
         if final is not None:
-            super().answered(link, replace(answer, payload=final))
+            super().answered(link, answer._replace(payload=final))
             return
         with self._lock:
             if request in self._requests:

@@ -58,6 +58,7 @@ class Server:
         self._on_burst = on_burst
         self._withdraw = withdraw
         self._unreadable = _Unreadable(service.srv_name)
+        self._in_bursts = False  # several came together the last time
         self._lock = threading.Lock()
         self._pacer = Pacer(self._send)
 
@@ -81,11 +82,19 @@ class Server:
         self._withdraw(self)
 
     def drain(self) -> None:
-        """Deliver what has arrived. Take loop only."""
+        """Deliver what has arrived. Take loop only.
+
+        Where requests came one at a time lately, the first does not wait until ROS was asked for
+        another one: it takes no part in a burst that begins with it.
+        """
         taken = self._next()
+        if taken is not None and not self._in_bursts:
+            self._deliver(taken)
+            taken = self._next()
         if taken is None:
             return
         following = self._next()
+        self._in_bursts = following is not None
         if following is None:
             self._deliver(taken)
             return

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from functools import lru_cache
 
 from fogft.core.names import REQUEST_ID_BYTES
 from fogft.wire import frame
-from fogft.wire.frame import FrameError, RequestHeader
+from fogft.wire.frame import NO_STAMP, STAMP_BYTES, FrameError, RequestHeader
 from fogft.wire.port import Answer
 
 LIMIT = 64  # entries
@@ -22,6 +21,7 @@ ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload leaves alone: it does not wait, 
 BYTES_LIMIT = 16 << 10  # of all payloads together
 
 _FIRST = bytes((frame.VERSION | 0x10,))
+_STAMPED = len(_FIRST) + STAMP_BYTES
 _REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdI")  # id, remaining seconds, length
 _ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s?I")  # id, whether it is a refusal, length
 
@@ -34,18 +34,21 @@ def is_batch(header: bytes) -> bool:
     return header[:1] == _FIRST
 
 
-def encode_requests(requests: Requests, origin: bytes) -> tuple[bytes, bytes]:
+def encode_requests(
+    requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
+) -> tuple[bytes, bytes]:
     """Return header and payload for requests: id, remaining seconds and payload of each.
 
     Args:
         requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
         origin: From `frame.origin`.
+        seen: The stamp of the last answer that the connection has seen.
     """
     parts = []
     for id, remaining_s, payload in requests:
         parts.append(_REQUEST.pack(id, remaining_s, len(payload)))
         parts.append(payload)
-    return _FIRST + origin, b"".join(parts)
+    return _FIRST + seen + origin, b"".join(parts)
 
 
 def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
@@ -56,15 +59,16 @@ def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, 
     """
     if not is_batch(header):
         raise FrameError("no batch of requests")
-    token, robot = _read_origin(header[1:])
+    seen = header[1:_STAMPED]
+    token, robot = frame.read_origin(header[_STAMPED:])
     found = []
     for (id, remaining_s, _), part in _entries(_REQUEST, payload):
         frame.check_remaining(remaining_s)
-        found.append((RequestHeader(id, remaining_s, token, robot), part))
+        found.append((RequestHeader(id, remaining_s, token, robot, seen), part))
     return found
 
 
-def encode_answers(answers: Answers) -> tuple[bytes, bytes]:
+def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
     """Return header and payload for answers: id, payload and refusal of each.
 
     A refusal takes the place of the payload where it is not empty.
@@ -74,26 +78,21 @@ def encode_answers(answers: Answers) -> tuple[bytes, bytes]:
         said = refusal.encode("ascii") if refusal else payload
         parts.append(_ANSWER.pack(id, bool(refusal), len(said)))
         parts.append(said)
-    return _FIRST, b"".join(parts)
+    return _FIRST + stamp, b"".join(parts)
 
 
-def decode_answers(header: bytes, payload: bytes) -> list[Answer]:
-    """Return the answers of a batch.
+def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
+    """Return the stamp and the answers of a batch.
 
     Raises:
         FrameError: It is not one.
     """
-    if header != _FIRST:
+    if not is_batch(header) or len(header) != _STAMPED:
         raise FrameError("no batch of answers")
-    return [
+    return header[1:], [
         Answer(id, None, frame.read_reason(part)) if refused else Answer(id, part)
         for (id, refused, _), part in _entries(_ANSWER, payload)
     ]
-
-
-@lru_cache(maxsize=256)
-def _read_origin(origin: bytes) -> tuple[bytes, str]:
-    return frame.read_origin(origin)
 
 
 def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[bytes, float, int], bytes]]:

@@ -26,10 +26,9 @@ from fogft.core.errors import WireError
 from fogft.core.holders import Role, holder_of
 from fogft.core.model import ReplicaId
 from fogft.core.records import RecordError, Verify
-from fogft.core.repeats import worth_logging
 from fogft.wire import first_message
 from fogft.wire import record_frames as frames
-from fogft.wire.reply_queue import Counters
+from fogft.wire.counters import Counters
 from fogft.wire.splice import Tunnel, hang_up, keep_alive
 
 log = logging.getLogger(__name__)
@@ -282,9 +281,7 @@ class DialIn:
         return self._counters.snapshot()
 
     def _count(self, event: str, detail: str) -> None:
-        count = self._counters.add(event)
-        if worth_logging(count):
-            log.warning("dial_in_refused event=%s count=%d detail=%r", event, count, detail[:200])
+        self._counters.warn(log, event, "dial_in_refused event=%s detail=%r", event, detail[:200])
 
     def close(self) -> None:
         """Close the door and all that came through it. Repeatable."""

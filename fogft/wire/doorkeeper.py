@@ -19,11 +19,10 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 
-from fogft.core.repeats import worth_logging
 from fogft.wire import sockets
+from fogft.wire.counters import Counters
 from fogft.wire.drain import Drain
 from fogft.wire.flow_watch import THIN_BYTES_PER_S
-from fogft.wire.reply_queue import Counters
 from fogft.wire.sockets import Address
 
 log = logging.getLogger(__name__)
@@ -133,11 +132,9 @@ class Doorkeeper:
 
     def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:
         sockets.end(connection)
-        count = self._counters.add(event)
-        if worth_logging(count):
-            log.warning(
-                "connection_ended reason=%s peer=%s:%d name=%r count=%d", event, *peer, name, count
-            )
+        self._counters.warn(
+            log, event, "connection_ended reason=%s peer=%s:%d name=%r", event, *peer, name
+        )
 
 
 def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:

@@ -2,7 +2,7 @@
 
 Nothing waits for time to pass: whoever holds something knows of more to come, or calls `take`.
 
-Owns: what is held, and how much. Not here: sending (`zenoh_connection`).
+Owns: what is held, and how much. Not here: sending (`attempts`).
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class InTime:
         attempt: Sized,
         remaining_s: float,
         now: float,
-        before: Callable[[], Iterable[Sized]] = tuple,
+        before: Callable[[str], Iterable[Sized]] = lambda service: (),
     ) -> bool:
         """Whether an attempt may arrive while there is time, for all that is known.
 
@@ -74,12 +74,14 @@ class InTime:
             attempt: The attempt.
             remaining_s: The time that it has.
             now: The clock.
-            before: Returns what leaves first.
+            before: Returns what leaves before a request to a service.
         """
         rate = self._carries(now)
         if rate is None or attempt.service not in self._timed:
             return True
-        size = self._left(now, rate) + sum(map(self._on_the_way, (attempt, *before())))
+        size = self._left(now, rate) + sum(
+            map(self._on_the_way, (attempt, *before(attempt.service)))
+        )
         if enough(size, rate, remaining_s):
             return True
         self.declined += 1

@@ -128,7 +128,7 @@ class MemoryLink:
     def _end(self, session: Session, attempt: _Attempt, answer: Answer) -> None:
         if session.window.remove(attempt):
             session.attempts.remove(attempt)
-            self._events.answered(self, replace(answer, service=attempt.service))
+            self._events.answered(self, answer._replace(service=attempt.service))
             if session.window.regained_room():
                 self._events.changed(self)
             return
@@ -296,7 +296,7 @@ class MemoryIncoming:
         self._send: Callable[[Answer], None] | None = send
         self._listener = listener
 
-    def reply(self, payload: bytes) -> None:
+    def reply(self, payload: bytes, *, more: bool = False) -> None:
         """Send the serialised response."""
         self.answer(Answer(self.request_id, payload=payload), "replies")
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from fogft.core.definitions import Definition
 from fogft.core.model import LinkState, ReplicaId
@@ -131,8 +131,7 @@ class Refusal:
     LOST = "lost"  # made locally: the link died before an answer came
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
     """The end of one attempt: `payload` if the service answered, else a `refusal`.
 
     Attributes:
@@ -304,8 +303,13 @@ class Incoming(Protocol):
     def payload(self) -> bytes:
         """The serialised request (CDR)."""
 
-    def reply(self, payload: bytes) -> None:
-        """Send the serialised response. Never blocks."""
+    def reply(self, payload: bytes, *, more: bool = False) -> None:
+        """Send the serialised response. Never blocks.
+
+        Args:
+            payload: The response.
+            more: Others will soon follow, to leave in one message with it.
+        """
 
     def refuse(self, reason: str) -> None:
         """Send a refusal. Never blocks."""

@@ -22,6 +22,7 @@ from zenoh import handlers
 from fogft.core import rmw_zenoh
 from fogft.core.errors import RosError, Unreadable
 from fogft.core.repeats import worth_logging
+from fogft.wire import zenoh_threads
 
 log = logging.getLogger(__name__)
 
@@ -256,6 +257,7 @@ class Client:
         return token
 
     def _replied(self, ticket: int, reply: Any) -> None:
+        zenoh_threads.note()
         if reply.ok is None:
             self._errors += 1
             if worth_logging(self._errors):

@@ -174,8 +174,8 @@ def end_sending(connection: socket.socket) -> None:
     Not both directions: where Zenoh hears of an end before it fails to send, its thread waits for
     whoever waits for room to send more, and he for that thread (`docs/design/links.md`).
     """
+    _drop_when_closed(connection)
     with contextlib.suppress(OSError):  # it ended by itself
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
         connection.shutdown(socket.SHUT_WR)
 
 
@@ -184,9 +184,13 @@ def abort(connection: socket.socket) -> None:
 
     Not where something is sent: see `end_sending`.
     """
-    with contextlib.suppress(OSError):
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+    _drop_when_closed(connection)
     _libc.connect(connection.fileno(), _NOWHERE, len(_NOWHERE))
+
+
+def _drop_when_closed(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it ended by itself
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
 
 
 def abort_all(port: int, within_s: float) -> None:
@@ -221,7 +225,7 @@ def _received(flows: list[Flow | None]) -> list[int]:
 
 
 def end(connection: socket.socket) -> None:
-    """End a connection at both of its ends. One on which much is sent: `end_sending` first."""
+    """End a connection at both of its ends at once. Where much flows, see `end_sending`."""
     end_sending(connection)
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RD)

@@ -1,7 +1,7 @@
 """One request on its way through one connection, and how its end is read.
 
 Owns: what a connection keeps of an attempt, the meaning of a reply. Not here: sending
-(`zenoh_connection`).
+(`attempts`).
 """
 
 from __future__ import annotations
@@ -38,25 +38,27 @@ class OpenAttempt:
         self.mark = 0  # what the connection had sent once this was sent (`credit`)
 
 
-def read_reply(reply: zenoh.Reply) -> Sequence[Answer]:
-    """Return what a replica answers to requests: a payload or a refusal to each.
+def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:
+    """Return a reply's stamp, and what it answers to requests: a payload or a refusal to each.
 
     Raises:
         FrameError: It does not say to which.
     """
-    if reply.err is not None:
-        id, refusal = frame.decode_refusal(reply.err.payload.to_bytes())
-        return (Answer(id, None, refusal),)
     ok = reply.ok
-    if ok is None or ok.attachment is None:
+    if ok is None:
+        err = reply.err
+        stamp, id, refusal = frame.decode_refusal(b"" if err is None else err.payload.to_bytes())
+        return stamp, (Answer(id, None, refusal),)
+    attachment = ok.attachment
+    if attachment is None:
         raise frame.FrameError("an answer without a header")
-    header, payload = ok.attachment.to_bytes(), ok.payload.to_bytes()
+    header, payload = attachment.to_bytes(), ok.payload.to_bytes()
     if batch_frames.is_batch(header):
         return batch_frames.decode_answers(header, payload)
-    id, packed = frame.decode_answer(header)
+    stamp, id, packed = frame.decode_answer(header)
     if packed:
         try:
             payload = unpack(payload)
         except ValueError:
-            return (Answer(id, None, Refusal.MALFORMED),)
-    return (Answer(id, payload),)
+            return stamp, (Answer(id, None, Refusal.MALFORMED),)
+    return stamp, (Answer(id, payload),)

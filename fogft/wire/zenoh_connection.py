@@ -5,12 +5,11 @@ one query, which stays open for as long as the connection. A query for each requ
 a third more (its state, two timers and its end, at both ends), and its time-out at the replica
 would be sent by the one thread that all else there needs, too.
 
-Everything of Zenoh's that can block (`put`, `close`) is called by the connection's own
-sender thread, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's
-threads.
+Everything of Zenoh's that can block (`put`, `close`) is called by the sender thread of its
+attempts, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's threads.
 
-Owns: a session, its sender thread, the attempts open on it.
-Not here: when to open and when to give up (`zenoh_link`).
+Owns: a session. Not here: the requests open on it (`attempts`), when to open and when to give
+up (`zenoh_link`).
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from __future__ import annotations
 import logging
 import secrets
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -29,23 +27,17 @@ from zenoh import handlers
 from fogft.core import names
 from fogft.core.errors import WireError
 from fogft.core.records import Sign
-from fogft.wire import batch_frames, frame
-from fogft.wire.compression import Compression
-from fogft.wire.credit import Credit
+from fogft.wire import frame, zenoh_threads
+from fogft.wire.attempts import Attempts
 from fogft.wire.diagnosis import wrong_name
 from fogft.wire.flow_watch import FlowWatch
-from fogft.wire.held import Held
-from fogft.wire.in_time import InTime
 from fogft.wire.leaving import see_off
-from fogft.wire.link_window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.wire.port import Answer, Peer, Refusal
 from fogft.wire.recalls import Recalls
-from fogft.wire.send_queue import SendQueue
 from fogft.wire.sockets import address
-from fogft.wire.turns import LARGE_BYTES, Turns
-from fogft.wire.unanswered import Unanswered
+from fogft.wire.turns import Turns
 from fogft.wire.ways import PLAIN_WAYS, Ways
-from fogft.wire.zenoh_attempt import OpenAttempt, read_reply
+from fogft.wire.zenoh_attempt import read_reply
 
 log = logging.getLogger(__name__)
 
@@ -53,15 +45,6 @@ _ALL = zenoh.QueryTarget.ALL
 # NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
 # last replica has answered. Kept true by tests/wire/test_first_reply_is_not_held_back.
 _AT_ONCE = zenoh.ConsolidationMode.NONE
-# Attempts that wait for the sender, forgotten ones included: those have freed their room in the
-# window, so without a bound of its own the queue of a sender that is stuck would grow.
-_QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
-# A `put` that took this long was stuck behind a full queue: see whether the session survived.
-_STUCK_S = 0.1
-# What Zenoh itself may hold of a large request once its sending has returned: two batches.
-_ZENOH_HOLDS_BYTES = 2 * 65535
-# How long the keeper looks often after the last large request began to leave.
-_WATCH_S = 5.0
 # How long a closed connection may still flow.
 _END_WITHIN_S = 1.0
 # For as long as the connection: Zenoh ends the query when the session closes.
@@ -76,10 +59,6 @@ _REFUSED = {
 
 
 _TELL_RECORDS_TIMEOUT_S = 5.0
-
-
-# In the queue, in place of an attempt: tell the replica of what was forgotten.
-_TELL = OpenAttempt("", b"", b"", offered=0.0, remaining_s=0.0)
 
 
 class Connection:
@@ -98,7 +77,14 @@ class Connection:
         late: Called with service and id when a forgotten request was answered. Must not block.
         lost: Called, from any thread and perhaps more than once, when it is no longer of use.
         room: Called when a window that was full has room again.
-        large: Called when something large is sent and `watched` is not set. Must not block.
+        large: Called when something large is sent and it is not `watched`. Must not block.
+
+    Attributes:
+        attempts: The requests open on it.
+        certificate: Ours (DER), which it uses.
+        flow: What flows through its socket.
+        lost_because: Why it is of no more use; empty while it is.
+        told: The records that the replica has taken from us.
 
     Raises:
         zenoh.ZError: Nothing was reached.
@@ -123,36 +109,16 @@ class Connection:
         room: Callable[[], None],
         large: Callable[[], None] = lambda: None,
     ) -> None:
-        self._turns = turns
-        self._on_large = large
-        self._large_since = float("-inf")
-        self._sending_since: float | None = None
-        self._held_by_zenoh = (0.0, 0)  # since when, so many bytes at most
-        self.watched = False
-        self._answered = answered
-        self._late = late
         self._on_lost = lost
-        self._room = room
         self._begun = False
-        self._unanswered = Unanswered()
-        self._held = Held()
         self._token = secrets.token_bytes(frame.TOKEN_BYTES)
-        self._origin = frame.origin(robot, self._token)
         self.certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
         greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
-        self._queue = SendQueue(ways.latest)
-        self._compressions = {name: Compression() for name in keys.keys() - ways.plain}
-        self.packs = False  # whether the replica reads what is compressed
-        self.packs_answers = False  # whether it finds out by itself when to compress answers
-        self._credit = Credit()
         self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
         self._answers_key = names.answers_key(peer.id.pool_uid, peer.id.slot)
-        self._recalls = recalls
-        self._telling = False
-        self.window: LinkWindow[OpenAttempt] = LinkWindow()
         self.lost_because = ""
-        self.told = b""  # the records that the replica has taken from us
+        self.told = b""
         self._session = zenoh.open(config)
         try:
             self._listener = self._session.info.declare_link_events_listener(
@@ -168,13 +134,20 @@ class Connection:
         except BaseException:
             _close_aside(self._session, peer)
             raise
-        self._in_time = InTime(
-            ways.timed, self.flow.carries_bytes_per_s, self._left_bytes, self._compression
+        self.attempts = Attempts(
+            self,
+            keys,
+            frame.origin(robot, self._token),
+            ways=ways,
+            turns=turns,
+            recalls=recalls,
+            answered=answered,
+            late=late,
+            room=room,
+            large=large,
+            ended=partial(_close, self._session),
+            name=f"fogft-send-{peer.id.short}",
         )
-        self._thread = threading.Thread(
-            target=self._run, name=f"fogft-send-{peer.id.short}", daemon=True
-        )
-        self._thread.start()
 
     def _check_peer(self, peer: Peer) -> FlowWatch:
         links = self._session.info.links()
@@ -201,7 +174,7 @@ class Connection:
         self._session.get(
             self._answers_key,
             handlers.Callback(
-                self._heard, lambda: self._lose("the replica ended our answers"), indirect=False
+                self._heard, lambda: self.lose("the replica ended our answers"), indirect=False
             ),
             attachment=frame.encode_greeting(frame.Greeting(self._token)),
             timeout=_ANSWERS_TIMEOUT_S,
@@ -211,246 +184,53 @@ class Connection:
         self._begun = True
         return True
 
-    # -- requests (any thread) ------------------------------------------------------------
+    # -- for its attempts -----------------------------------------------------------------
 
-    def offer(
-        self,
-        service: str,
-        request_id: bytes,
-        payload: bytes,
-        remaining_s: float,
-        *,
-        more: bool = False,
-    ) -> bool:
-        """Take an attempt, or return False. Never blocks. With `more`, `send` must follow."""
-        if service not in self._publishers or self._queue.qsize() >= _QUEUE_LIMIT:
-            return False
-        now = time.monotonic()
-        attempt = OpenAttempt(service, request_id, payload, offered=now, remaining_s=remaining_s)
-        if not self._in_time.may_arrive(attempt, remaining_s, now, partial(self._before, service)):
-            return False
-        if not self.window.admit(attempt) and not self._displace(attempt):
-            return False
-        mark = self._credit.take(attempt.size)
-        if mark is None:
-            self.send()
-            attempt.mark = self._credit.queue(attempt.size)
-            self._queue.put(attempt)
-            return True
-        # It cannot block: the hop to another thread is saved.
-        attempt.mark = mark
-        if (more or self._held) and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
-            self._send_together(self._held.add(attempt))
-        else:
-            self._send_or_lose(attempt)
-        if not more:
-            self.send()
-        return True
+    def publish(self, service: str, content: bytes, header: bytes) -> None:
+        """Send a message to a service. May block for as long as the peer takes nothing.
 
-    def send(self) -> None:
-        """Send what was offered with `more`. Never blocks: it was small, and reserved."""
-        self._send_together(self._held.take())
+        Raises:
+            zenoh.ZError: The session is closed.
+        """
+        self._publishers[service].put(content, attachment=header)
 
-    def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
-        if len(attempts) < 2 or self.flow.thin:  # there, each is compressed
-            for attempt in attempts:
-                self._send_or_lose(attempt)
-            return
-        now = time.monotonic()
-        parts = []
-        for attempt in attempts:
-            payload = attempt.payload  # read once, as in `_send`
-            attempt.payload = None
-            if payload is not None and self.window.holds(attempt):
-                parts.append((attempt.request_id, max(attempt.deadline - now, 0.0), payload))
-                self._unanswered.add(attempt)
-        if not parts:
-            return
-        header, content = batch_frames.encode_requests(parts, self._origin)
-        try:
-            self._publishers[attempts[0].service].put(content, attachment=header)
-        except Exception as error:  # whatever it is, the attempts must end
-            self._lose(f"sending failed: {error}")
-            for attempt in attempts:
-                self._end(attempt, None, Refusal.LOST)
+    def recall(self, ids: Sequence[bytes]) -> None:
+        """Tell the replica that these are no longer wanted. May block likewise.
 
-    def _before(self, service: str) -> list[OpenAttempt]:
-        """Return what leaves before an attempt that comes now."""
-        if self._queue.overtakes(service):
-            return []
-        return [one for one in self.window.attempts() if one.payload is not None]
-
-    def _left_bytes(self, now: float, bytes_per_s: float) -> float:
-        """Return what was sent and has not arrived: in the kernel, and in Zenoh above it."""
-        since, held = self._held_by_zenoh
-        left = max(0.0, held - bytes_per_s * (now - since))
-        return left + self.flow.left_bytes(now, bytes_per_s)
-
-    def _compression(self, service: str) -> Compression | None:
-        return self._compressions.get(service) if self.packs else None
-
-    def _displace(self, attempt: OpenAttempt) -> bool:
-        """Let a newer attempt in for the stalest unsent one, where its service wants that."""
-        stale = self._queue.stalest(attempt)
-        if stale is None:
-            return False
-        self._end(stale, None, Refusal.SUPERSEDED)
-        return self.window.admit(attempt)
-
-    def forget(self, request_id: bytes) -> None:
-        """Free the room and the bytes of a request, also where its sender is stuck."""
-        attempt = self.window.forget(request_id)
-        if attempt is None:
-            return
-        sent, recalls, now = attempt.payload is None, self._recalls, time.monotonic()
-        if sent and recalls is not None and recalls.add(request_id, attempt.offered, now):
-            self.flush()
-        attempt.payload = None
-        if self.window.regained_room():
-            self._room()
-
-    def flush(self) -> None:
-        """Have the replica told of what was forgotten and not answered."""
-        if self._recalls and not self._telling:  # there are some
-            self._telling = True
-            self._queue.put(_TELL)
-
-    def _end(self, attempt: OpenAttempt, payload: bytes | None, refusal: str = "") -> None:
-        if self.window.remove(attempt):
-            attempt.payload = None
-            self._answered(Answer(attempt.request_id, payload, refusal, attempt.service))
-            if self.window.regained_room():
-                self._room()
-
-    # -- the sender thread ----------------------------------------------------------------
-
-    def _run(self) -> None:
-        while True:
-            attempt = self._queue.get()
-            if attempt is None:
-                break
-            if attempt is _TELL:
-                self._tell()
-                continue
-            self._send_or_lose(attempt)
-            self._credit.dequeued()
-        _close(self._session)
-
-    def _tell(self) -> None:
-        self._telling = False
-        ids = self._recalls.take() if self._recalls is not None else []
-        if not ids:
-            return
-        try:
-            self._session.put(
-                self._cancel_key,
-                frame.encode_cancel(ids),
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-        except zenoh.ZError as error:
-            self._lose(f"sending failed: {error}")
-
-    def _send_or_lose(self, attempt: OpenAttempt) -> None:
-        try:
-            self._send(attempt)
-        except Exception as error:  # whatever it is, the attempt must end
-            self._lose(f"sending failed: {error}")
-            self._end(attempt, None, Refusal.LOST)
-
-    def _send(self, attempt: OpenAttempt) -> None:
-        payload = attempt.payload  # read once: `forget` may take it away at any moment
-        if payload is None or not self.window.holds(attempt):
-            return  # forgotten while it waited
-        remaining_s = attempt.deadline - time.monotonic()
-        if remaining_s <= 0:
-            self._end(attempt, None, Refusal.LOST)
-            return
-        if not self._in_time.may_arrive(attempt, remaining_s, time.monotonic()):
-            self._end(attempt, None, Refusal.TOO_SLOW)
-            return
-        attempt.payload = None
-        large = attempt.size >= LARGE_BYTES
-        turn = self._turns.take() if large else None
-        began = time.monotonic()
-        if large:
-            self._large_since = self._sending_since = began
-            self._sends_large()
-        try:
-            if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
-                self._publish(attempt, payload, remaining_s)
-        finally:
-            self._sending_since = None
-            self._turns.give(turn)
-        if large:
-            self._held_by_zenoh = time.monotonic(), min(attempt.size, _ZENOH_HOLDS_BYTES)
-        if time.monotonic() - began > _STUCK_S and not self.alive():
-            self._lose("it took nothing more, and Zenoh gave the session up")
-
-    def _sends_large(self) -> None:
-        """Have the keeper look whether it flows, from now on and for a while."""
-        if not self.watched:
-            self.watched = True
-            self._on_large()
-
-    def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
-        compression = self._compression(attempt.service)
-        packed = None
-        if compression is not None:
-            packed = compression.pack(payload, self.flow.bytes_per_s)
-        self._unanswered.add(attempt)
-        self._publishers[attempt.service].put(
-            payload if packed is None else packed,
-            attachment=frame.encode_request(
-                attempt.request_id,
-                remaining_s,
-                self._origin,
-                packed=packed is not None,
-                may_pack=self.flow.thin and compression is not None,
-                reads_packed=self.packs_answers and compression is not None,
-            ),
+        Raises:
+            zenoh.ZError: The session is closed.
+        """
+        self._session.put(
+            self._cancel_key,
+            frame.encode_cancel(ids),
+            congestion_control=zenoh.CongestionControl.BLOCK,
         )
+
+    def lose(self, because: str) -> None:
+        """It is of no more use. Any thread, perhaps more than once."""
+        self.lost_because = self.lost_because or because
+        self._on_lost()
 
     # -- Zenoh's threads ------------------------------------------------------------------
 
     def _heard(self, reply: zenoh.Reply) -> None:
+        zenoh_threads.note()
         try:
-            answers = read_reply(reply)
+            stamp, answers = read_reply(reply)
         except frame.FrameError as error:
-            self._lose(f"its answers cannot be read: {error}")
+            self.lose(f"its answers cannot be read: {error}")
             return
-        for answer in answers:
-            self._take_answer(answer)
-
-    def _take_answer(self, answer: Answer) -> None:
-        attempt = self._unanswered.answered(answer.request_id)
-        if attempt is None:
-            return  # it was answered before
-        if answer.payload is not None:
-            self._credit.heard(attempt.mark)  # requests of one connection arrive in order
-        if self.window.holds(attempt):
-            self._end(attempt, answer.payload, answer.refusal)
-            return
-        if self._recalls is not None:  # it was forgotten, or has ended
-            self._recalls.answered(answer.request_id)
-        if answer.payload is not None or answer.refusal == Refusal.LATE:
-            self._late(attempt.service, answer.request_id)
+        self.attempts.heard(stamp, answers)
 
     def _link_event(self, event: zenoh.LinkEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
-            self._lose("the connection was lost")
-
-    def _lose(self, because: str) -> None:
-        self.lost_because = self.lost_because or because
-        self._on_lost()
+            self.lose("the connection was lost")
 
     # -- the keeper -----------------------------------------------------------------------
 
     def look(self, now: float) -> float:
         """Look what flows; return for how many of the last seconds something large moved."""
-        if self.watched and now - self._large_since > _WATCH_S and not self._queue.qsize():
-            self.watched = False
-        since = self._sending_since
-        return self.flow.look(now, 0.0 if since is None else now - since)
+        return self.flow.look(now, self.attempts.look(now))
 
     def alive(self) -> bool:
         """Whether Zenoh still has a link beneath this session."""
@@ -493,11 +273,11 @@ class Connection:
 
     def _probe_refused(self, content: bytes) -> None:
         try:
-            _, reason = frame.decode_refusal(content)
+            _, _, reason = frame.decode_refusal(content)
         except frame.FrameError:
             return  # Zenoh's own: it timed out, and the keeper counts the silence
         words = _REFUSED.get(reason, f"the replica refuses our probes: {reason}")
-        self._lose(words)
+        self.lose(words)
 
     def tell_records(self, key: str, records: bytes) -> None:
         """Send signed records; `told` is them once the replica has taken them.
@@ -523,36 +303,24 @@ class Connection:
             consolidation=_AT_ONCE,
         )
 
-    def sweep(self) -> None:
-        """End the attempts whose time is up and of which Zenoh told nothing."""
-        now = time.monotonic()
-        for attempt in self.window.attempts():
-            if attempt.deadline <= now:
-                self._end(attempt, None, Refusal.LOST)
-
     def close(self) -> None:
         """End it: what is open is lost. Returns at once; the sender thread closes the session."""
-        ended = self.window.close()
-        see_off(self._thread)
+        self.attempts.close()
         # A large send that goes on is for nobody any more, and may block for minutes.
         threading.Thread(target=self._end_flow, name="fogft-end-link", daemon=True).start()
-        for attempt in ended:
-            attempt.payload = None
-            self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
 
     def _end_flow(self) -> None:
+        attempts = self.attempts
         try:
             self.flow.end_when_safe(
-                lambda: self._sending_since is not None,
-                lambda: len(self._unanswered) > 0,
-                _END_WITHIN_S,
+                lambda: attempts.sending, lambda: attempts.awaits_answers, _END_WITHIN_S
             )
         finally:
-            self._queue.put(None)
+            attempts.end()
 
     def join(self, timeout_s: float) -> None:
         """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
-        self._thread.join(timeout_s)
+        self.attempts.join(timeout_s)
 
 
 def _close(session: Any) -> None:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from queue import SimpleQueue
-
-import zenoh
 
 from fogft.wire import frame
+from fogft.wire.chores import Chores
 from fogft.wire.port import Refusal
-from fogft.wire.reply_queue import Reply, ReplyQueues
+from fogft.wire.replies import Reply
+from fogft.wire.reply_queue import ReplyQueues
+from fogft.wire.streams import Stream
 
 
 class ZenohIncoming:
@@ -27,9 +27,9 @@ class ZenohIncoming:
         header: frame.RequestHeader,
         payload: bytes,
         *,
-        stream: zenoh.Query,
+        stream: Stream,
         queues: ReplyQueues,
-        chores: SimpleQueue[Callable[[], None] | None],
+        chores: Chores,
         thin: Callable[[bytes], bool],
     ) -> None:
         self._thin = thin
@@ -65,15 +65,15 @@ class ZenohIncoming:
         """The serialised request (CDR)."""
         return self._payload
 
-    def reply(self, payload: bytes) -> None:
-        """Send the serialised response. Never blocks."""
-        self._send(payload, "")
+    def reply(self, payload: bytes, *, more: bool = False) -> None:
+        """Send the serialised response. Never blocks. With `more`, others will soon follow."""
+        self._send(payload, "", more=more)
 
     def refuse(self, reason: str) -> None:
         """Send a refusal. Never blocks."""
-        self._send(b"", reason)
+        self._send(b"", reason, more=True)
 
-    def _send(self, payload: bytes, refusal: str) -> None:
+    def _send(self, payload: bytes, refusal: str, *, more: bool) -> None:
         try:
             stream = self._streams.pop()
         except IndexError:
@@ -82,7 +82,7 @@ class ZenohIncoming:
         header = self._header
         packs = header.may_pack or (header.reads_packed and self._thin(header.token))
         reply = Reply(stream, header.request_id, payload, refusal, may_pack=packs)
-        self._queues.put(header.token, header.robot, reply)
+        self._queues.put(header.token, header.robot, reply, more=more)
 
     def __del__(self) -> None:
         """Refuse what its owner forgot: the robot must not wait for it until its deadline.
@@ -92,6 +92,6 @@ class ZenohIncoming:
         """
         if self._streams:
             forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)
-            self._chores.put(
-                partial(self._queues.put, self._header.token, self._header.robot, forgotten)
-            )
+            header = self._header
+            refuse = partial(self._queues.put, header.token, header.robot, forgotten, more=True)
+            self._chores.add(refuse)

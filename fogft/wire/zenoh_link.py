@@ -4,7 +4,7 @@ A keeper thread for each link opens the connection, sends probes, and replaces t
 connection when it is lost or when probes go unanswered: never because a service is slow.
 `offer` only puts the attempt into the connection's queue.
 
-Owns: the state of a link. Not here: sessions and attempts (`zenoh_connection`), what a
+Owns: the state of a link. Not here: sessions (`zenoh_connection`), attempts (`attempts`), what a
 replica's silence means for the pool (`fogft.core`).
 """
 
@@ -14,23 +14,20 @@ import logging
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
 import zenoh
 
 from fogft.core import names
 from fogft.core.errors import CredentialError, WireError
-from fogft.core.model import LinkState, doubted_after_s
-from fogft.wire import config, probe_frames
+from fogft.core.model import LinkState
+from fogft.wire import config
 from fogft.wire.compression import ZLIB, ZLIB_ANSWERS
-from fogft.wire.frame import FrameError
 from fogft.wire.leaving import see_off
 from fogft.wire.opening import Opening
 from fogft.wire.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.wire.probing import Probing
 from fogft.wire.recalls import Recalls
-from fogft.wire.silence import Silence
 from fogft.wire.zenoh_connection import Connection
 
 if TYPE_CHECKING:
@@ -41,20 +38,9 @@ log = logging.getLogger(__name__)
 _PROBE_EVERY_S = 1.0
 _FIRST_PROBES_EVERY_S = 0.1
 _UNREADY_PROBES_EVERY_S = 0.25  # a replica that is there gets requests soon after it is ready
-_PROBE_TIMEOUT_S = 60.0  # on a thin uplink it waits behind what is large
 _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
 _RENEW_AGAIN_S = 5.0
 _LOOK_EVERY_S = 0.1  # while something large is sent
-
-
-@dataclass(frozen=True)
-class _Heard:
-    """A probe's answer as it came, and when."""
-
-    connection: Connection
-    content: bytes
-    sent_at: float
-    at: float
 
 
 class ZenohLink:
@@ -69,22 +55,15 @@ class ZenohLink:
         self._events = events
         self._suspect_after_s = dialer.suspect_after_s
         self._probe_every_s = min(_PROBE_EVERY_S, dialer.suspect_after_s / 2)
-        self._probe_key = names.probe_key(peer.id.pool_uid, peer.id.slot)
         self._config = config.robot_settings(peer, dialer.credentials, dialer.settings)
         self._wake = threading.Event()
         self._woke_at = 0.0
         self._closed = False
-        self._heard: SimpleQueue[_Heard] = SimpleQueue()
-        self._silence = Silence()  # of the replica, as people see it
-        self._asked = Silence()  # of the present connection
+        self._probing = Probing(peer, self._wake.set)
         # Written by the keeper only; `_live` is set exactly while the state is UP.
         self._live: Connection | None = None
         self._state = LinkState.CONNECTING
         self._ready: frozenset[str] = frozenset()
-        self._probe_answer: ProbeAnswer | None = None
-        self._heard_at: float | None = None
-        self._rtt_s: float | None = None
-        self._doubted = False
         self._detail = "not reached yet"
         self._opening = Opening(peer, dialer.settings)
         self._opened = 0
@@ -116,7 +95,7 @@ class ZenohLink:
     @property
     def draining(self) -> bool:
         """Whether the replica asked to be left alone."""
-        answer = self._probe_answer
+        answer = self._probing.answer
         return answer is not None and answer.draining
 
     @property
@@ -136,43 +115,45 @@ class ZenohLink:
     ) -> bool:
         """Take one attempt, or return False. Never blocks. With `more`, `send` must follow."""
         live = self._live
-        return live is not None and live.offer(service, request_id, payload, remaining_s, more=more)
+        return live is not None and live.attempts.offer(
+            service, request_id, payload, remaining_s, more=more
+        )
 
     def send(self) -> None:
         """Send what was offered with `more`. Never blocks."""
         live = self._live
         if live is not None:
-            live.send()
+            live.attempts.send()
         for retiring in tuple(self._retiring):  # a moment ago it was the live one
-            retiring.send()
+            retiring.attempts.send()
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request whose answer is no longer wanted."""
         live = self._live
         if live is not None:
-            live.forget(request_id)
+            live.attempts.forget(request_id)
         for retiring in tuple(self._retiring):
-            retiring.forget(request_id)
+            retiring.attempts.forget(request_id)
 
     def flush(self) -> None:
         """Tell the replica of all that was forgotten and not answered."""
         self.send()
         live = self._live
         if live is not None:
-            live.flush()
+            live.attempts.flush()
 
     def status(self) -> LinkStatus:
         """Return a snapshot."""
         now = time.monotonic()
-        live, heard_at = self._live, self._heard_at
+        live, heard_at = self._live, self._probing.heard_at
         return LinkStatus(
             state=self._state,
-            probe_answer=self._probe_answer,
+            probe_answer=self._probing.answer,
             heard_age_s=None if heard_at is None else now - heard_at,
-            silent_for_s=self._silence.for_s(now),
-            rtt_s=self._rtt_s,
-            in_flight=len(live.window) if live else 0,
-            in_flight_bytes=live.window.held_bytes if live else 0,
+            silent_for_s=self._probing.silent_s(now),
+            rtt_s=self._probing.rtt_s,
+            in_flight=len(live.attempts.window) if live else 0,
+            in_flight_bytes=live.attempts.window.held_bytes if live else 0,
             reopened=max(self._opened - 1, 0),
             detail=self._detail,
         )
@@ -205,7 +186,7 @@ class ZenohLink:
     def _keep(self) -> None:
         failures = 0
         while not self._closed:
-            self._silence.began(time.monotonic())
+            self._probing.nobody_to_ask(time.monotonic())
             failures = 0 if self._hold() else failures + 1
             self._woke_at = time.monotonic()  # opening took time, and that is silence
             self._let_go()
@@ -252,14 +233,14 @@ class ZenohLink:
             self._say(new.lost_because)
             new.close()
         self._renew_at = time.monotonic() + _RENEW_AGAIN_S
-        self._asked = Silence()
+        self._probing.another_connection()
         return old
 
     def _let_go(self) -> None:
         """Close connections that were succeeded, once nothing is under way on them."""
         for connection in list(self._retiring):
-            connection.sweep()
-            if not len(connection.window) or connection.lost_because or self._closed:
+            connection.attempts.sweep()
+            if not len(connection.attempts.window) or connection.lost_because or self._closed:
                 self._retiring.remove(connection)
                 connection.close()
 
@@ -302,7 +283,7 @@ class ZenohLink:
         """
         up = False
         self._woke_at = next_probe = time.monotonic()
-        self._asked = Silence()
+        self._probing.another_connection()
         while not self._closed and not connection.lost_because and not (up and until_up):
             now = time.monotonic()
             if self._renewal_due(now) and connection is self._live:
@@ -311,16 +292,16 @@ class ZenohLink:
             if not self._flows(connection, now):
                 break
             if now >= next_probe:
-                connection.sweep()
+                connection.attempts.sweep()
                 self._probe(connection, now)
                 if up:
                     self._tell_records(connection)
                 next_probe = now + self._next_probe_in_s(up=up)
-            left_s = self._suspect_after_s - self._asked.for_s(now)
+            left_s = self._suspect_after_s - self._probing.unheard_s(now)
             if left_s <= 0:
                 connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
                 break
-            often = _LOOK_EVERY_S if connection.watched else left_s
+            often = _LOOK_EVERY_S if connection.attempts.watched else left_s
             doubt_s = self._doubt(now)
             self._pause(min(next_probe - now, left_s, often, doubt_s))
             try:
@@ -334,8 +315,7 @@ class ZenohLink:
     def _flows(self, connection: Connection, now: float) -> bool:
         """See whether what is large moves: then nobody is silent. False where it stands still."""
         moved_s = connection.look(now)
-        for silence in (self._silence, self._asked):
-            silence.excuse(moved_s, now)
+        self._probing.excuse(moved_s, now)
         longest_s, shortest_s = self._suspect_after_s, self._dialer.settings.stall_after_s
         if connection.flow.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
             connection.lost_because = "it takes nothing more of what is sent"
@@ -347,13 +327,12 @@ class ZenohLink:
         Returns:
             In how many seconds to look again.
         """
-        silent_s = self._silence.for_s(now)
-        left_s = doubted_after_s(self._rtt_s) - silent_s
-        was, self._doubted = self._doubted, left_s <= 0
-        if self._doubted and not was and self._live is not None:
+        late, left_s = self._probing.late(now)
+        if late and self._live is not None:
+            silent_s = self._probing.silent_s(now)
             log.info("link_doubted replica=%s silent_s=%.2f", self._peer.id.short, silent_s)
             self._changed()
-        return left_s if left_s > 0 else self._suspect_after_s
+        return left_s
 
     def _next_probe_in_s(self, *, up: bool) -> float:
         if not up:
@@ -380,21 +359,12 @@ class ZenohLink:
         return self._renew.is_set()
 
     def _probe(self, connection: Connection, now: float) -> None:
-        self._asked.began(now)
-        self._silence.began(now)
-        known = self._probe_answer
+        known = self._probing.answer
         # Its types are asked for once a connection: it may be another process at each.
         describe = self._live is not connection or known is None or not known.types
         probe = Probe(self._dialer.robot, self._dialer.manager_age(), describe)
-
-        def heard(content: bytes) -> None:
-            self._heard.put(_Heard(connection, content, now, time.monotonic()))
-            self._wake.set()
-
         try:
-            connection.probe(
-                self._probe_key, probe_frames.encode_probe(probe), _PROBE_TIMEOUT_S, heard
-            )
+            self._probing.ask(connection, probe, now)
         except zenoh.ZError as error:
             connection.lost_because = f"sending failed: {error}"
             return
@@ -408,43 +378,26 @@ class ZenohLink:
             WireError: Another replica answers here, or nothing that can be read.
         """
         up = False
-        while True:
-            try:
-                heard = self._heard.get_nowait()
-            except Empty:
-                return up
-            if heard.connection is connection and connection.begin():
-                self._take(connection, heard)
+        for heard in self._probing.heard(connection):
+            if connection.begin():
+                known = self._probing.answer
+                self._answers(connection, known, self._probing.take(heard))
                 up = True
+        return up
 
-    def _take(self, connection: Connection, heard: _Heard) -> None:
-        id = self._peer.id
-        try:
-            answer = probe_frames.decode_probe_answer(heard.content)
-        except FrameError as error:
-            raise WireError(f"`{self._peer.endpoint}` answers probes with {error}") from error
-        if (answer.slot, answer.generation) != (id.slot, id.generation):
-            raise WireError(
-                f"`{self._peer.endpoint}` says that it is {answer.slot}.{answer.generation}, "
-                f"not {id.short}"
-            )
-        known = self._probe_answer
-        if not answer.types and known is not None and known.incarnation == answer.incarnation:
-            answer = replace(answer, types=known.types)
-        self._asked.ended()
-        self._silence.ended()
-        self._heard_at = heard.at
-        self._rtt_s = heard.at - heard.sent_at
-        news = self._live is not connection or answer != self._probe_answer
-        self._probe_answer = answer
+    def _answers(
+        self, connection: Connection, known: ProbeAnswer | None, answer: ProbeAnswer
+    ) -> None:
+        """A connection's replica has answered: from now on it is the live one."""
+        news = self._live is not connection or answer != known
         self._ready = answer.ready
-        connection.packs = ZLIB in answer.accepts
-        connection.packs_answers = ZLIB_ANSWERS in answer.accepts
+        connection.attempts.packs = ZLIB in answer.accepts
+        connection.attempts.packs_answers = ZLIB_ANSWERS in answer.accepts
         if self._live is not connection:
             self._state = LinkState.UP
             self._detail = ""
             self._live = connection
-            log.info("link_up replica=%s rtt_s=%.4f", id.short, self._rtt_s)
+            log.info("link_up replica=%s rtt_s=%.4f", self._peer.id.short, self._probing.rtt_s)
         if self._closed:  # by another thread, just now
             self._live, self._ready = None, frozenset()
         elif news:
@@ -461,7 +414,7 @@ class ZenohLink:
             log.warning("link_lost replica=%s reason=%r", self._peer.id.short,
                         connection.lost_because)  # fmt: skip
         if not self._closed:
-            self._silence.began(time.monotonic())
+            self._probing.nobody_to_ask(time.monotonic())
             self._say(connection.lost_because)
         connection.close()
         if was_up:
@@ -473,8 +426,7 @@ class ZenohLink:
         self._wake.wait(wanted_s)
         self._wake.clear()
         now = time.monotonic()
-        for silence in (self._silence, self._asked):
-            silence.excuse(now - self._woke_at - wanted_s, now)
+        self._probing.excuse(now - self._woke_at - wanted_s, now)
         self._woke_at = now
 
     def _say(self, detail: str) -> None:

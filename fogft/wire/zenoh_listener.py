@@ -17,9 +17,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
-from queue import SimpleQueue
 from typing import TypeVar
 
 import zenoh
@@ -28,21 +26,24 @@ from zenoh import handlers
 from fogft.core import names
 from fogft.core.errors import WireError
 from fogft.core.model import ReplicaId
-from fogft.core.record_set import RecordSet, Verdict
-from fogft.core.records import RecordError, SignedRecord
-from fogft.core.repeats import worth_logging
-from fogft.wire import batch_frames, config, frame, probe_frames, record_frames, sockets
-from fogft.wire.compression import ACCEPTED, unpack
+from fogft.core.record_set import RecordSet
+from fogft.wire import batch_frames, config, frame, sockets, zenoh_threads
+from fogft.wire.asides import Asides
+from fogft.wire.chores import Chores
+from fogft.wire.compression import unpack
 from fogft.wire.config import CredentialPaths, LinkSettings
+from fogft.wire.counters import Counters
 from fogft.wire.doorkeeper import Doorkeeper
-from fogft.wire.guests import Guests, NotAdmittedError
+from fogft.wire.guests import Guests
 from fogft.wire.handshakes import HandshakeLog
 from fogft.wire.leaving import see_off
 from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
-from fogft.wire.reply_queue import Counters, QueryTurns, Reply, ReplyQueues
+from fogft.wire.query_ends import QueryTurns
+from fogft.wire.replies import Reply
+from fogft.wire.reply_queue import ReplyQueues
 from fogft.wire.signing import LazyVerifier
 from fogft.wire.sockets import Address, address
-from fogft.wire.streams import Streams
+from fogft.wire.streams import Stream, Streams
 from fogft.wire.zenoh_incoming import ZenohIncoming
 
 log = logging.getLogger(__name__)
@@ -50,9 +51,6 @@ log = logging.getLogger(__name__)
 Heard = TypeVar("Heard", zenoh.Query, zenoh.Sample)
 
 _CLOSE_WAIT_S = 1.0
-_NO_REQUEST = bytes(names.REQUEST_ID_BYTES)
-_CHORES_LIMIT = 1024  # probes, records and recalls that wait; a robot has a few on the way
-_STRANGERS = b""  # in place of a token: replies to whose connection is not known
 
 
 class ZenohListener:
@@ -91,14 +89,21 @@ class ZenohListener:
             certificate_name or names.replica_certificate_name(id),
             LazyVerifier(credentials.ca),
         )
-        self._records = RecordSet(id.pool_uid, LazyVerifier(credentials.ca))
         self._counters = Counters()
         self._turns = QueryTurns()
         self._queues = ReplyQueues(self._counters, self._turns)
-        self._chores: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._chores = Chores(self._counters)
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
-        self._streams = Streams()
+        self._streams = Streams(slow=self._slow)
+        self._asides = Asides(
+            guests=self._guests,
+            records=RecordSet(id.pool_uid, LazyVerifier(credentials.ca)),
+            streams=self._streams,
+            queues=self._queues,
+            chores=self._chores,
+            counters=self._counters,
+        )
         self._services: dict[str, str] = {}  # key -> service
 
     @property
@@ -129,7 +134,7 @@ class ZenohListener:
                 f"cannot listen at `{self._endpoint}`: {str(error).split(' at /')[0]}",
                 "see that the port is free and that the certificate, its key and the CA exist",
             ) from error
-        threading.Thread(target=self._do_chores, name="fogft-probes", daemon=True).start()
+        self._chores.start()
         self._doorkeeper = Doorkeeper(
             self._port,
             self._peers,
@@ -142,10 +147,10 @@ class ZenohListener:
         place = self._id.pool_uid, self._id.slot
         self._hear(session, names.services_key(*place), partial(self._request, on_request))
         self._hear(session, names.cancel_key(*place), partial(self._cancel, on_cancel))
-        self._declare(session, names.answers_key(*place), self._open_answers)
-        self._declare(session, names.records_key(*place), self._heard_records)
+        self._declare(session, names.answers_key(*place), self._asides.open_answers)
+        self._declare(session, names.records_key(*place), self._asides.records)
         # Last: who is told that this replica is ready finds every service.
-        self._declare(session, names.probe_key(*place), partial(self._probe, on_probe))
+        self._declare(session, names.probe_key(*place), partial(self._asides.probe, on_probe))
 
     def add(self, services: Mapping[str, str]) -> None:
         """Hear requests for further services too (name -> key)."""
@@ -156,14 +161,19 @@ class ZenohListener:
         links = [] if session is None else session.info.links()
         return {address(link.dst): link.auth_identifier or "" for link in links}
 
-    def _thin(self, token: bytes) -> bool:
-        """Whether what a connection's robot is sent was seen to leave slowly."""
+    def _slow(self, holder: str) -> bool:
+        """Whether what a robot is sent was seen to leave slowly."""
         doorkeeper = self._doorkeeper
-        return doorkeeper is not None and self._guests.holder(token) in doorkeeper.thin
+        return doorkeeper is not None and holder in doorkeeper.thin
+
+    def _thin(self, token: bytes) -> bool:
+        return self._slow(self._guests.holder(token))
 
     def _count_handshakes(self) -> None:
         for reason in self._handshakes.refusals() if self._handshakes else ():
-            self._count("handshakes_refused", "handshake_refused", reason)
+            self._counters.warn(
+                log, "handshakes_refused", "handshake_refused reason=%r", str(reason)
+            )
 
     def _declare(
         self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query, int], None]
@@ -185,6 +195,7 @@ class ZenohListener:
 
         def guarded(one: Heard) -> None:
             turn = self._turns.came()
+            zenoh_threads.note()
             try:
                 heard(one, turn)
             except Exception:
@@ -204,17 +215,27 @@ class ZenohListener:
             else:
                 requests = [(frame.decode_request(head), sample.payload.to_bytes())]
         except frame.FrameError as error:
-            self._count("malformed", "request_malformed", error)
+            self._malformed(error)
             return
+        self._take_requests(on_request, str(sample.key_expr), requests)
         self._counters.add("requests", len(requests))
+
+    def _take_requests(
+        self,
+        on_request: Callable[[Incoming], None],
+        key: str,
+        requests: Sequence[tuple[frame.RequestHeader, bytes]],
+    ) -> None:
         token = requests[0][0].token
         stream = self._streams.of(token)
         if stream is None or not self._guests.admits(token):
-            self._count("not_admitted", "robot_not_admitted", "it did not greet")
+            self._counters.warn(
+                log, "not_admitted", "robot_not_admitted reason=%r", "it did not greet"
+            )
             if stream is not None:
                 self._refuse_all(requests, stream, Refusal.NOT_ADMITTED)
             return
-        service = self._services.get(str(sample.key_expr))
+        service = self._services.get(key)
         if service is None:
             self._refuse_all(requests, stream, Refusal.NOT_READY)
             return
@@ -222,7 +243,7 @@ class ZenohListener:
             try:
                 request = unpack(payload) if header.packed else payload
             except ValueError as error:
-                self._count("malformed", "request_malformed", error)
+                self._malformed(error)
                 self._refuse(header, stream, Refusal.MALFORMED)
                 continue
             incoming = ZenohIncoming(
@@ -240,148 +261,31 @@ class ZenohListener:
                 self._counters.add("failed")
                 log.exception("request_not_taken service=%s", service)
                 incoming.refuse(Refusal.LOST)
+        stream.seen(requests[0][0].seen)
 
     def _refuse_all(
-        self, requests: list[tuple[frame.RequestHeader, bytes]], stream: zenoh.Query, reason: str
+        self, requests: Sequence[tuple[frame.RequestHeader, bytes]], stream: Stream, reason: str
     ) -> None:
         for header, _ in requests:
             self._refuse(header, stream, reason)
 
-    def _refuse(self, header: frame.RequestHeader, stream: zenoh.Query, reason: str) -> None:
-        self._queues.put(header.token, header.robot, Reply(stream, header.request_id, b"", reason))
+    def _refuse(self, header: frame.RequestHeader, stream: Stream, reason: str) -> None:
+        self._queues.put(
+            header.token, header.robot, Reply(stream, header.request_id, b"", reason), more=True
+        )
 
-    def _open_answers(self, query: zenoh.Query, turn: int) -> None:
-        attachment = query.attachment
-        try:
-            greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
-        except frame.FrameError as error:
-            self._malformed(error, query, turn)
-            return
-        if not self._guests.admits(greeting.token):
-            refused = Reply(query, _NO_REQUEST, b"", Refusal.NOT_ADMITTED, turn=turn)
-            self._turn_away(refused, "it did not greet")
-            return
-        for token, ended in self._streams.opened(greeting.token, query):
-            reply = Reply(ended, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
-            self._queues.put(token, "gone", reply)
-
-    def _probe(
-        self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query, turn: int
-    ) -> None:
-        self._counters.add("probes")
-        attachment = query.attachment
-        try:
-            probe = probe_frames.decode_probe(query.payload.to_bytes() if query.payload else b"")
-            greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
-        except frame.FrameError as error:
-            self._malformed(error, query, turn)
-            return
-        answer = partial(self._answer_probe, on_probe, probe, greeting, query, turn)
-        self._do_later(answer, query, turn)
-
-    def _do_later(self, chore: Callable[[], None], query: zenoh.Query, turn: int) -> None:
-        """Have the probe thread do something; where too much waits for it, the query just ends."""
-        if self._chores.qsize() < _CHORES_LIMIT:
-            self._chores.put(chore)
-            return
-        self._counters.add("chores_dropped")
-        ended = Reply(query, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
-        self._queues.put(_STRANGERS, "strangers", ended)
-
-    def _turn_away(self, refused: Reply, why: str) -> None:
-        self._count("not_admitted", "robot_not_admitted", why)
-        self._queues.put(_STRANGERS, "strangers", refused)
+    def _malformed(self, error: ValueError) -> None:
+        self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
 
     def _cancel(self, on_cancel: Callable[[Sequence[bytes]], None], sample: zenoh.Sample) -> None:
         self._counters.add("cancellations")
         try:
             ids = frame.decode_cancel(sample.payload.to_bytes())
         except frame.FrameError as error:
-            self._count("malformed", "request_malformed", error)
+            self._malformed(error)
             return
-        if self._chores.qsize() < _CHORES_LIMIT:
-            self._chores.put(partial(on_cancel, ids))
-
-    def _heard_records(self, query: zenoh.Query, turn: int) -> None:
-        self._counters.add("records")
-        attachment = query.attachment
-        try:
-            greeting = frame.decode_greeting(attachment.to_bytes() if attachment else b"")
-            offered = record_frames.unpack(query.payload.to_bytes() if query.payload else b"")
-        except (frame.FrameError, RecordError) as error:
-            self._malformed(error, query, turn)
-            return
-        self._do_later(partial(self._take_records, greeting, offered, query, turn), query, turn)
-
-    def _malformed(self, error: ValueError, query: zenoh.Query, turn: int) -> None:
-        self._count("malformed", "request_malformed", error)
-        refused = Reply(query, _NO_REQUEST, b"", Refusal.MALFORMED, turn=turn)
-        self._queues.put(_STRANGERS, "strangers", refused)
-
-    def _count(self, event: str, message: str, reason: object) -> None:
-        count = self._counters.add(event)
-        if worth_logging(count):
-            log.warning("%s reason=%r count=%d", message, str(reason), count)
-
-    # -- the probe thread -----------------------------------------------------------------
-
-    def _take_records(
-        self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query, turn: int
-    ) -> None:
-        """Judge records by their own signatures: whoever brings them has no say in them."""
-        if not self._greeted(greeting, query, turn):
-            return
-        try:
-            for one in offered:
-                verdict = self._records.offer(one)
-                if verdict is Verdict.REFUSED:
-                    self._counters.add("records_refused")
-                    log.warning("record_refused reason=%r", self._records.last_refusal)
-                elif verdict is Verdict.OLDER:
-                    self._counters.add("records_older")
-            query.reply(query.key_expr, b"")
-        finally:
-            self._end_aside(greeting, query, turn)
-        self.revoke(self._records.revoked)
-
-    def _answer_probe(
-        self,
-        on_probe: Callable[[Probe], ProbeAnswer],
-        probe: Probe,
-        greeting: frame.Greeting,
-        query: zenoh.Query,
-        turn: int,
-    ) -> None:
-        if not self._greeted(greeting, query, turn):
-            return
-        try:
-            answer = replace(on_probe(probe), accepts=ACCEPTED)
-            content = probe_frames.encode_probe_answer(answer)
-            query.reply(query.key_expr, content, express=True)
-        finally:
-            self._end_aside(greeting, query, turn)
-
-    def _greeted(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> bool:
-        """Whether this is somebody who is let in; else it is told why not."""
-        try:
-            self._guests.greet(greeting)
-        except NotAdmittedError as error:
-            self._turn_away(Reply(query, _NO_REQUEST, b"", error.refusal, turn=turn), str(error))
-            return False
-        return True
-
-    def _end_aside(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> None:
-        """End a query in its robot's own thread: unlike the answer, that queues behind replies."""
-        ended = Reply(query, _NO_REQUEST, b"", "", turn=turn, ends_only=True)
-        self._queues.put(greeting.token, "probe", ended)
-
-    def _do_chores(self) -> None:
-        while (chore := self._chores.get()) is not None:
-            try:
-                chore()
-            except Exception:
-                self._counters.add("failed")
-                log.exception("probe_not_answered")
+        if not self._chores.offer(partial(on_cancel, ids)):
+            self._counters.add("chores_dropped")
 
     # -- the owner ------------------------------------------------------------------------
 
@@ -408,7 +312,7 @@ class ZenohListener:
             self._doorkeeper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)
         sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
-        self._chores.put(None)
+        self._chores.close()
         closer = threading.Thread(
             target=_close, args=(session,), name="fogft-close-listener", daemon=True
         )

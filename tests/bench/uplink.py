@@ -25,14 +25,17 @@ def uplink(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     ]
 
 
-def of_pool(folder: Path, replicas: int, requests: int) -> dict[str, Any]:
-    """Return bytes per request as a multiple of the payload, both ways of asking."""
+def of_pool(folder: Path, replicas: int, requests: int, *, delay_s: float = 0.0) -> dict[str, Any]:
+    """Return bytes per request as a multiple of the payload, both ways of asking.
+
+    A service that answers at once (`delay_s`) saves a robot what has not left it by then.
+    """
     folder.mkdir()
     pool = GatewayPool(folder, timeout_s=60.0)
     relays: list[CountingRelay] = []
     try:
         for slot in range(replicas):
-            pool.replica(slot)
+            pool.replica(slot, delay_s=delay_s)
             relays.append(CountingRelay(pool.endpoint(slot)))
         gateway = pool.gateway("edge")
         relay = CountingRelay(gateway.endpoint())

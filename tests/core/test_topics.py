@@ -6,8 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.core.goals import Goals, cancel_request, goal_of, is_success, is_unknown, merged
-from fogft.core.spec import Part
 from fogft.core.topic_queues import Outbox, Ring, Seen
 from fogft.core.topic_select import QUIET_LIMIT_S, QUIET_S, Selection
 from fogft.core.topics import Origin, Select, TopicSpec, from_plain, to_plain
@@ -168,46 +166,3 @@ def test_a_configuration_says_all_of_a_topic(select):
     }  # fmt: skip
     with pytest.raises(ValueError):
         from_plain({**to_plain(topic), "depth": 0.5})
-
-
-def test_a_goal_is_known_by_the_id_that_its_client_gave_it():
-    request = b"\0\1\0\0" + b"i" * 16 + b"\5\0\0\0"
-    assert goal_of(request) == b"i" * 16
-    assert goal_of(cancel_request(b"i" * 16)) == b"i" * 16
-    assert len(cancel_request(b"i" * 16)) == 4 + 16 + 8
-
-
-@pytest.mark.parametrize(
-    ("part", "response", "success"),
-    [
-        (Part.GOAL, b"\0\1\0\0\1", True),
-        (Part.GOAL, b"\0\1\0\0\0", False),
-        (Part.RESULT, b"\0\1\0\0\4", True),
-        (Part.RESULT, b"\0\1\0\0\5", False),
-        (Part.RESULT, b"\0\1\0\0\0", False),
-        (Part.CANCEL, b"\0\1\0\0\0\0\0\0\1\0\0\0", True),
-        (Part.CANCEL, b"\0\1\0\0\0\0\0\0\0\0\0\0", False),
-        (Part.CANCEL, b"\0\1\0\0\1\0\0\0\1\0\0\0", False),
-        (Part.CANCEL, b"", False),
-    ],
-)
-def test_what_a_success_is(part, response, success):
-    assert is_success(part, response) is success
-    assert not is_unknown(b"\0\1\0\0\4")
-
-
-def test_only_goals_whose_result_is_awaited_are_under_way():
-    """One whose client went away would otherwise begin anew on each replica that comes."""
-    goals, request = Goals(), b"\0\1\0\0" + b"i" * 16
-    goals.awaited(b"i" * 16)
-    goals.accepted(request)
-    assert goals.requests == ()
-    goals.awaited(b"i" * 16)
-    assert goals.requests == (request,)
-    goals.ended(b"i" * 16)
-    assert goals.requests == ()
-
-
-def test_a_goals_status_is_the_furthest_that_a_replica_gives_it():
-    said = {0: {b"a": 6, b"b": 2, b"c": 5}, 1: {b"a": 2, b"b": 4}, 2: {b"c": 6}}
-    assert merged(said) == {b"a": 2, b"b": 4, b"c": 5}

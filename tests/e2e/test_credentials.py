@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.pool import Client, Machine, Pool
+from tests.freezing import freeze
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
 
@@ -44,7 +45,7 @@ def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
     result = second.result()
     assert result["requests"] > 80
     assert flawless(result), result
-    os.kill(ada.process.pid, signal.SIGSTOP)  # a frozen robot holds nobody up
+    freeze(ada.process.pid)  # a frozen robot holds nobody up
     assert "is taken back" in pool_said(pool, "credentials", "rotate", "robot")
     os.kill(ada.process.pid, signal.SIGCONT)
     pool.wait(lambda: [link["state"] for link in links(ada)] == ["up", "up"])

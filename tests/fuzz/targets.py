@@ -41,7 +41,7 @@ UID = "0123456789abcdef"
 ROBOT = f"robot.ada.1.{UID}"
 REPLICA = f"replica.0.1.{UID}"
 MANAGER = f"manager.manager.1.{UID}"
-ID, TOKEN = bytes(range(16)), bytes(8)
+ID, TOKEN, STAMP = bytes(range(16)), bytes(8), b"seen"
 
 
 @dataclass(frozen=True)
@@ -233,6 +233,7 @@ def targets() -> dict[str, Target]:
                     ID,
                     1.5,
                     frame.origin("ada", TOKEN),
+                    seen=STAMP,
                     packed=True,
                     may_pack=True,
                     reads_packed=True,
@@ -240,7 +241,7 @@ def targets() -> dict[str, Target]:
             ),
         ),
         "batch of requests": Target(
-            lambda data: batch_frames.decode_requests(data[:12], data[12:]),
+            lambda data: batch_frames.decode_requests(data[:16], data[16:]),
             framed,
             (
                 b"".join(
@@ -251,12 +252,12 @@ def targets() -> dict[str, Target]:
             ),
         ),
         "batch of answers": Target(
-            lambda data: batch_frames.decode_answers(data[:1], data[1:]),
+            lambda data: batch_frames.decode_answers(data[:5], data[5:]),
             framed,
-            (b"".join(batch_frames.encode_answers([(ID, b"x", ""), (ID, b"", "lost")])),),
+            (b"".join(batch_frames.encode_answers(STAMP, [(ID, b"x", ""), (ID, b"", "lost")])),),
         ),
-        "answer": Target(frame.decode_answer, framed, (frame.encode_answer(ID),)),
-        "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(ID, "lost"),)),
+        "answer": Target(frame.decode_answer, framed, (frame.encode_answer(STAMP, ID),)),
+        "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(STAMP, ID, "lost"),)),
         "cancel": Target(frame.decode_cancel, framed, (frame.encode_cancel([ID, ID]),)),
         "probe": Target(
             probe_frames.decode_probe, framed, (probe_frames.encode_probe(Probe("ada", 1.0)),)

@@ -131,8 +131,9 @@ class FakeIncoming:
         self.remaining_s = remaining_s
         self.outcome: list[Any] = []
 
-    def reply(self, payload: bytes) -> None:
+    def reply(self, payload: bytes, *, more: bool = False) -> None:
         self.outcome.append(payload)
+        self.more = more
 
     def refuse(self, reason: str) -> None:
         self.outcome.append(f"refused {reason}")

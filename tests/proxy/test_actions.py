@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from fogft.core.goals import cancel_request, goal_of
+import pytest
+
+from fogft.core.goals import Goals, cancel_request, goal_of
 from fogft.core.spec_topics import action_services
 from fogft.proxy.actions import Actions
 from tests.proxy.fakes import Clock, FakeLink
@@ -167,3 +169,295 @@ def test_a_result_of_a_goal_that_nobody_knows_is_told_as_such():
     scene.ask("result", HEADER + ID)
     scene.say(0, UNKNOWN, "result")
     assert scene.answers == [("result", UNKNOWN)]
+
+
+def left_of(known: Goals) -> dict[str, Any]:
+    """Return what it keeps, without the ids of requests whose answers may still come."""
+    return {name: kept for name, kept in vars(known).items() if name != "_over"}
+
+
+def latest(link: FakeLink, name: str) -> int:
+    return max(i for i, offered in enumerate(link.offered) if offered[0] == name)
+
+
+def crash(scene: Scene, slot: int = 0) -> None:
+    """Its command dies, with the request for the result."""
+    link = scene.links[slot]
+    scene.parts["result"].answered(link, link.refusal("crashed", latest(link, RESULT.name)))
+
+
+def test_a_newcomer_that_does_not_take_the_goal_now_is_given_it_again():
+    """It is overloaded, or its window is full; then the first replica is gone."""
+    scene = Scene(1)
+    scene.accept()
+    late = FakeLink(7)
+    scene.links = [late]
+    scene.route(late)
+    refusal = late.refusal("overloaded", latest(late, GOAL.name))
+    scene.parts["goal"].answered(late, refusal)
+    scene.tick(1.0)
+    assert len(scene.given(late, "goal")) == 2
+    full = FakeLink(8, room=0)
+    scene.links = [full]
+    scene.route(full)
+    full.room = 1000
+    scene.tick(1.0)
+    assert len(scene.given(full, "goal")) == 1
+    scene.say(0, ACCEPTED, "goal")
+    scene.say(0, SUCCEEDED, "result")
+    assert scene.answers[1:] == [("result", SUCCEEDED)]
+
+
+def test_a_replica_that_had_no_room_when_the_goal_was_made_is_given_it_later():
+    scene = Scene(2)
+    scene.links[1].room = 0
+    scene.accept()
+    assert scene.given(scene.links[1], "goal") == []
+    scene.links[1].room = 1000
+    scene.tick(1.0)
+    assert scene.given(scene.links[1], "goal") == [HEADER + ID + b"5"]
+
+
+def test_a_goal_whose_result_every_replica_has_dropped_is_told_as_such():
+    """Not asked for again and again until the client's patience ends."""
+    scene = Scene(2)
+    scene.accept()
+    scene.clock.now += 1.0
+    scene.say(1, ACCEPTED, "goal")
+    scene.say(0, UNKNOWN, "result")
+    scene.say(1, UNKNOWN, "result")  # it may not have known the goal when it was asked
+    assert len(scene.answers) == 1
+    scene.tick(1.0)
+    assert [len(scene.given(link, "result")) for link in scene.links] == [1, 2]
+    scene.say(1, UNKNOWN, "result")
+    assert scene.answers[1:] == [("result", UNKNOWN)]
+
+
+def test_who_refused_the_goal_is_asked_once_and_who_comes_next_is_given_it():
+    scene = Scene(1)
+    scene.accept()
+    busy, willing = FakeLink(7), FakeLink(8)
+    scene.links = [busy]
+    scene.route(busy)
+    scene.say(0, REFUSED, "goal")
+    for _ in range(20):
+        scene.say(0, UNKNOWN, "result")
+        scene.tick(1.0)
+    assert len(scene.given(busy, "result")) == 1
+    assert len(scene.given(busy, "goal")) == 1
+    scene.links = [willing]
+    scene.route(busy, willing)
+    scene.say(0, ACCEPTED, "goal")
+    scene.say(0, SUCCEEDED, "result")
+    assert scene.answers[1:] == [("result", SUCCEEDED)]
+
+
+def test_a_replica_whose_command_crashed_is_given_the_goal_again():
+    """Its link has not even noticed."""
+    scene = Scene(1)
+    scene.accept()
+    crash(scene)
+    scene.tick(1.0)
+    assert len(scene.given(scene.links[0], "goal")) == 2
+    scene.say(0, ACCEPTED, "goal")
+    scene.tick(1.0)
+    scene.say(0, SUCCEEDED, "result")
+    assert scene.answers[1:] == [("result", SUCCEEDED)]
+
+
+def test_a_goal_that_nobody_took_in_time_leaves_nothing_behind():
+    scene = Scene(1)
+    scene.ask("goal", HEADER + ID)
+    scene.tick(6.0)
+    scene.ask("goal", HEADER + b"j" * 16)
+    scene.say(0, REFUSED, "goal")
+    assert left_of(scene.parts["goal"]._shared.goals) == left_of(Goals())
+
+
+def test_a_replica_whose_command_crashed_often_is_asked_once_it_has_begun_anew():
+    scene = Scene(1)
+    scene.accept()
+    for _ in range(4):
+        crash(scene)
+        scene.tick(1.0)
+        scene.say(0, ACCEPTED, "goal")
+        scene.tick(1.0)
+    scene.say(0, SUCCEEDED, "result")
+    assert scene.answers[1:] == [("result", SUCCEEDED)]
+
+
+def test_a_replica_that_refused_and_comes_back_willing_is_asked_for_the_result():
+    scene = Scene(2)
+    scene.accept()
+    scene.say(1, REFUSED, "goal")
+    scene.say(1, UNKNOWN, "result")
+    first, second = scene.links
+    scene.route(first)
+    scene.route(first, second)
+    scene.say(1, ACCEPTED, "goal")
+    scene.route(second)
+    scene.tick(1.0)
+    scene.say(1, SUCCEEDED, "result")
+    assert scene.answers[1:] == [("result", SUCCEEDED)]
+
+
+def cancelling(*ids: bytes) -> bytes:
+    """Return a response that names these goals, as CDR has it."""
+    return HEADER + b"\0\0\0\0" + bytes([len(ids), 0, 0, 0]) + b"".join(i + bytes(8) for i in ids)
+
+
+def test_a_goal_that_was_cancelled_is_begun_on_nobody_else():
+    """Neither on who had no room when it was made, nor on who comes later."""
+    scene = Scene(2)
+    scene.links[1].room = 0
+    scene.accept()
+    scene.ask("cancel", cancel_request(ID))
+    scene.say(0, cancelling(b"other goal id...", ID), "cancel")
+    scene.say(0, CANCELED, "result")
+    scene.links[1].room = 1000
+    late = FakeLink(7)
+    scene.links.append(late)
+    scene.route(*scene.links)
+    scene.tick(10.0)
+    for slot in (1, 2):
+        assert scene.given(scene.links[slot], "goal") == []
+        scene.say(slot, UNKNOWN, "result")
+    assert scene.answers[-1] == ("result", CANCELED)
+
+
+def test_who_takes_a_goal_that_was_cancelled_or_is_over_is_told_to_cancel_it():
+    for over in (False, True):
+        scene = Scene(2)
+        scene.accept()
+        if over:
+            scene.say(0, SUCCEEDED, "result")
+            scene.tick()
+        else:
+            scene.ask("cancel", cancel_request(ID))
+            scene.say(0, cancelling(ID), "cancel")
+        before = len(scene.given(scene.links[1], "cancel"))
+        scene.say(1, ACCEPTED, "goal")
+        scene.tick()
+        assert scene.given(scene.links[1], "cancel")[before:] == [cancel_request(ID)]
+
+
+def test_goals_of_an_action_that_is_another_one_now_are_given_to_nobody():
+    scene = Scene(1)
+    scene.accept()
+    for part in scene.parts.values():
+        part.close()
+    late = FakeLink(7)
+    scene.route(late)
+    scene.tick(10.0)
+    assert scene.given(late, "goal") == []
+
+
+def test_a_goal_that_a_replica_cannot_read_is_not_given_to_it_again():
+    scene = Scene(2)
+    scene.accept()
+    link = scene.links[1]
+    scene.parts["goal"].answered(link, link.refusal("malformed", latest(link, GOAL.name)))
+    scene.tick(60.0)
+    assert len(scene.given(link, "goal")) == 1
+
+
+def test_a_result_that_is_turned_away_is_awaited_by_nobody():
+    scene = Scene(1)
+    scene.ask("goal", HEADER + ID)
+    scene.say(0, ACCEPTED, "goal")
+    scene.parts["result"]._max_pending = 0
+    scene.ask("result", HEADER + ID)
+    late = FakeLink(7)
+    scene.route(late)
+    assert scene.given(late, "goal") == []
+
+
+def test_who_does_not_look_at_a_goal_is_left_alone_for_longer_each_time():
+    scene = Scene(2)
+    scene.accept()
+    link = scene.links[1]
+    refused = 0
+    for _ in range(200):  # in 20 s
+        if len(scene.given(link, "goal")) > refused:
+            refused += 1
+            scene.parts["goal"].answered(link, link.refusal("overloaded", latest(link, GOAL.name)))
+        scene.tick(0.1)
+    assert 4 <= len(scene.given(link, "goal")) <= 8
+
+
+def test_a_goal_that_is_made_while_nobody_is_there_outlives_who_takes_it_first():
+    scene = Scene(1)
+    (link,) = scene.links
+    scene.route()
+    scene.ask("goal", HEADER + ID + b"5")
+    scene.route(link)
+    scene.say(0, ACCEPTED, "goal")
+    scene.ask("result", HEADER + ID)
+    scene.links = [FakeLink(7)]
+    scene.route(*scene.links)
+    scene.say(0, ACCEPTED, "goal")
+    scene.say(0, SUCCEEDED, "result")
+    assert scene.answers[-1] == ("result", SUCCEEDED)
+
+
+def cancel_accepted(scene: Scene) -> None:
+    """The first replica cancels the goal."""
+    scene.ask("cancel", cancel_request(ID))
+    scene.say(0, cancelling(ID), "cancel")
+
+
+@pytest.mark.parametrize("away", ["link", "room", "refuses"])
+def test_a_cancellation_reaches_who_was_away_for_a_moment(away):
+    scene = Scene(2)
+    scene.accept()
+    first, second = scene.links
+    scene.say(1, ACCEPTED, "goal")
+    if away == "link":
+        scene.route(first)
+    second.room = 0 if away == "room" else 1000
+    cancel_accepted(scene)
+    if away == "refuses":
+        refusal = second.refusal("overloaded", latest(second, CANCEL.name))
+        scene.parts["cancel"].answered(second, refusal)
+    before = len(scene.given(second, "cancel"))
+    second.room = 1000
+    scene.route(first, second)
+    for _ in range(10):
+        scene.tick(0.1)
+    assert scene.given(second, "cancel")[before:] == [cancel_request(ID)]
+    assert len(scene.given(first, "cancel")) == 1
+
+
+@pytest.mark.parametrize("away", ["link", "room"])
+def test_a_loser_is_told_once_it_is_there(away):
+    scene = Scene(2)
+    scene.accept()
+    first, second = scene.links
+    scene.say(1, ACCEPTED, "goal")
+    if away == "link":
+        scene.route(first)
+    second.room = 0 if away == "room" else 1000
+    scene.say(0, SUCCEEDED, "result")
+    scene.tick(1.0)
+    assert scene.given(second, "cancel") == []
+    second.room = 1000
+    scene.route(first, second)
+    scene.tick(1.0)
+    assert scene.given(second, "cancel") == [cancel_request(ID)]
+    scene.tick(1.0)
+    assert len(scene.given(second, "cancel")) == 1
+
+
+def test_who_never_comes_back_is_not_told_for_ever():
+    scene = Scene(2)
+    scene.accept()
+    first, second = scene.links
+    scene.say(1, ACCEPTED, "goal")
+    scene.route(first)
+    scene.say(0, SUCCEEDED, "result")
+    for _ in range(70):
+        scene.tick(1.0)
+    assert not scene.parts["cancel"]._shared.to_cancel
+    scene.route(first, second)
+    scene.tick(1.0)
+    assert scene.given(second, "cancel") == []

@@ -8,7 +8,7 @@ from fogft.core.advertising import HOLD_S
 from fogft.core.definitions import Definition
 from fogft.core.errors import RosError
 from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.spec import ServiceSpec
+from fogft.core.spec import Part, ServiceSpec
 from fogft.proxy.client import ClientProxy
 from fogft.proxy.dispatcher import Dispatcher
 from fogft.wire.port import ProbeAnswer, Refusal
@@ -97,6 +97,16 @@ def test_a_draining_replica_is_spared_while_another_can_answer(by):
     scene.ready(*scene.dialer.links)
     scene.ask()
     assert [len(link.offered) for link in scene.dialer.links] == [0, 1]
+
+
+def test_a_draining_replica_is_told_to_cancel_too():
+    """It may be the one that works on the goal."""
+    scene = Scene()
+    scene.proxy.serve([ServiceSpec("/s", SET_BOOL, part=Part.CANCEL)])
+    scene.follow(member(0, draining=True), member(1))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    assert [len(link.offered) for link in scene.dialer.links] == [1, 1]
 
 
 def test_a_draining_replica_answers_when_it_is_the_last():

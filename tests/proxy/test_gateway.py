@@ -146,9 +146,9 @@ def test_only_a_gateways_certificate_will_do(pool):
 @pytest.mark.parametrize("replicas", [1, 2, 4])
 def test_the_uplink_carries_each_request_once(tmp_path, replicas):
     """At most 1.05 times the payload, whatever the number of replicas; probes are counted."""
-    found = uplink.of_pool(tmp_path / "pool", replicas, 50)
+    found = uplink.of_pool(tmp_path / "pool", replicas, 50, delay_s=0.5)
     assert found["through_a_gateway"] <= 1.05
-    if replicas > 1:  # a loser may be stopped before all of it has left
+    if replicas > 1:  # on a busy machine a loser may be stopped before all of it has left
         assert found["directly"] > 1.5
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from fogft.ros import environment
 from tests.cloud.fake_metadata import serving
+from tests.freezing import freeze
 from tests.proxy.by_hand import LIMIT_S, Caller, Parts, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
@@ -59,7 +60,7 @@ def test_a_frozen_robot_does_not_hold_up_a_live_one(parts, call):
     frozen, live = parts.robot("frozen", replica), parts.robot("live", replica)
     caller, other = call(live), call(frozen)
     other.ask(50)
-    os.kill(frozen.process.pid, signal.SIGSTOP)
+    freeze(frozen.process.pid)
     for _ in range(200):
         caller.ask()
         caller.spin(0.005)
@@ -125,7 +126,7 @@ def test_a_machine_that_is_told_of_its_end_gets_no_more_requests(parts, call):
         metadata.action = {"action": "terminate", "time": "2026-01-01T00:02:00Z"}
         wait_for(lambda: robot.links()[0]["draining"], "the notice")
         assert caller.all_answered()
-        told.process.send_signal(signal.SIGSTOP)  # whoever is asked now, it is not this one
+        freeze(told.process.pid)  # whoever is asked now, it is not this one
         caller.ask(100)
         assert caller.all_answered()
         assert robot.links()[0]["in_flight"] == 0

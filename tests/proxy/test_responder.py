@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -40,6 +41,28 @@ def test_a_request_is_run_and_answered():
     assert scene.responder.in_flight == 0
 
 
+def test_only_an_answer_beside_which_nothing_is_at_work_leaves_alone():
+    scene = Scene()
+    first, second = scene.ask(A), scene.ask(B)
+    scene.answer(0)
+    scene.answer(1)
+    assert (first.more, second.more) == (True, False)
+
+
+def test_an_answer_leaves_before_it_is_counted_and_makes_room_after():
+    """The robot does not wait for our numbers; what it sends next is passed on all the same."""
+    scene = Scene(limits={"/s": 1})
+    first, second = scene.ask(A), scene.ask(B)
+    ran_s: list[float] = []
+    first.reply = lambda payload, more: ran_s.append(scene.responder.ran_s)
+    scene.clock.now += 1.0
+    scene.answer(0)
+    assert (ran_s, scene.responder.ran_s) == ([0.0], 1.0)
+    scene.answer(1)
+    assert second.outcome == [b"r"]
+    assert scene.responder.in_flight == 0
+
+
 def test_a_copy_joins_the_work_in_progress():
     scene = Scene()
     first, copy = scene.ask(A), scene.ask(A)
@@ -48,12 +71,71 @@ def test_a_copy_joins_the_work_in_progress():
     assert scene.responder.ran == 1
 
 
+def test_a_reply_that_cannot_be_sent_keeps_no_room():
+    """What waits for it goes on, and the next requests too."""
+    scene = Scene(limits={"/s": 1})
+    first, second = scene.ask(A), scene.ask(B)
+
+    def fail(payload: bytes, *, more: bool = False) -> None:
+        raise RuntimeError("can't start new thread")
+
+    first.reply = fail
+    with pytest.raises(RuntimeError, match="thread"):
+        scene.answer(0)
+    scene.answer(1)
+    assert second.outcome == [b"r"]
+    assert scene.responder.in_flight == 0
+
+
+def test_whoever_waits_behind_a_request_that_ros_refuses_does_not_wait_longer():
+    """It came while that was being passed on."""
+    scene = Scene(limits={"/s": 1})
+    call, waiting = scene.client.call, []
+
+    def refuse(payload: bytes, on_response) -> int:
+        scene.client.call = call
+        waiting.append(scene.ask(B))
+        raise RosError("its queue is full")
+
+    scene.client.call = refuse
+    assert scene.ask(A).outcome == ["refused overloaded"]
+    scene.answer(0)
+    assert waiting[0].outcome == [b"r"]
+
+
+def test_deadlines_of_what_was_forgotten_do_not_pile_up():
+    """An id that is run anew, again and again, and more ids than are kept."""
+    scene = Scene(passing=lambda service, answer: answer == b"not yet", kept_ids=10)
+    for n in range(5000):
+        scene.ask(A, remaining_s=3600.0)
+        scene.answer(n, b"not yet")
+    for n in range(5000):
+        scene.ask(n.to_bytes(16, "big"), remaining_s=3600.0)
+        scene.answer(5000 + n)
+    assert len(scene.responder._deadlines["/s"]) < 1200
+    scene.clock.now += 3601.0
+    scene.responder.tick()
+    assert not scene.responder._deadlines["/s"]
+    assert not scene.responder._work
+
+
 def test_a_copy_of_finished_work_gets_the_kept_answer():
     scene = Scene()
     scene.ask(A)
     scene.answer(0, b"r")
     assert scene.ask(A).outcome == [b"r"]
     assert len(scene.client.calls) == 1
+
+
+def test_an_answer_for_the_moment_is_not_kept_and_a_copy_is_run_anew():
+    scene = Scene(passing=lambda service, answer: answer == b"not yet")
+    first = scene.ask(A)
+    scene.answer(0, b"not yet")
+    copy = scene.ask(A)
+    assert (first.outcome, copy.outcome) == ([b"not yet"], [])
+    scene.answer(1, b"r")
+    assert (copy.outcome, scene.ask(A).outcome) == ([b"r"], [b"r"])
+    assert (scene.responder.in_flight, len(scene.client.calls)) == (0, 2)
 
 
 def test_a_copy_whose_answer_is_no_longer_kept_is_refused_not_run_again():

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from fogft.core.model import ReplicaId
+from fogft.core.service_form import REPLICA_KEYS, from_plain, to_plain
 from fogft.core.spec import ServiceSpec
+from fogft.core.spec_topics import action_services
 from fogft.proxy.server import ServerProxy
 from fogft.wire.port import Probe
 from tests.proxy.fakes import UID, Clock, FakeIncoming, FakeListener, FakeNode, FakeSupervisor
 
+HEADER = b"\0\1\0\0"
+ACCEPTED, UNKNOWN, SUCCEEDED = HEADER + b"\1", HEADER + b"\0", HEADER + b"\4"
+
 
 class Scene:
-    def __init__(self) -> None:
+    def __init__(self, *services: ServiceSpec) -> None:
         self.clock = Clock()
         self.listener = FakeListener()
         self.supervisor = FakeSupervisor()
         self.nodes: list[FakeNode] = []
         self.proxy = ServerProxy(
             ReplicaId(UID, 2, 3),
-            (ServiceSpec("/s", "std_srvs/srv/SetBool"),),
+            services or (ServiceSpec("/s", "std_srvs/srv/SetBool"),),
             self.listener,
             self.make_node,
             self.supervisor,  # type: ignore[arg-type]
@@ -174,3 +179,70 @@ def test_close_stops_the_command_and_leaves_the_wire_and_ros():
     assert scene.listener.closed
     assert scene.nodes[-1].closed
     assert incoming.outcome == ["refused crashed"]
+
+
+def action() -> Scene:
+    """A replica that offers an action, of which it knows what the manager writes for it."""
+    parts = action_services("/count", "p/action/T", 5.0, 60.0)
+    told = [from_plain(to_plain(part, REPLICA_KEYS)) for part in parts]
+    scene = Scene(*told)
+    scene.proxy.run_once()
+    return scene
+
+
+def test_a_result_of_a_goal_that_is_not_known_yet_is_not_kept_for_copies():
+    scene = action()
+    name = "/count/_action/get_result"
+    for answer in (UNKNOWN, SUCCEEDED):
+        incoming = FakeIncoming(b"a" * 16, HEADER + b"g" * 16, service=name)
+        scene.listener.on_request(incoming)
+        scene.nodes[-1].clients[name].calls[-1][1](answer)
+        assert incoming.outcome == [answer]
+    kept = FakeIncoming(b"a" * 16, HEADER + b"g" * 16, service=name)
+    scene.listener.on_request(kept)
+    assert kept.outcome == [SUCCEEDED]
+    assert len(scene.nodes[-1].clients[name].calls) == 2
+
+
+def test_a_goal_is_given_once_to_each_life_of_the_command():
+    scene = action()
+    name = "/count/_action/send_goal"
+
+    def give(number: int) -> FakeIncoming:
+        incoming = FakeIncoming(bytes([number]) * 16, HEADER + b"g" * 16, service=name)
+        scene.listener.on_request(incoming)
+        return incoming
+
+    def calls() -> int:
+        return len(scene.nodes[-1].clients[name].calls)
+
+    first = give(1)
+    scene.nodes[-1].clients[name].calls[0][1](ACCEPTED)
+    assert first.outcome == give(2).outcome == [ACCEPTED]
+    assert calls() == 1
+    scene.nodes[-1].clients[name].there = False  # the server alone is gone for a moment
+    scene.proxy.run_once()
+    scene.nodes[-1].clients[name].there = True
+    scene.proxy.run_once()
+    give(3)
+    assert calls() == 2
+    scene.supervisor.dies = True
+    scene.proxy.run_once()
+    scene.proxy.run_once()
+    give(4)
+    assert (len(scene.nodes), calls()) == (2, 1)
+
+
+def test_the_end_of_our_own_node_gives_no_goal_a_second_time():
+    """The command lives on, with all goals that it has accepted."""
+    scene = action()
+    name = "/count/_action/send_goal"
+    scene.listener.on_request(FakeIncoming(b"a" * 16, HEADER + b"g" * 16, service=name))
+    scene.nodes[-1].clients[name].calls[0][1](ACCEPTED)
+    scene.nodes[-1].alive = False
+    scene.proxy.run_once()
+    scene.proxy.run_once()
+    again = FakeIncoming(b"b" * 16, HEADER + b"g" * 16, service=name)
+    scene.listener.on_request(again)
+    assert again.outcome == [ACCEPTED]
+    assert (len(scene.nodes), scene.nodes[-1].clients[name].calls) == (2, [])

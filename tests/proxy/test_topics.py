@@ -52,7 +52,7 @@ class Carried:
         self.robot, self._world, self._slot, self._link = "r", world, slot, link
         self.ended = False
 
-    def reply(self, payload: bytes) -> None:
+    def reply(self, payload: bytes, *, more: bool = False) -> None:
         self._end(Answer(self.request_id, payload=payload, service=self.service))
 
     def refuse(self, reason: str) -> None:

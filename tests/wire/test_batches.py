@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 from fogft.core.model import ReplicaId
 from fogft.wire import batch_frames, config, frame
 from fogft.wire.config import LinkSettings
-from fogft.wire.frame import FrameError
+from fogft.wire.frame import NO_STAMP, FrameError
 from fogft.wire.held import Held
 from fogft.wire.port import Incoming, Probe, ProbeAnswer, Refusal
-from fogft.wire.reply_queue import Reply, ReplyQueue
+from fogft.wire.query_ends import QueryEnd
+from fogft.wire.replies import Reply
+from fogft.wire.reply_queue import ReplyQueue
 from fogft.wire.zenoh_attempt import OpenAttempt
 from fogft.wire.zenoh_link import ZenohLink
 from fogft.wire.zenoh_listener import ZenohListener
@@ -35,6 +37,7 @@ from tests.wire.wire_pool import (
 
 ids = st.binary(min_size=16, max_size=16)
 payloads = st.binary(max_size=40)
+stamps = st.binary(min_size=4, max_size=4)
 ORIGIN = frame.origin("ada", bytes(8))
 requests = st.lists(
     st.tuples(ids, st.floats(0, frame.REMAINING_LIMIT_S), payloads), min_size=1, max_size=8
@@ -46,20 +49,25 @@ answers = st.lists(
 )
 
 
-@given(requests)
-def test_requests_come_back_in_their_order(sent: list[tuple[bytes, float, bytes]]) -> None:
-    header, content = batch_frames.encode_requests(sent, ORIGIN)
+@given(requests, stamps)
+def test_requests_come_back_in_their_order(
+    sent: list[tuple[bytes, float, bytes]], seen: bytes
+) -> None:
+    header, content = batch_frames.encode_requests(sent, ORIGIN, seen=seen)
     found = batch_frames.decode_requests(header, content)
     assert [(one.request_id, one.remaining_s, payload) for one, payload in found] == sent
-    assert all((one.token, one.robot) == (bytes(8), "ada") for one, _ in found)
+    assert all((one.token, one.robot, one.seen) == (bytes(8), "ada", seen) for one, _ in found)
     assert not any(one.packed or one.may_pack or one.reads_packed for one, _ in found)
 
 
-@given(answers)
-def test_answers_come_back_in_their_order(sent: list[tuple[bytes, bytes, str]]) -> None:
+@given(answers, stamps)
+def test_answers_come_back_in_their_order(
+    sent: list[tuple[bytes, bytes, str]], stamp: bytes
+) -> None:
     """A refusal travels in place of its payload."""
-    header, content = batch_frames.encode_answers(sent)
-    found = batch_frames.decode_answers(header, content)
+    header, content = batch_frames.encode_answers(stamp, sent)
+    came, found = batch_frames.decode_answers(header, content)
+    assert came == stamp
     assert [(one.request_id, one.refusal) for one in found] == [(id, why) for id, _, why in sent]
     assert [one.payload for one in found] == [None if why else said for _, said, why in sent]
 
@@ -70,13 +78,13 @@ def test_a_batch_is_no_single_frame_and_the_other_way_round() -> None:
     single = frame.encode_request(bytes(16), 1.0, ORIGIN)
     assert batch_frames.is_batch(header)
     assert not batch_frames.is_batch(single)
-    assert not batch_frames.is_batch(frame.encode_answer(bytes(16), packed=True))
+    assert not batch_frames.is_batch(frame.encode_answer(NO_STAMP, bytes(16), packed=True))
     with pytest.raises(FrameError):
         frame.decode_request(header)
     with pytest.raises(FrameError):
         batch_frames.decode_requests(single, content)
     with pytest.raises(FrameError):
-        frame.decode_answer(batch_frames.encode_answers([(bytes(16), b"", "")])[0])
+        frame.decode_answer(batch_frames.encode_answers(NO_STAMP, [(bytes(16), b"", "")])[0])
 
 
 @given(requests, st.data())
@@ -107,8 +115,9 @@ def test_a_time_that_is_none_is_refused(remaining_s: float) -> None:
 def test_there_is_a_limit_to_what_a_batch_may_claim() -> None:
     many = [(request_id(n), b"", "") for n in range(batch_frames.LIMIT + 1)]
     with pytest.raises(FrameError, match="more than"):
-        batch_frames.decode_answers(*batch_frames.encode_answers(many))
-    assert len(batch_frames.decode_answers(*batch_frames.encode_answers(many[:-1]))) == 64
+        batch_frames.decode_answers(*batch_frames.encode_answers(NO_STAMP, many))
+    most = batch_frames.encode_answers(NO_STAMP, many[:-1])
+    assert len(batch_frames.decode_answers(*most)[1]) == 64
 
 
 # -- what is held -------------------------------------------------------------------------
@@ -146,26 +155,35 @@ STREAMS: list[Any] = [object(), object()]
 
 @given(
     st.lists(
-        st.tuples(st.integers(0, 1), st.sampled_from([0, 10, 4096, 5000]), st.booleans()),
+        st.one_of(
+            st.none(),
+            st.tuples(st.integers(0, 1), st.sampled_from([0, 10, 4096, 5000]), st.booleans()),
+        ),
         max_size=60,
     )
 )
 def test_replies_leave_in_order_and_only_those_of_one_query_together(
-    plan: list[tuple[int, int, bool]],
+    plan: list[tuple[int, int, bool] | None],
 ) -> None:
-    """What is large, or may be compressed, leaves alone. The end comes last."""
+    """What is large, or may be compressed, leaves alone, as do ends of queries (None here)."""
     queue = ReplyQueue()
+    query: Any = object()
     put = [
-        Reply(STREAMS[stream], request_id(n), bytes(size), "", may_pack=may_pack)
-        for n, (stream, size, may_pack) in enumerate(plan)
+        QueryEnd(query, n)
+        if one is None
+        else Reply(STREAMS[one[0]], request_id(n), bytes(one[1]), "", may_pack=one[2])
+        for n, one in enumerate(plan)
     ]
     for reply in put:
         queue.replies.put(reply)
     queue.replies.put(None)
-    found: list[Reply] = []
+    found: list[Reply | QueryEnd] = []
     while together := queue.next(1.0):
+        if isinstance(together, QueryEnd):
+            found.append(together)
+            continue
         if len(together) > 1:
-            assert len({id(reply.query) for reply in together}) == 1
+            assert len({id(reply.stream) for reply in together}) == 1
             assert all(reply.joins for reply in together)
             assert sum(len(r.payload) for r in together) <= batch_frames.BYTES_LIMIT
             assert len(together) <= batch_frames.LIMIT
@@ -207,9 +225,9 @@ def spy(monkeypatch: pytest.MonkeyPatch, name: str) -> list[int]:
     sizes: list[int] = []
     encode = getattr(batch_frames, name)
 
-    def noted(parts: Any, *rest: Any) -> Any:
-        sizes.append(len(parts))
-        return encode(parts, *rest)
+    def noted(*given: Any, **named: Any) -> Any:
+        sizes.extend(len(parts) for parts in given if isinstance(parts, list))
+        return encode(*given, **named)
 
     monkeypatch.setattr(batch_frames, name, noted)
     return sizes

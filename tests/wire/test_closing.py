@@ -1,7 +1,8 @@
-"""A link that is closed while much flows through it holds up no other: Zenoh has one thread.
+"""A link that ends while much flows through it holds up no other.
 
-Each closes in the midst of something large, again and again: where Zenoh's thread and a sender wait
-for each other, both do so for `wait_before_close_s`, which here is longer than any test waits.
+Each ends in the midst of something large, again and again: where one of Zenoh's threads and a
+sender wait for each other, both do so for `wait_before_close_s`, which here is longer than any
+test waits.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from typing import Any
 import pytest
 
 from fogft.wire.zenoh_link import ZenohLink
+from tests.wire.robot_process import RobotProcess
 from tests.wire.test_frozen import STUCK
-from tests.wire.wire_pool import SERVICE, Owner, ReplicaProcess, request_id, wait_for
+from tests.wire.wire_pool import SERVICE, Authority, Owner, ReplicaProcess, request_id, wait_for
 
 LARGE_BYTES = 30_000_000
 
@@ -36,7 +38,7 @@ def sends_large(link: ZenohLink, number: int) -> None:
     assert link.offer(SERVICE, request_id(number), bytes(LARGE_BYTES), 600.0)
     connection = link._live
     assert connection is not None
-    wait_for(lambda: connection._sending_since is not None)
+    wait_for(lambda: connection.attempts.sending)
     time.sleep(random.Random(number).random() * 0.02)
 
 
@@ -77,8 +79,9 @@ def test_by_the_robot_while_it_is_answered(
         answered(owner, other, 2 * number + 1)
 
 
+@pytest.mark.parametrize("killed", [False, True])
 def test_by_the_replica_while_it_is_sent_to(
-    start_replica: Starts, dial: Dials, owner: Owner
+    start_replica: Starts, dial: Dials, owner: Owner, killed: bool
 ) -> None:
     """The robot's link to another replica goes on."""
     other = usable(dial, start_replica(settings=STUCK))
@@ -86,7 +89,23 @@ def test_by_the_replica_while_it_is_sent_to(
         replica = start_replica(slot=number, settings=STUCK)
         link = usable(dial, replica, slot=number)
         sends_large(link, 2 * number)
-        replica.stop()
+        replica.kill() if killed else replica.stop()
         wait_for(lambda link=link: not link.usable)
         answered(owner, other, 2 * number + 1)
         link.close()
+
+
+def test_by_a_robot_that_is_killed_while_it_is_answered(
+    authority: Authority, start_replica: Starts, dial: Dials, owner: Owner
+) -> None:
+    """The replica's link to another robot goes on."""
+    replica = start_replica(settings=STUCK)
+    link = usable(dial, replica)
+    asks = {"requests": 2, "payload": f"noise:{LARGE_BYTES}", "settings": STUCK}
+    for number in range(6):
+        before = replica.count("replies")
+        robot = RobotProcess(authority, replica, **asks)
+        wait_for(lambda n=before: replica.count("replies") > n)
+        time.sleep(random.Random(number).random() * 0.02)
+        robot.kill()
+        answered(owner, link, number)

@@ -18,6 +18,7 @@ from fogft.wire.port import Probe, ProbeAnswer
 
 ids = st.binary(min_size=16, max_size=16)
 tokens = st.binary(min_size=8, max_size=8)
+stamps = st.binary(min_size=4, max_size=4)
 robots = st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size=64).filter(
     lambda name: len(name.encode()) <= frame.ROBOT_BYTES_LIMIT and name.isprintable()
 )
@@ -59,28 +60,35 @@ FLAGS = st.fixed_dictionaries(
 )
 
 
-@given(request_id=ids, remaining_s=remaining, token=tokens, robot=robots, flags=FLAGS)
+@given(request_id=ids, remaining_s=remaining, token=tokens, robot=robots, seen=stamps, flags=FLAGS)
 def test_a_request_header_comes_back(
-    request_id: bytes, remaining_s: float, token: bytes, robot: str, flags: dict[str, bool]
+    request_id: bytes,
+    remaining_s: float,
+    token: bytes,
+    robot: str,
+    seen: bytes,
+    flags: dict[str, bool],
 ) -> None:
     """Decoding undoes encoding."""
-    sent = frame.encode_request(request_id, remaining_s, frame.origin(robot, token), **flags)
-    expected = frame.RequestHeader(request_id, remaining_s, token, robot, **flags)
+    origin = frame.origin(robot, token)
+    sent = frame.encode_request(request_id, remaining_s, origin, seen=seen, **flags)
+    expected = frame.RequestHeader(request_id, remaining_s, token, robot, seen, **flags)
     assert frame.decode_request(sent) == expected
 
 
-@given(request_id=ids)
-def test_an_answer_header_comes_back(request_id: bytes) -> None:
+@given(stamp=stamps, request_id=ids)
+def test_an_answer_header_comes_back(stamp: bytes, request_id: bytes) -> None:
     """Decoding undoes encoding."""
     for packed in (False, True):
-        header = frame.encode_answer(request_id, packed=packed)
-        assert frame.decode_answer(header) == (request_id, packed)
+        header = frame.encode_answer(stamp, request_id, packed=packed)
+        assert frame.decode_answer(header) == (stamp, request_id, packed)
 
 
-@given(request_id=ids, reason=reasons)
-def test_a_refusal_comes_back(request_id: bytes, reason: str) -> None:
+@given(stamp=stamps, request_id=ids, reason=reasons)
+def test_a_refusal_comes_back(stamp: bytes, request_id: bytes, reason: str) -> None:
     """Decoding undoes encoding."""
-    assert frame.decode_refusal(frame.encode_refusal(request_id, reason)) == (request_id, reason)
+    sent = frame.encode_refusal(stamp, request_id, reason)
+    assert frame.decode_refusal(sent) == (stamp, request_id, reason)
 
 
 @given(token=tokens, certificate=st.binary(max_size=1500), signature=st.binary(min_size=1))
@@ -158,7 +166,7 @@ def test_json_of_the_wrong_shape_is_a_frame_error_or_a_frame(
 @given(request_id=ids, cut=st.integers(0, 100), grown=st.binary(max_size=80))
 def test_a_header_of_the_wrong_length_is_refused(request_id: bytes, cut: int, grown: bytes) -> None:
     """An answer's header has one length; every other is a FrameError."""
-    whole = frame.encode_answer(request_id)
+    whole = frame.encode_answer(frame.NO_STAMP, request_id)
     for wrong in {whole[: cut % len(whole)], whole + grown + b"x"}:
         with pytest.raises(FrameError):
             frame.decode_answer(wrong)
@@ -168,7 +176,7 @@ def test_a_header_of_the_wrong_length_is_refused(request_id: bytes, cut: int, gr
 def test_another_version_is_refused(version: int) -> None:
     """A peer of another version is told apart from garbage by its version."""
     request = frame.encode_request(bytes(16), 1.0, frame.origin("r", bytes(8)))
-    refusal = frame.encode_refusal(bytes(16), "lost")
+    refusal = frame.encode_refusal(frame.NO_STAMP, bytes(16), "lost")
     for sent, decode in ((request, frame.decode_request), (refusal, frame.decode_refusal)):
         with pytest.raises(FrameError, match=f"version {version}"):
             decode(bytes([version]) + sent[1:])

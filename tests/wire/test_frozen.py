@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 
 from fogft.core.model import LinkState
 from fogft.wire.config import LinkSettings
+from fogft.wire.credit import SMALL_BYTES
 from fogft.wire.port import Refusal
 from fogft.wire.zenoh_link import ZenohLink
+from tests.freezing import freeze
+from tests.wire.robot_process import RobotProcess
 from tests.wire.wire_pool import (
     LIMIT_S,
     SERVICE,
@@ -101,76 +99,49 @@ def test_a_frozen_replica_is_given_up_without_delay_for_another(
     assert links[1].status().reopened == 0
 
 
-ROBOT = """
-import json, sys, time
-from pathlib import Path
-from fogft.wire.config import CredentialPaths, LinkSettings
-from fogft.wire.zenoh_dialer import ZenohDialer
-from tests.wire.wire_pool import POOL_UID, SERVICE, Owner, keys, peer, request_id, wait_for
-
-files = CredentialPaths(*(Path(path) for path in sys.argv[1:4]))
-owner = Owner()
-settings = LinkSettings(**json.loads(sys.argv[5]))
-dialer = ZenohDialer(files, robot="frozen", pool_uid=POOL_UID, settings=settings)
-link = dialer.dial(peer(sys.argv[4]), keys(0), owner)
-wait_for(lambda: link.usable)
-for number in range(60):
-    link.offer(SERVICE, request_id(number), b"many bytes, please", 600.0)
-print("offered", flush=True)
-time.sleep(600)
-"""
-
-
 @pytest.fixture
-def freeze_robot(authority: Authority) -> Iterator[Callable[[ReplicaProcess], None]]:
-    """Start a robot that asks a replica for 60 answers, and freeze it before they come."""
-    started: list[subprocess.Popen[str]] = []
+def freeze_robot(authority: Authority) -> Iterator[Callable[..., None]]:
+    """Start a robot that asks a replica for so many answers, and freeze it before they come."""
+    started: list[RobotProcess] = []
 
-    def start(replica: ReplicaProcess) -> None:
-        files = authority.robot("frozen")
-        paths = [str(files.ca), str(files.certificate), str(files.key)]
+    def start(replica: ReplicaProcess, requests: int = 60) -> None:
         started.append(
-            subprocess.Popen(
-                [sys.executable, "-c", ROBOT, *paths, replica.endpoint, json.dumps(asdict(STUCK))],
-                stdout=subprocess.PIPE,
-                text=True,
-                cwd=Path(__file__).parents[2],
+            RobotProcess(
+                authority, replica, requests=requests, payload="many bytes, please", settings=STUCK
             )
         )
-        stdout = started[-1].stdout
-        assert stdout is not None
-        assert stdout.readline() == "offered\n"
-        wait_for(lambda: replica.count("requests") == 60)
-        started[-1].send_signal(signal.SIGSTOP)
+        wait_for(lambda: replica.count("requests") == requests)
+        freeze(started[-1].process.pid)
 
     yield start
-    for process in started:
-        process.kill()
-        process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
+    for robot in started:
+        robot.kill()
 
 
+@pytest.mark.parametrize(("reply_bytes", "requests"), [(1 << 20, 60), (SMALL_BYTES, 500)])
 def test_a_frozen_robot_does_not_delay_another_robots_replies(
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
     owner: Owner,
-    freeze_robot: Callable[[ReplicaProcess], None],
+    freeze_robot: Callable[..., None],
+    reply_bytes: int,
+    requests: int,
 ) -> None:
-    """60 MB of replies wait for a robot that takes none; the other's 1 MB replies all arrive.
+    """More than all buffers hold waits for a robot that takes none; the other's replies arrive.
 
-    Nor is its link suspected meanwhile: probes have a way of their own.
+    Also where the first of them left at once, from the service's own thread. Nor is the other's
+    link suspected meanwhile: probes have a way of their own.
     """
-    replica = start_replica(delay_s=1.0, reply_bytes=1 << 20, settings=STUCK)
-    freeze_robot(replica)
+    replica = start_replica(delay_s=1.0, reply_bytes=reply_bytes, settings=STUCK)
+    freeze_robot(replica, requests)
     link = dial(replica.endpoint)
     wait_for(lambda: link.usable)
-    wait_for(lambda: replica.count("replies") >= 60)
+    wait_for(lambda: replica.count("replies") >= requests)
     replica.ask(delay_s=0.0)
     for number in range(100, 130):
         assert link.offer(SERVICE, request_id(number), b"me too", 60.0)
         wait_for(lambda n=number: owner.of(n))
-    assert {len(a.payload or b"") for a in owner.from_slot(0)} == {1 << 20}
+    assert {len(a.payload or b"") for a in owner.from_slot(0)} == {reply_bytes}
     assert link.status().reopened == 0
 
 
@@ -178,7 +149,7 @@ def test_a_frozen_robot_is_given_up_without_delay_for_another(
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
     owner: Owner,
-    freeze_robot: Callable[[ReplicaProcess], None],
+    freeze_robot: Callable[..., None],
 ) -> None:
     """Its link is ended with megabytes in it; nobody waits for Zenoh to close that."""
     settings = LinkSettings(stuck_after_s=0.5)
@@ -231,7 +202,7 @@ def test_closing_in_the_midst_of_a_large_send_leaves_no_thread(
     if settles:
         connection = link._live
         assert connection is not None
-        wait_for(lambda: connection._sending_since is not None)
+        wait_for(lambda: connection.attempts.sending)
     link.close()
     wait_for(lambda: owner.of(1))
     wait_for(lambda: set(threading.enumerate()) <= before)

@@ -183,7 +183,7 @@ def test_who_did_not_greet_is_refused_and_counted(
     ada = authority.robot("ada").certificate.read_bytes()
     forged = frame.Greeting(bytes(8), ssl.PEM_cert_to_DER_cert(ada.decode()), b"s" * 70)
     bare = frame.encode_greeting(frame.Greeting(bytes(8)))
-    probe = b'{"v":3,"robot":"ada","manager_age_s":null}'
+    probe = b'{"v":%d,"robot":"ada","manager_age_s":null}' % frame.VERSION
     tries = [
         (names.probe_key(POOL_UID, 0), probe, frame.encode_greeting(forged)),
         (names.probe_key(POOL_UID, 0), probe, bare),
@@ -194,7 +194,7 @@ def test_who_did_not_greet_is_refused_and_counted(
             replies = list(session.get(key, payload=payload, attachment=attachment, timeout=20.0))
             assert len(replies) == 1
             assert replies[0].err is not None
-            said = frame.decode_refusal(replies[0].err.payload.to_bytes())[1]
+            said = frame.decode_refusal(replies[0].err.payload.to_bytes())[2]
             assert said == Refusal.NOT_ADMITTED
             assert replica.count("not_admitted") == sent
         request = frame.encode_request(request_id(1), 5.0, frame.origin("ada", bytes(8)))

@@ -142,7 +142,7 @@ def carry(
         now = request.offered
         drain(now)
         free_at = max(free_at, now) if not waiting else free_at
-        if judge.may_arrive(request, request.deadline - now, now, lambda: tuple(waiting)):
+        if judge.may_arrive(request, request.deadline - now, now, lambda service: tuple(waiting)):
             waiting.append(request)
             drain(now)
     drain(float("inf"))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.core.model import ReplicaId
+from fogft.wire import frame
 from fogft.wire.port import Incoming, Probe, ProbeAnswer
 from fogft.wire.streams import Streams
 from fogft.wire.unanswered import Unanswered
+from fogft.wire.unseen import UNSEEN_LIMIT
 from fogft.wire.zenoh_attempt import OpenAttempt
 from fogft.wire.zenoh_link import ZenohLink
 from fogft.wire.zenoh_listener import ZenohListener
@@ -34,9 +38,9 @@ def test_every_query_is_either_open_or_ended_once(tokens: list[int], limit: int)
     for number, token in enumerate(tokens):
         query: Any = (token, number)
         opened.append(query)
-        ended += streams.opened(bytes([token]), query)
-    kept = [streams.of(bytes([token])) for token in range(10)]
-    kept = [query for query in kept if query is not None]
+        ended += streams.opened(bytes([token]), query, "holder")
+    found = [streams.of(bytes([token])) for token in range(10)]
+    kept: list[Any] = [stream.query for stream in found if stream is not None]
     youngest = sorted(dict(opened).items(), key=lambda item: item[1])[-limit:]
     assert sorted(kept) == sorted(youngest)
     assert sorted([query for _, query in ended] + kept) == sorted(opened)
@@ -103,3 +107,97 @@ def test_a_connection_whose_answers_have_ended_is_replaced(
         assert owner.of(2)[0].payload == b"second"
     finally:
         listener.close()
+
+
+class Answering:
+    """A replica in this process, and which thread sends what it answers."""
+
+    def __init__(self, authority: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.arrived: list[Incoming] = []
+        self.answers_itself = False
+        self.senders: list[str] = []
+        encode = frame.encode_answer
+
+        def noted(*args: Any, **rest: Any) -> bytes:
+            self.senders.append(threading.current_thread().name)
+            return encode(*args, **rest)
+
+        monkeypatch.setattr(frame, "encode_answer", noted)
+        id = ReplicaId(POOL_UID, 0, 1)
+        self.listener = ZenohListener("127.0.0.1:0", authority.replica(), id)
+        self.listener.serve(
+            keys(0), self._take, lambda probe: ProbeAnswer(0, 1, "here", frozenset({SERVICE}))
+        )
+
+    def _take(self, incoming: Incoming) -> None:
+        if self.answers_itself:
+            incoming.reply(incoming.payload)
+        self.arrived.append(incoming)
+
+
+@pytest.fixture
+def answering(authority: Authority, monkeypatch: pytest.MonkeyPatch) -> Iterator[Answering]:
+    one = Answering(authority, monkeypatch)
+    yield one
+    one.listener.close()
+
+
+def test_an_answer_to_a_robot_that_hears_leaves_from_the_thread_that_brings_it(
+    answering: Answering, dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """No other thread is woken for it: that costs a twentieth of a round trip."""
+    link = dial(answering.listener.endpoint)
+    wait_for(lambda: link.usable)
+    for number in range(20):
+        assert link.offer(SERVICE, request_id(number), b"%d" % number, 60.0)
+        wait_for(lambda number=number: len(answering.arrived) > number)  # type: ignore[misc]
+        answering.arrived[number].reply(b"to %d" % number)
+        wait_for(lambda number=number: owner.of(number))  # type: ignore[misc]
+        assert owner.of(number)[0].payload == b"to %d" % number
+    assert answering.senders == [threading.current_thread().name] * 20
+
+
+def test_a_robot_that_does_not_say_what_it_saw_is_answered_by_the_thread_that_may_block(
+    answering: Answering, dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """All but a few of what came at once: it may be frozen by now."""
+    link = dial(answering.listener.endpoint)
+    wait_for(lambda: link.usable)
+    for number in range(20):
+        assert link.offer(SERVICE, request_id(number), b"%d" % number, 60.0)
+    wait_for(lambda: len(answering.arrived) == 20)
+    for number, incoming in enumerate(answering.arrived):
+        incoming.reply(bytes(5000) + b"%d" % number)  # too large to share a message
+    wait_for(lambda: len(owner.answers) == 20)
+    assert [owner.of(n)[0].payload for n in range(20)] == [bytes(5000) + b"%d" % n
+                                                           for n in range(20)]  # fmt: skip
+    own = threading.current_thread().name
+    assert answering.senders.count(own) == UNSEEN_LIMIT
+    assert all(name == own or name.startswith("fogft-reply-") for name in answering.senders)
+
+
+def test_an_answer_that_others_will_follow_waits_for_them_in_the_queue(
+    answering: Answering, dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    link = dial(answering.listener.endpoint)
+    wait_for(lambda: link.usable)
+    assert link.offer(SERVICE, request_id(1), b"x", 60.0)
+    wait_for(lambda: answering.arrived)
+    answering.arrived[0].reply(b"y", more=True)
+    wait_for(lambda: owner.of(1))
+    assert all(name.startswith("fogft-reply-") for name in answering.senders)
+    assert len(answering.senders) == 1
+
+
+def test_zenohs_own_thread_never_sends(
+    answering: Answering, dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """It would wait for room that only it can make."""
+    answering.answers_itself = True
+    link = dial(answering.listener.endpoint)
+    wait_for(lambda: link.usable)
+    for number in range(3):
+        assert link.offer(SERVICE, request_id(number), b"x", 60.0)
+        wait_for(lambda number=number: owner.of(number))  # type: ignore[misc]
+    assert all(name.startswith("fogft-reply-") for name in answering.senders)
+    assert len(answering.senders) == 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import threading
@@ -19,6 +20,7 @@ from fogft.pool import credentials
 from fogft.pool.credentials import Role
 from fogft.wire.config import CredentialPaths, LinkSettings
 from fogft.wire.port import Answer, Link, Peer
+from tests.freezing import freeze
 
 POOL_UID = "0123456789abcdef"
 SERVICE, TYPE = "/echo", "std_srvs/srv/SetBool"
@@ -176,7 +178,10 @@ class ReplicaProcess:
         return int(self.ask().get(event, 0))  # type: ignore[call-overload]
 
     def signal(self, number: int) -> None:
-        self._process.send_signal(number)
+        if number == signal.SIGSTOP:
+            freeze(self._process.pid)
+        else:
+            self._process.send_signal(number)
 
     def kill(self) -> None:
         self._process.kill()
