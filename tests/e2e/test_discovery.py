@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterable
 
 import pytest
 
@@ -23,9 +24,11 @@ OFFERED = {
 }
 
 
-def robot(pool: Pool, name: str, kind: str, seconds: float = 20) -> dict:
+def robot(
+    pool: Pool, name: str, kind: str, seconds: float = 20, others: Iterable[str] = ()
+) -> dict:
     done = subprocess.run(
-        [sys.executable, str(NODES / "robot.py"), name, kind, str(seconds)],
+        [sys.executable, str(NODES / "robot.py"), name, kind, str(seconds), *others],
         env=pool.environ, capture_output=True, text=True, timeout=100, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -47,7 +50,7 @@ def test_the_robot_is_offered_what_run_advertises(pool: Pool):
         "fogft: {replicas: 2}\n"
     )
     pool.up()
-    seen = robot(pool, "/arm/worker/reset", "std_srvs/srv/Trigger")
+    seen = robot(pool, "/arm/worker/reset", "std_srvs/srv/Trigger", others=OFFERED)
     assert own(seen["services"]) == OFFERED
     assert "message='/arm/worker'" in seen["answer"]
     assert "success=True" in robot(pool, "/arm/turn", "std_srvs/srv/SetBool")["answer"]
@@ -58,7 +61,8 @@ def test_the_robot_is_offered_what_run_advertises(pool: Pool):
     os.kill(status["manager_pid"], signal.SIGKILL)
     os.kill(status["proxy_pid"], signal.SIGKILL)
     pool.up()
-    assert own(robot(pool, "/plan", "nav_msgs/srv/GetPlan")["services"]) == OFFERED
+    seen = robot(pool, "/plan", "nav_msgs/srv/GetPlan", others=OFFERED)
+    assert own(seen["services"]) == OFFERED
     assert {r["generation"] for r in pool.status()["replicas"]} == {1}, "nothing was replaced"
 
 
