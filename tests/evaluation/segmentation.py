@@ -65,7 +65,7 @@ class Segmentation(Defaults):
 
     def trials(self, scale: Scale) -> Mapping[str, int]:
         """As many as the paper's, but for `quick`."""
-        return dict.fromkeys(CONDITIONS, scale.choose(quick=25, normal=300, full=300))
+        return dict.fromkeys(CONDITIONS, scale.choose(quick=8, normal=300, full=300))
 
     @contextlib.contextmanager
     def session(self, stage: Stage) -> Iterator[Run]:
