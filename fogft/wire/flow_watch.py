@@ -95,7 +95,8 @@ class FlowWatch:
                     break
                 if sending():
                     if not sockets.takes_more(connection):
-                        break
+                        sockets.end_sending(connection)  # at once: soon it may take more
+                        return
                 elif flow.received != received:
                     received, quiet_since = flow.received, time.monotonic()
                 elif time.monotonic() - quiet_since > _QUIET_S:
