@@ -106,7 +106,6 @@ class Asides:
     def later(self, chore: Callable[[], None], query: zenoh.Query, turn: int) -> None:
         """Have the other thread do something; where too much waits for it, the query just ends."""
         if not self._chores.offer(chore):
-            self._counters.add("chores_dropped")
             self._queues.end(_STRANGERS, "strangers", QueryEnd(query, turn))
 
     def _turn_away(self, refused: QueryEnd, why: str) -> None:

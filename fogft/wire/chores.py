@@ -36,8 +36,9 @@ class Chores:
         threading.Thread(target=self._work, name="fogft-probes", daemon=True).start()
 
     def offer(self, chore: Callable[[], None]) -> bool:
-        """Take a chore, unless too many wait; return whether it was taken."""
+        """Take a chore, unless too many wait: then count it; return whether it was taken."""
         if len(self) >= LIMIT:
+            self._counters.add("chores_dropped")
             return False
         self._queue.put(chore)
         return True

@@ -167,9 +167,8 @@ def keep_short(connection: socket.socket) -> None:
 def end_sending(connection: socket.socket) -> None:
     """Send nothing more on a connection, whatever Zenoh is doing with it.
 
-    What its peer has not taken is dropped when the socket is closed: that is done by Zenoh's one
-    thread, which would wait for that peer up to 10 s (Zenoh's own SO_LINGER), and with it every
-    link of this process.
+    What its peer has not taken is dropped when the socket is closed: that is done by a thread of
+    Zenoh's, which would wait for that peer up to 10 s (Zenoh's own SO_LINGER).
 
     Not both directions: where Zenoh hears of an end before it fails to send, its thread waits for
     whoever waits for room to send more, and he for that thread (`docs/design/links.md`).

@@ -284,8 +284,7 @@ class ZenohListener:
         except frame.FrameError as error:
             self._malformed(error)
             return
-        if not self._chores.offer(partial(on_cancel, ids)):
-            self._counters.add("chores_dropped")
+        self._chores.offer(partial(on_cancel, ids))
 
     # -- the owner ------------------------------------------------------------------------
 

@@ -26,11 +26,13 @@ def test_chores_are_done_in_order_and_one_that_fails_stops_none(caplog):
 
 
 def test_only_so_many_wait_but_what_must_be_taken_is():
-    chores = Chores(Counters())
+    counters = Counters()
+    chores = Chores(counters)
     assert all(chores.offer(print) for _ in range(LIMIT))
     assert not chores.offer(print)
     chores.add(print)
     assert len(chores) == LIMIT + 1
+    assert counters.snapshot() == {"chores_dropped": 1}
 
 
 def test_what_happens_often_is_logged_seldom(caplog):

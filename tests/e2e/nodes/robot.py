@@ -29,10 +29,11 @@ def main() -> None:
         rclpy.spin_until_future_complete(node, future, timeout_sec=20)
         answer = str(future.result()) if future.done() else "no response"
     node.destroy_client(client)
-    found = dict(node.get_service_names_and_types())
-    while not found.keys() >= set(others) and time.monotonic() < end:
-        time.sleep(0.05)
+    while True:
         found = dict(node.get_service_names_and_types())
+        if found.keys() >= set(others) or time.monotonic() >= end:
+            break
+        time.sleep(0.05)
     print(json.dumps({"services": found, "answer": answer}))
     rclpy.try_shutdown()
 
