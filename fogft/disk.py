@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fogft.core.errors import PoolBusy, StateError
+from fogft.errors import PoolBusy, StateError
 
 _PATIENCE_S = 0.2
 

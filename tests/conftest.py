@@ -15,8 +15,8 @@ import pytest
 
 from tests import own_process
 from tests.dealing import dealt
-from tests.wire.namespaces import Namespaces, why_not
-from tests.wire.rmw_router import Router, running
+from tests.link.namespaces import Namespaces, why_not
+from tests.rmw_zenoh.rmw_router import Router, running
 
 # No test asserts wall-clock time; Hypothesis would, by default.
 # In CI the same examples each time: a new one is found by a person, who can look at it.
@@ -37,10 +37,21 @@ os.environ.setdefault("CYDR_CACHE_DIR", f"{tempfile.gettempdir()}/fogft-test-cyd
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+TESTS = Path(__file__).parent
 DOMAINS = range(60, 101)  # above 101 the ports of a domain reach Linux's ephemeral ones
 
 # Folders of tests that start no process, open no connection and wait for nothing.
-COMPUTING = {"core", "docs", "evaluation", "examples", "fuzz", "simulation"}
+COMPUTING = {
+    "docs",
+    "evaluation",
+    "examples",
+    "fuzz",
+    "model",
+    "ordering",
+    "planning",
+    "requests",
+    "simulation",
+}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -51,7 +62,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return float(marker.args[0]) if marker and marker.args else 0.0
 
     def computes(item: pytest.Item) -> bool:
-        return item.path.parent.name in COMPUTING
+        return item.path.relative_to(TESTS).parts[0] in COMPUTING
 
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:

@@ -13,7 +13,7 @@ import threading
 import pytest
 
 from fogft import disk
-from fogft.core.errors import PoolBusy, StateError
+from fogft.errors import PoolBusy, StateError
 
 
 def test_a_file_is_replaced_whole_and_private(tmp_path):

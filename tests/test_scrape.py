@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from fogft.core.exposition import GAUGE, Sample, of
-from fogft.scrape import Scrape
+from fogft.metrics.exposition import GAUGE, Sample, of
+from fogft.metrics.scrape import Scrape
 
 ONE = [of("fogft_x", GAUGE, "x", [Sample(1)])]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fogft.app.clouds import cloud_of, local_root, make_store
-from fogft.core.errors import FogftError, known_slots
+from fogft.errors import FogftError, known_slots
 
 if TYPE_CHECKING:
     from fogft.cloud.local.chaos import Chaos
-    from fogft.core.model import ReplicaId
+    from fogft.model.replica import ReplicaId
 
 
 def chaos() -> Chaos:

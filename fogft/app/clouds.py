@@ -6,12 +6,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fogft.core.errors import CloudError
-from fogft.pool.paths import PoolPaths, home
+from fogft.errors import CloudError
+from fogft.pool.folder.paths import PoolPaths, home
 
 if TYPE_CHECKING:
     from fogft.cloud.port import Cloud
-    from fogft.pool.store import Identity, PoolStore
+    from fogft.pool.folder.store import Identity, PoolStore
 
 LOCAL = "local"
 SKY = "sky"
@@ -20,7 +20,7 @@ CLOUDS = (LOCAL, SKY)
 
 def pools() -> list[str]:
     """Return the names of the pools on this machine, sorted."""
-    from fogft.pool import known
+    from fogft.pool.folder import known_pools as known
 
     return known.names(home())
 
@@ -31,7 +31,7 @@ def pool_name(name: str | None = None) -> str:
     Raises:
         PoolNotFound: There is no such pool, none, or more than one to choose from.
     """
-    from fogft.pool import known
+    from fogft.pool.folder import known_pools as known
 
     return known.meant(home(), name)
 
@@ -81,8 +81,8 @@ def costs_money(pool: str) -> bool:
 
 def make_store(pool: str) -> PoolStore:
     """Return the store of a pool."""
-    from fogft.pool import pool_file
-    from fogft.pool.store import PoolStore
+    from fogft.pool.folder.store import PoolStore
+    from fogft.poolfile import file as pool_file
 
     return PoolStore(
         PoolPaths.of(pool),
@@ -93,7 +93,7 @@ def make_store(pool: str) -> PoolStore:
 
 def cloud_names() -> dict[str, str]:
     """Return which cloud of `CLOUDS` each name stands for that a pool file can name."""
-    from fogft.cloud.names import NO_VM_CLOUDS, VM_CLOUDS
+    from fogft.model.clouds import NO_VM_CLOUDS, VM_CLOUDS
 
     return {LOCAL: LOCAL, **dict.fromkeys((*VM_CLOUDS, *NO_VM_CLOUDS), SKY)}
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 from fogft import disk
 from fogft.app.clouds import make_store
-from fogft.core.errors import FogftError
-from fogft.core.holders import Holder, Role
-from fogft.pool.paths import PoolPaths, home
+from fogft.errors import FogftError
+from fogft.model.certificate_holder import Holder, Role
+from fogft.pool.folder.paths import PoolPaths, home
 
 if TYPE_CHECKING:
-    from fogft.pool.joining import Issued, Joined
-    from fogft.pool.ledger import Entry
+    from fogft.pool.commands.joining import Issued, Joined
+    from fogft.pool.credentials.ledger import Entry
 
 PUBLISH_LIMIT_S = 10.0
 _POLL_S = 0.05
@@ -24,8 +24,8 @@ _POLL_S = 0.05
 
 def certificates(pool: str) -> Sequence[Entry]:
     """Return the certificates that a pool's CA has issued, oldest first. Keys are not in it."""
-    from fogft.pool.ledger import Ledger
-    from fogft.pool.store import read_identity
+    from fogft.pool.credentials.ledger import Ledger
+    from fogft.pool.folder.store import read_identity
 
     paths = PoolPaths.of(pool)
     read_identity(paths)
@@ -42,7 +42,7 @@ def issue(
             whoever joined would find nobody.
         FogftError: The file exists, or there is no such pool.
     """
-    from fogft.pool import joining
+    from fogft.pool.commands import joining
 
     file = out or Path(f"{name}.join")
     if file.exists():
@@ -60,9 +60,9 @@ def join(file: Path, passphrase: str) -> Joined:
     Raises:
         CredentialError: It is none, too old, or was used, here or elsewhere.
     """
-    from fogft.pool import joining
+    from fogft.pool.commands import joining
 
-    logging.getLogger("fogft.wire").addHandler(logging.NullHandler())  # an error says what matters
+    logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # an error says what matters
     disk.make_folder(home())
     return joining.join(file, passphrase, home(), time.time())
 
@@ -76,8 +76,8 @@ def revoke(pool: str, role: Role, name: str) -> tuple[list[Holder], bool]:
         CredentialError: There is none of that name.
         FogftError: There is no such pool.
     """
-    from fogft.pool import wishes
-    from fogft.pool.ledger import Ledger
+    from fogft.pool.commands import wishes
+    from fogft.pool.credentials.ledger import Ledger
 
     store = make_store(pool)
     store.identity()
@@ -92,7 +92,7 @@ def revoke(pool: str, role: Role, name: str) -> tuple[list[Holder], bool]:
 
 
 def _generation_in(paths: PoolPaths, slot: int, now: float) -> int | None:
-    from fogft.pool import wishes
+    from fogft.pool.commands import wishes
 
     try:
         return wishes.generation_in(paths, slot, now)
@@ -108,8 +108,8 @@ def rotate_robot(pool: str) -> tuple[Holder, list[Holder], bool]:
         CredentialError: The pool's CA cannot be used.
         FogftError: There is no such pool.
     """
-    from fogft.pool import configuration
-    from fogft.pool.ledger import Ledger
+    from fogft.pool.credentials.ledger import Ledger
+    from fogft.pool.manager import configuration
 
     store = make_store(pool)
     ledger = Ledger(store.paths.credentials)
@@ -131,7 +131,7 @@ def _in_use(paths: PoolPaths, holder: Holder) -> bool:
 def rotate_replicas(pool: str, slot: int | None = None) -> list[str]:
     """Have replicas replaced, the new one first, each with a key of its own; return which."""
     from fogft.app.looking import slots
-    from fogft.pool import wishes
+    from fogft.pool.commands import wishes
 
     store = make_store(pool)
     chosen = slots(pool) if slot is None else [slot]

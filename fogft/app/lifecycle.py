@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from fogft import disk
 from fogft.app.clouds import LOCAL, cloud_names, cloud_of, make_cloud, make_store
 from fogft.app.planning import far
-from fogft.pool.paths import home
+from fogft.pool.folder.paths import home
 
 if TYPE_CHECKING:
-    from fogft.core.model import Offer
-    from fogft.core.spec import PoolSpec
-    from fogft.pool.preview import Order
+    from fogft.model.replica import Offer
+    from fogft.model.spec import PoolSpec
+    from fogft.pool.commands.preview import Order
 
 
 def order(
@@ -33,7 +33,9 @@ def order(
         CloudError: There is no such cloud, or a new pool cannot use any that it names.
     """
     from fogft.cloud.port import Accounts
-    from fogft.pool import named_clouds, pool_file, preview
+    from fogft.pool.commands import preview
+    from fogft.poolfile import file as pool_file
+    from fogft.poolfile import named_clouds
     from fogft.ros.comparison import check_tolerances
     from fogft.ros.state_bytes import check_state
     from fogft.ros.types import check_ok_field, check_type
@@ -76,7 +78,7 @@ def start(order: Order) -> bool:
     Raises:
         FogftError: The pool is another one's, is being ended, or its manager did not start.
     """
-    from fogft.pool import startup
+    from fogft.pool.commands import startup
 
     disk.make_folder(home())
     store, spec = make_store(order.spec.name), order.spec
@@ -99,7 +101,7 @@ def down(
         PoolNotFound: There is no such pool.
         FogftError: Something did not end; run it again.
     """
-    from fogft.pool import shutdown
+    from fogft.pool.manager import shutdown
     from fogft.ros import shared_memory
 
     shutdown.end(make_store(pool), cloud_of, told=told, warned=warned)

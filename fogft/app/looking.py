@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 from fogft import disk, logfile
 from fogft.app.clouds import cloud_of, make_store, pools
-from fogft.pool.paths import PoolPaths, home
+from fogft.pool.folder.paths import PoolPaths, home
 
 if TYPE_CHECKING:
     from fogft.doctor.finding import Finding
-    from fogft.pool.seen import Seen
+    from fogft.pool.commands.status import Seen
 
 
 def manager_alive(pool: str) -> bool:
@@ -23,14 +23,14 @@ def manager_alive(pool: str) -> bool:
 
 def file_of(pool: str) -> str:
     """Return the pool file that a pool was started from."""
-    from fogft.pool.store import read_identity
+    from fogft.pool.folder.store import read_identity
 
     return read_identity(PoolPaths.of(pool)).file
 
 
 def status(pool: str) -> Seen:
     """Return what the manager last saw of a pool, how old it is, and who looks now."""
-    from fogft.pool import seen
+    from fogft.pool.commands import status as seen
 
     return seen.read(PoolPaths.of(pool), time.time())
 
@@ -41,7 +41,7 @@ def refresh(pool: str, limit_s: float = 15.0) -> Seen:
     Raises:
         StateError: The manager did not look again within `limit_s`.
     """
-    from fogft.pool import seen
+    from fogft.pool.commands import status as seen
 
     if manager_alive(pool):
         return seen.renewed(PoolPaths.of(pool), limit_s)
@@ -67,7 +67,7 @@ def excluded(pool: str) -> list[str]:
 
 def logs(pool: str, slot: int | None = None) -> list[tuple[str, Path]]:
     """Return a pool's logs, each with its name: ``manager``, ``proxy``, ``slot.generation``."""
-    from fogft.pool import logs
+    from fogft.pool.commands import logs
 
     store = make_store(pool)
     return logs.find(store, cloud_of(store.identity()), slot)
@@ -81,7 +81,7 @@ def tail(path: Path, lines: int = 8) -> str:
 def doctor(file: Path | None = None) -> Iterator[Finding]:
     """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come."""
     from fogft.doctor import checks, finding
-    from fogft.pool import pool_file
+    from fogft.poolfile import file as pool_file
 
     spec = None if file is None else pool_file.read(file)
     yield from finding.run(checks.ALL, finding.situation(home(), pools(), spec))

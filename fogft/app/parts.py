@@ -19,7 +19,7 @@ def init(example: str, into: Path | None, *, force: bool = False) -> list[Path]:
     Raises:
         FogftError: There is no such example, or a file is in the way.
     """
-    from fogft.pool import init as examples_
+    from fogft.pool.commands import init as examples_
 
     name = example or examples_.DEFAULT_EXAMPLE
     return examples_.copy_example(name, into or Path(name), force=force)
@@ -27,16 +27,16 @@ def init(example: str, into: Path | None, *, force: bool = False) -> list[Path]:
 
 def examples() -> Sequence[str]:
     """Return the names of the examples that `init` can write."""
-    from fogft.pool import init
+    from fogft.pool.commands import init
 
     return list(init.examples())
 
 
 def run_proxy(config: Path, *, metrics: str | None = None) -> None:
     """Run a client proxy until a signal ends it."""
-    from fogft.proxy import client_process
+    from fogft.proxy.robot import process
 
-    client_process.run(config, metrics=metrics)
+    process.run(config, metrics=metrics)
 
 
 def run_server(
@@ -50,7 +50,7 @@ def run_server(
     metrics: str | None = None,
 ) -> None:
     """Run a server proxy until a signal ends it."""
-    from fogft.proxy import server_process
+    from fogft.proxy.replica import process as server_process
 
     server_process.run(
         config,
@@ -65,20 +65,20 @@ def run_server(
 
 def run_manager(pool: str, *, metrics: str | None = None) -> None:
     """Run a pool's manager until a signal ends it, or the pool has been ended."""
-    from fogft.pool import manager
+    from fogft.pool.manager import manager
 
     manager.run(make_store(pool), cloud_of, metrics=metrics)
 
 
 def run_rendezvous(config: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
     """Run a rendezvous until a signal ends it."""
-    from fogft.pool import rendezvous
+    from fogft.pool.commands import rendezvous
 
     rendezvous.run(rendezvous.read_config(config, listen, metrics))
 
 
 def run_gateway(config: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
     """Run a gateway until a signal ends it."""
-    from fogft.proxy import gateway_process
+    from fogft.proxy.gateway import process as gateway_process
 
     gateway_process.run(config, listen=listen, metrics=metrics)

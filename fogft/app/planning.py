@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft.app.clouds import LOCAL, cloud_names, make_cloud, make_store
-from fogft.core.errors import CloudError, PoolNotFound, SpecError
-from fogft.pool.paths import latency_file
+from fogft.errors import CloudError, PoolNotFound, SpecError
+from fogft.pool.folder.paths import latency_file
 
 if TYPE_CHECKING:
-    from fogft.core.explain import Explanation
-    from fogft.core.model import Offer
-    from fogft.core.spec import PoolSpec
-    from fogft.pool.latency import Distance
-    from fogft.pool.offers import Seller
-    from fogft.pool.traffic import Measured
+    from fogft.model.replica import Offer
+    from fogft.model.spec import PoolSpec
+    from fogft.planning.explain import Explanation
+    from fogft.pool.manager.distances import Distance
+    from fogft.pool.manager.offers import Seller
+    from fogft.pool.manager.traffic import Measured
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,14 @@ def plan(
         CloudError: Prices cannot be had.
     """
     from fogft.cloud.table import PriceTable
-    from fogft.core.explain import explain
-    from fogft.core.history import History
-    from fogft.core.intent import Intent
-    from fogft.core.model import Observed
-    from fogft.pool import named_clouds, offers, pool_file
-    from fogft.pool.traffic import is_stated, measured, with_measured
+    from fogft.model.intent import Intent
+    from fogft.model.replica import Observed
+    from fogft.planning.explain import explain
+    from fogft.planning.observed.history import History
+    from fogft.pool.manager import offers
+    from fogft.pool.manager.traffic import is_stated, measured, with_measured
+    from fogft.poolfile import file as pool_file
+    from fogft.poolfile import named_clouds
 
     source = pool_file.text(file)
     spec = pool_file.parse(source, file=str(file), folder=file.parent)
@@ -122,7 +124,7 @@ def far(
         offline: Measure nothing.
         told: Called before anything is measured.
     """
-    from fogft.pool.latency import Latencies, regions_of
+    from fogft.pool.manager.distances import Latencies, regions_of
 
     regions, latencies, notes = regions_of(sold), Latencies(latency_file()), []
     if not offline and (stale := latencies.stale(regions)):
@@ -136,7 +138,7 @@ def far(
 
 def _on_demand(seller: Seller, spec: PoolSpec) -> Sequence[Offer]:
     """Return what one on-demand machine of the pool's largest kind costs; none if not sold."""
-    from fogft.core.groups import groups_of, with_spot
+    from fogft.model.groups import groups_of, with_spot
 
     try:
         return seller.offers(with_spot(groups_of(spec)[-1].resources, False))

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from fogft.app.clouds import LOCAL, cloud_names, make_cloud
 
 if TYPE_CHECKING:
-    from fogft.core.model import Offer, Placement
-    from fogft.core.spec import PoolSpec
+    from fogft.model.replica import Offer, Placement
+    from fogft.model.spec import PoolSpec
     from fogft.simulation.market import FindOffers
     from fogft.simulation.report import Report
 
@@ -42,8 +42,9 @@ def simulate(
     Raises:
         FogftError: The file, the traces or the numbers are wrong.
     """
-    from fogft.core.errors import FogftError
-    from fogft.pool import named_clouds, pool_file
+    from fogft.errors import FogftError
+    from fogft.poolfile import file as pool_file
+    from fogft.poolfile import named_clouds
     from fogft.simulation import fitting, report
     from fogft.simulation import model as models
     from fogft.simulation import traces as recorded
@@ -117,8 +118,8 @@ def check_plot(path: Path) -> None:
 
 def _pricing(find: FindOffers, source: str, file: Path) -> FindOffers:
     """Return the same, whose errors name the line of the pool file."""
-    from fogft.core.errors import SpecError
-    from fogft.pool.named_clouds import located
+    from fogft.errors import SpecError
+    from fogft.poolfile.named_clouds import located
 
     def ask(resources: Mapping[str, Any]) -> Sequence[Offer]:
         try:
@@ -131,8 +132,8 @@ def _pricing(find: FindOffers, source: str, file: Path) -> FindOffers:
 
 def _everything(spec: PoolSpec, find: FindOffers) -> list[Placement]:
     """Return what can be bought anywhere; at least what the pool may use."""
-    from fogft.core.errors import FogftError
-    from fogft.core.groups import groups_of, with_spot
+    from fogft.errors import FogftError
+    from fogft.model.groups import groups_of, with_spot
 
     sold = [o for group in groups_of(spec) for o in find(with_spot(group.resources, True))]
     with contextlib.suppress(FogftError):  # not every cloud lists all that it has

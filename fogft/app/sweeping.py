@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft.app.clouds import LOCAL, SKY, make_cloud
-from fogft.core.errors import FogftError
-from fogft.pool.paths import home
+from fogft.errors import FogftError
+from fogft.pool.folder.paths import home
 
 if TYPE_CHECKING:
-    from fogft.pool.sweep import Unowned
+    from fogft.pool.commands.sweep import Unowned
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def sweep(cloud: str) -> Swept:
         CloudError: There is no such cloud, or it is not usable here.
     """
     from fogft.cloud.port import Auditing
-    from fogft.pool import sweep as sweeping
+    from fogft.pool.commands import sweep as sweeping
 
     concrete = make_cloud(cloud, Path.cwd())
     if not isinstance(concrete, Auditing):
@@ -52,6 +52,6 @@ def sweep(cloud: str) -> Swept:
 
 def end_unowned(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
     """End what was found, but what a manager has taken over since; return what went wrong."""
-    from fogft.pool import sweep as sweeping
+    from fogft.pool.commands import sweep as sweeping
 
     return sweeping.end(make_cloud(found.cloud, Path.cwd()), found.unowned, home(), told=told)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 
 from fogft.app.clouds import cloud_of, make_store
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 
 def scale(pool: str, by: int) -> tuple[int, int]:
     """Want `by` more replicas (fewer when negative); return how many before and after."""
-    from fogft.pool import wishes
+    from fogft.pool.commands import wishes
 
     return wishes.scale(make_store(pool), by)
 
 
 def drain(pool: str, slot: int) -> str:
     """Have the replica in a slot replaced; return it as ``slot.generation``."""
-    from fogft.pool import wishes
+    from fogft.pool.commands import wishes
 
     return wishes.drain(make_store(pool), slot, time.time())
 
@@ -28,9 +28,9 @@ def exclude(pool: str, location: str) -> bool:
     Raises:
         FogftError: The pool's cloud has no such location.
     """
-    from fogft.core.intent import checked_location
-    from fogft.core.spec_tree import nearest
-    from fogft.pool import wishes
+    from fogft.model.intent import checked_location
+    from fogft.pool.commands import wishes
+    from fogft.poolfile.tree import nearest
 
     store = make_store(pool)
     identity, place = store.identity(), checked_location(location)
@@ -49,6 +49,6 @@ def exclude(pool: str, location: str) -> bool:
 
 def include(pool: str, location: str) -> None:
     """Allow a location again."""
-    from fogft.pool import wishes
+    from fogft.pool.commands import wishes
 
     wishes.include(make_store(pool), location)

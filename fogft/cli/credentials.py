@@ -17,11 +17,11 @@ import typer
 from fogft.cli import output
 from fogft.cli.complete import PoolOption
 from fogft.cli.sections import Command
-from fogft.core.errors import CredentialError, FogftError
-from fogft.core.holders import Holder, Role
+from fogft.errors import CredentialError, FogftError
+from fogft.model.certificate_holder import Holder, Role
 
 if TYPE_CHECKING:
-    from fogft.pool.ledger import Entry
+    from fogft.pool.credentials.ledger import Entry
 
 DAY_H = 24.0
 RoleName = Annotated[
@@ -77,7 +77,7 @@ def issue(
       fogft credentials issue robot ada
     """
     from fogft import app
-    from fogft.pool import bundle
+    from fogft.pool.credentials import bundle
 
     own = None if passphrase_file is None else _read_passphrase(passphrase_file)
     passphrase = own or bundle.new_passphrase()
@@ -211,8 +211,8 @@ def join(
       fogft join ada.join
     """
     from fogft import app
-    from fogft.pool import bundle as bundles
-    from fogft.pool import joining
+    from fogft.pool.commands import joining
+    from fogft.pool.credentials import bundle as bundles
 
     label = bundles.read_label(joining.read(bundle))
     whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"

@@ -12,16 +12,16 @@ import typer
 from fogft.cli import complete, output
 from fogft.cli.complete import PoolArgument
 from fogft.cli.sections import Command
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 if TYPE_CHECKING:
-    from fogft.pool.preview import Preview
-    from fogft.pool.seen import Seen
+    from fogft.pool.commands.preview import Preview
+    from fogft.pool.commands.status import Seen
 
 DEFAULT_FILE = Path("pool.yaml")
 LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
-ROLLED_BACK = "rolled back"  # `fogft.core.rollout.UpdateState`
+ROLLED_BACK = "rolled back"  # `fogft.planning.rollout.UpdateState`
 HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
 
 
@@ -166,7 +166,7 @@ def question(preview: Preview) -> str:
 def managed(pool: str) -> Seen:
     """Return a pool's status; raise when nobody manages it any more."""
     from fogft import app
-    from fogft.pool.paths import PoolPaths
+    from fogft.pool.folder.paths import PoolPaths
 
     seen = app.status(pool)
     if not seen.manager_alive:

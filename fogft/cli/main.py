@@ -35,7 +35,7 @@ from fogft.cli import (
 )
 from fogft.cli import plan as planning
 from fogft.cli.sections import Commands
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 INTERRUPTED = 130
 STDOUT_CLOSED = 141

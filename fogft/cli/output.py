@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import IO, Any
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 # A table that is read by another program is never cut.
 _WIDTH_OF_A_PIPE = 240

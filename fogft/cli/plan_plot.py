@@ -1,7 +1,7 @@
 """Draw a plan: each offer's price against its distance, the chosen ones filled. SVG, by hand.
 
 Owns: the drawing.
-Not here: what is drawn (`fogft.core.explain`).
+Not here: what is drawn (`fogft.planning.explain`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from fogft.app.planning import PlanShown

@@ -1,7 +1,7 @@
 """How a plan looks: a table of offers, then what the pool costs and gives; or JSON.
 
 Owns: words and columns.
-Not here: the reasons (`fogft.core.explain`).
+Not here: the reasons (`fogft.planning.explain`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from fogft.cli.table import Cell, columns
 
 if TYPE_CHECKING:
     from fogft.app.planning import PlanShown
-    from fogft.core.cost import Cost
-    from fogft.core.explain import Considered
-    from fogft.core.model import Offer
-    from fogft.core.spec import ServiceSpec
+    from fogft.model.replica import Offer
+    from fogft.model.spec import ServiceSpec
+    from fogft.planning.cost import Cost
+    from fogft.planning.explain import Considered
 
 _HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST", "WHY NOT")
 
@@ -125,7 +125,7 @@ def _row(shown: PlanShown, one: Considered) -> list[Cell]:
 
 
 def _price(offer: Offer, now: float) -> str:
-    from fogft.pool.preview import price_told
+    from fogft.pool.commands.preview import price_told
 
     return price_told(offer, now) or "made up"
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 from fogft.cli import output
 
 if TYPE_CHECKING:
-    from fogft.core.spec import PoolSpec
-    from fogft.pool.preview import Preview
-    from fogft.pool.seen import Seen
+    from fogft.model.spec import PoolSpec
+    from fogft.pool.commands.preview import Preview
+    from fogft.pool.commands.status import Seen
 
 LOOK_EVERY_S = 0.2
 

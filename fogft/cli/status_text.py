@@ -13,8 +13,8 @@ from fogft.cli.table import GAP, Cell, columns, with_remark
 from fogft.cli.tree_text import tree
 
 if TYPE_CHECKING:
-    from fogft.pool.seen import Seen
-    from fogft.pool.status import PoolStatus, ReplicaStatus, ServiceStatus
+    from fogft.pool.commands.status import Seen
+    from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
 
 PHASES = {"provisioning": "soon", "starting": "soon", "ready": "good", "draining": "leaving"}
 LINKS = {"up": "good", "connecting": "soon", "suspect": "bad"}

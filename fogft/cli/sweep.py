@@ -9,7 +9,7 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.sections import Command
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from fogft.app.sweeping import Swept

@@ -16,7 +16,7 @@ from fogft.cli.sections import Command
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from fogft.pool.seen import Seen
+    from fogft.pool.commands.status import Seen
 
 REDRAW_EVERY_S = 1.0
 STALE_AFTER_S = 15.0

@@ -4,7 +4,7 @@ A provider's public endpoint of a region ends TCP in that region, so the time to
 one round trip. Positions are those of the cities or states that providers name, to a degree.
 
 Owns: endpoints and positions.
-Not here: connecting (`fogft.pool.latency`).
+Not here: connecting (`fogft.pool.manager.distances`).
 """
 
 from __future__ import annotations

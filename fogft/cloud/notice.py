@@ -21,7 +21,7 @@ from typing import Protocol
 
 from fogft.cloud import notice_formats
 from fogft.cloud.notice_formats import Notice, NoticeKind
-from fogft.core.errors import CloudError
+from fogft.errors import CloudError
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
-from fogft.core.model import Machine, Offer, Placement, ReplicaId
+from fogft.model.replica import Machine, Offer, Placement, ReplicaId
 
 
 @dataclass(frozen=True)

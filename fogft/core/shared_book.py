@@ -13,8 +13,8 @@ import struct
 from collections import OrderedDict
 from dataclasses import dataclass, field
 
-from fogft.core.ordering import OrderError
 from fogft.core.shared_orders import Entry, RequestId
+from fogft.ordering.orders import OrderError
 
 # More robots than will ever share a pool; the one that asked longest ago is forgotten.
 SESSIONS_LIMIT = 256

@@ -11,7 +11,7 @@ import struct
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from fogft.core.ordering import OrderError, Position
+from fogft.ordering.orders import OrderError, Position
 
 _ENTRY = struct.Struct(">BQQQ")
 _VOTE = struct.Struct(">QQBBQQ")

@@ -5,7 +5,7 @@ robots hand in until the sequencer has it numbered, and answers it once a majori
 has applied it; it keeps the book of who asked what.
 
 Owns: what robots handed in, the book, and whether this replica counts in a majority.
-Not here: calling the service and answering (`fogft.proxy.ordered_responder`).
+Not here: calling the service and answering (`fogft.proxy.replica.ordered_responder`).
 Protocol and its argument: docs/design/state.md, "Several robots".
 """
 
@@ -15,11 +15,12 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from fogft.core import ordering, shared_book, shared_orders
-from fogft.core.ordered_replica import NOT_READY, Begin, Effect, OrderedReplica, Refuse, Reply
-from fogft.core.ordering import FORGOTTEN, MALFORMED, NOT_JOINED, Op, OrderError, Position
+from fogft.core import shared_book, shared_orders
 from fogft.core.shared_book import Applied, Book
 from fogft.core.shared_orders import OVERLOADED, Entry, Handed, RequestId, Standing, Vote
+from fogft.ordering import orders
+from fogft.ordering.orders import FORGOTTEN, MALFORMED, NOT_JOINED, Op, OrderError, Position
+from fogft.ordering.replica import NOT_READY, Begin, Effect, OrderedReplica, Refuse, Reply
 
 T = TypeVar("T")
 
@@ -72,7 +73,7 @@ class SharedReplica(OrderedReplica[T]):
             if life != self._life:
                 return [Refuse(to, NOT_JOINED)]
         if op is Op.RESTORE and epoch == self.promised:
-            shared_book.decode(ordering.decode_snapshot(payload)[1])
+            shared_book.decode(orders.decode_snapshot(payload)[1])
         if op is Op.LISTEN and epoch == self.promised:
             return self._listen(payload, to)
         return super().order(op, epoch, index, payload, robot=robot, to=to)

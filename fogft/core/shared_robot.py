@@ -15,13 +15,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from fogft.core import ordering, shared_orders
-from fogft.core.ordered_peer import Order
-from fogft.core.ordering import START, Op, OrderId, Position
+from fogft.core import shared_orders
 from fogft.core.shared_orders import RequestId, Standing
 from fogft.core.shared_places import Places
 from fogft.core.shared_sequencer import Answered, SharedSequencer
 from fogft.core.shared_watch import Watch
+from fogft.ordering import orders
+from fogft.ordering.orders import START, Op, OrderId, Position
+from fogft.ordering.peer import Order
 
 TROUBLE_AFTER_S = 10.0
 RETRY_S = 1.0
@@ -321,7 +322,7 @@ class SharedRobot:
             self._places.end(replica, index)
             request = self._requests.get(index)
             if request is not None:
-                final = reason == ordering.MALFORMED
+                final = reason == orders.MALFORMED
                 request.next_at = float("inf") if final else now + REFUSED_RETRY_S
         elif op is not Op.HAND_IN and self.term and epoch == self.term.epoch:
             self.term.refused(replica, op, index, reason, now)

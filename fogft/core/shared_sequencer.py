@@ -15,12 +15,13 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from fogft.core import ordering, shared_orders
+from fogft.core import shared_orders
 from fogft.core.majority import is_majority
-from fogft.core.ordered_peer import Peer, Phase
-from fogft.core.ordered_term import OrderedTerm
-from fogft.core.ordering import START, Op, Position, Promise
 from fogft.core.shared_orders import Entry, Handed, RequestId, Vote
+from fogft.ordering import orders
+from fogft.ordering.orders import START, Op, Position, Promise
+from fogft.ordering.peer import Peer, Phase
+from fogft.ordering.term import OrderedTerm
 
 HEARTBEAT_S = 0.25
 GONE_AFTER_S = 5.0
@@ -302,7 +303,7 @@ class SharedSequencer(OrderedTerm):
         if op is Op.LISTEN:
             self._listens.pop(replica, None)
             peer = self._peers.get(replica)
-            obeyed = ordering.read_fenced(reason)
+            obeyed = orders.read_fenced(reason)
             if obeyed is None or (obeyed < self.epoch and (peer is None or peer.promise is None)):
                 return  # nothing is known by it: the claim is still on its way, or the link died
         super().refused(replica, op, index, reason, now)

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fogft.core.spec import PoolSpec
-from fogft.core.spec_tree import Section
+from fogft.model.spec import PoolSpec
+from fogft.poolfile.tree import Section
 
 FEWEST = 3  # with two, the loss of one leaves no majority, and nobody can put that right
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from fogft.core.spec import PoolSpec
+from fogft.model.spec import PoolSpec
 
 
 class Verdict(str, Enum):

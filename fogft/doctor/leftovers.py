@@ -11,10 +11,10 @@ from collections.abc import Iterator
 
 from fogft.cloud.local import faults as local_faults
 from fogft.cloud.local import processes as local_processes
-from fogft.core.errors import FogftError
 from fogft.doctor.finding import Check, Finding, Situation, ok, warn
-from fogft.pool.paths import PoolPaths
-from fogft.pool.store import read_identity
+from fogft.errors import FogftError
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import read_identity
 from fogft.ros import shared_memory
 
 

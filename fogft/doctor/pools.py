@@ -8,12 +8,12 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 from fogft import disk
-from fogft.core.errors import CredentialError, FogftError
-from fogft.core.groups import FIRST_BY_HAND
-from fogft.core.middleware import Speaks
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
-from fogft.pool import credentials
-from fogft.pool.paths import PoolPaths
+from fogft.errors import CredentialError, FogftError
+from fogft.model.groups import FIRST_BY_HAND
+from fogft.model.middleware import Speaks
+from fogft.pool.credentials import authority
+from fogft.pool.folder.paths import PoolPaths
 
 _EXPIRY_WARNING = timedelta(days=3)
 # The client proxy reports twice a second.
@@ -72,7 +72,7 @@ def judge_folder(pool: str, folder: Path, now: datetime) -> Iterator[Finding]:
     anew = f"run `fogft down {pool}` and `fogft up` again: that makes new ones"
     for certificate in sorted(folder.rglob("*.crt")):
         try:
-            said = credentials.describe(certificate)
+            said = authority.describe(certificate)
         except CredentialError as error:
             yield fail("credentials", f"pool `{pool}`: {error.message}", anew)
             continue

@@ -25,11 +25,11 @@ from launch.frontend import Entity, Parser, expose_action
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 from launch_ros.actions import Node
 
-from fogft.core.errors import FogftError
 from fogft.disk import make_folder, write_whole
+from fogft.errors import FogftError
 from fogft.launch.hold import READY
 from fogft.launch.words import NodeWords, pool_tree, run_text
-from fogft.pool.paths import home
+from fogft.pool.folder.paths import home
 
 _END_LIMIT_S = 900  # how long launch waits for `fogft down` before it kills
 # What a node on another machine cannot do, and what to do instead.

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 FILE_LIMIT_BYTES = 256 << 10
 _END = "END_OF_PARAMETERS"

@@ -1,7 +1,7 @@
 """What a replica tells the rendezvous of itself, and what it learns there.
 
 Owns: the replica's record, when it is written anew, and the doors that it dials.
-Not here: what is told with each probe (`server`), records (`fogft.core.records`).
+Not here: what is told with each probe (`server`), records (`fogft.records.record`).
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol
 
-from fogft.core.model import ReplicaId
-from fogft.core.records import RecordError, RecordKind
-from fogft.core.roster import SlotState, dial_in
+from fogft.link.dial_out.replica import DialOut
+from fogft.model.replica import ReplicaId
 from fogft.proxy.config import ServerProxyConfig
-from fogft.wire.dial_out import DialOut
-from fogft.wire.rendezvous_client import Known, RendezvousClient
-from fogft.wire.signing import Signer
+from fogft.records.client import Known, RendezvousClient
+from fogft.records.record import RecordError, RecordKind
+from fogft.records.roster import SlotState, dial_in
+from fogft.records.signing import Signer
 
 log = logging.getLogger(__name__)
 

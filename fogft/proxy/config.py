@@ -12,16 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.notice import SOURCES as NOTICE_SOURCES
-from fogft.core import membership, names, topics
-from fogft.core.errors import StateError
-from fogft.core.middleware import Speaks
-from fogft.core.model import ReplicaId
-from fogft.core.service_form import from_plain, seconds
-from fogft.core.spec import ServiceSpec
-from fogft.core.topics import TopicSpec
-from fogft.core.uplinks import is_interface
-from fogft.wire.config import CredentialPaths
-from fogft.wire.frame import ROBOT_BYTES_LIMIT
+from fogft.errors import StateError
+from fogft.link.frame import ROBOT_BYTES_LIMIT
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model import membership, names
+from fogft.model import topic as topics
+from fogft.model.middleware import Speaks
+from fogft.model.replica import ReplicaId
+from fogft.model.spec import ServiceSpec
+from fogft.model.topic import TopicSpec
+from fogft.model.uplinks import is_interface
+from fogft.poolfile.service_form import from_plain, seconds
 
 DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
 

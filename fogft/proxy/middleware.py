@@ -14,9 +14,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from fogft.core.definitions import Definition
-from fogft.core.errors import RosError
-from fogft.core.middleware import Speaks
+from fogft.errors import RosError
+from fogft.model.middleware import Speaks
+from fogft.model.type_definition import Definition
 from fogft.proxy import start
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
@@ -78,7 +78,7 @@ def join(
 
         serialised = SerialisedNode(name, domain_id)
         return Joined(serialised, definition, serialised.make_visible)
-    from fogft.wire.rmw_node import RmwZenohNode
+    from fogft.rmw_zenoh.node import RmwZenohNode
 
     def hash_of(type_name: str) -> str:
         there = told().get(type_name)

@@ -12,12 +12,12 @@ import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from fogft.core.ordered_peer import Order
-from fogft.core.ordering import OrderId
 from fogft.core.shared_robot import SharedRobot
-from fogft.core.spec_state import StateSpec
-from fogft.proxy.mark import MarkFile
-from fogft.proxy.service_order import Numbered, report_of
+from fogft.ordering.orders import OrderId
+from fogft.ordering.peer import Order
+from fogft.poolfile.state import StateSpec
+from fogft.proxy.order_mark import MarkFile
+from fogft.proxy.robot.service_order import Numbered, report_of
 
 log = logging.getLogger(__name__)
 

@@ -3,7 +3,7 @@
 Bytes cannot be compared: the padding of CDR is whatever lay in memory. So both are made
 Python messages, which plain services never need.
 
-Owns: reading and comparing responses of one type. Not here: votes (`fogft.core.votes`).
+Owns: reading and comparing responses of one type. Not here: votes (`fogft.requests.votes`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.types import load_service_type
 
 _FLOATS = ("float", "double")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fogft.core.errors import RosError, Unreadable
+from fogft.errors import RosError, Unreadable
 
 
 def _to_bytes(message: Any) -> bytes:

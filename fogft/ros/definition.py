@@ -1,6 +1,6 @@
 """The definition of a service type, as the Python code generated for it tells.
 
-Owns: a type's fields and hash. Not here: comparing two definitions (`fogft.core.definitions`).
+Owns: a type's fields and hash. Not here: comparing two definitions (`fogft.model.type_definition`).
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fogft.core.definitions import REQUEST, RESPONSE, Definition, Fields, nested
-from fogft.core.errors import RosError
+from fogft.errors import RosError
+from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
 from fogft.ros.types import load_service_type
 
 

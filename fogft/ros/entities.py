@@ -15,8 +15,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from fogft.core.errors import RosError
-from fogft.core.repeats import worth_logging
+from fogft.errors import RosError
+from fogft.log_limits import worth_logging
 from fogft.ros.pacing import Pacer
 from fogft.ros.port import OnBurst
 from fogft.ros.transfer import ClientEnd, ServiceEnd

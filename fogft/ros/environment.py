@@ -17,7 +17,7 @@ from collections.abc import Mapping, MutableMapping
 from importlib import metadata
 from pathlib import Path
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 
 PROFILE_VARIABLE = "FASTDDS_DEFAULT_PROFILES_FILE"
 _CHOSEN_BY_USER = (

@@ -1,6 +1,6 @@
 """One status list of an action out of those of its replicas.
 
-Owns: reading and writing them. Not here: which status counts (`fogft.core.goals`).
+Owns: reading and writing them. Not here: which status counts (`fogft.topics.goals`).
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from fogft.core import goals
+from fogft.topics import goals
 
 
 def merged(said: Mapping[int, bytes]) -> bytes | None:

@@ -16,8 +16,8 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from fogft.core import ros_names
-from fogft.core.errors import RosError
+from fogft.errors import RosError
+from fogft.model import ros_names
 from fogft.ros import topic_ends, transfer
 from fogft.ros.entities import Client, Server
 from fogft.ros.port import OnBurst, Quality

@@ -21,7 +21,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.port import NotFoundYet
 
 log = logging.getLogger(__name__)

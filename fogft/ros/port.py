@@ -4,8 +4,8 @@ One context, one node and one thread that takes (one wait set) for each `RosNode
 Callbacks come from that thread and must not block. Responses and requests may be sent
 from any thread.
 
-Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.wire.rmw_node.RmwZenohNode`
-(Zenoh, no ROS installed), `fogft.ros.memory` (tests).
+Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.rmw_zenoh.node.RmwZenohNode`
+(Zenoh, no ROS installed), `tests.fakes.ros` (tests).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Protocol
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 
 OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where it has ended
 

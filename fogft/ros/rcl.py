@@ -30,7 +30,7 @@ from ctypes import (
 )
 from typing import Any
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 
 OK = 0
 TIMEOUT = 2  # of a response: whoever asked is not known yet, and was waited for

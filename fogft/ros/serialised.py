@@ -17,7 +17,7 @@ from __future__ import annotations
 from ctypes import addressof, byref, c_int64, string_at
 from typing import Any
 
-from fogft.core.errors import RosError, Unreadable
+from fogft.errors import RosError, Unreadable
 from fogft.ros import rcl
 from fogft.ros.port import NotFoundYet
 

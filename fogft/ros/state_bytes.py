@@ -4,7 +4,7 @@ The state sits in one text or byte field of a response (snapshot) and of a reque
 Where the response has a boolean `success`, false is a failure. These calls are rare, so
 Python messages are built here, as nowhere else in a proxy.
 
-Owns: reading and writing that field. Not here: when (`fogft.proxy.ordered_responder`).
+Owns: reading and writing that field. Not here: when (`fogft.proxy.replica.ordered_responder`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import array
 import re
 from typing import Any
 
-from fogft.core.errors import RosError
-from fogft.core.spec_state import StateService, StateSpec
+from fogft.errors import RosError
+from fogft.poolfile.state import StateService, StateSpec
 from fogft.ros.types import load_service_type
 
 _SEQUENCE = re.compile(r"sequence<(octet|uint8|int8|char)(?:, \d+)?>")

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.port import Quality
 
 log = logging.getLogger(__name__)

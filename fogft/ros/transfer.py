@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from typing import Any, Protocol
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 
 log = logging.getLogger(__name__)
 

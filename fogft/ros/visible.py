@@ -4,8 +4,8 @@ An ordinary rclpy node on an executor and a thread of its own, in the context of
 takes requests. Other threads only put work into its queue, so nothing here ever stands in a
 request's way, and whatever goes wrong here is logged and ends there.
 
-Owns: that node and its thread. Not here: what is said (`fogft.proxy.seen_from_ros`), the log
-(`ros_log`).
+Owns: that node and its thread. Not here: what is said (`fogft.proxy.robot.diagnostics_node`),
+the log (`ros_log`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.port import Status
 from fogft.ros.ros_log import RosLog
 

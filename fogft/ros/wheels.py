@@ -15,7 +15,7 @@ import sys
 import sysconfig
 from pathlib import Path
 
-from fogft.core.errors import FogftError, RosError
+from fogft.errors import FogftError, RosError
 
 _HEADERS = re.compile(r"/opt/python/[^/;\"]+/include/python[0-9.]+")
 _NUMPY = re.compile(r"/opt/python/[^;\"]+/numpy/(?:_core|core)/include")

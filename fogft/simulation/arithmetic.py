@@ -1,14 +1,14 @@
 """What arithmetic alone says of the same market, to set beside what was simulated.
 
 Owns: uptime and recovery of one replica in a modelled market. Their combination is
-`fogft.core.reliability`'s, for replicas that fail independently.
+`fogft.planning.reliability`'s, for replicas that fail independently.
 """
 
 from __future__ import annotations
 
 import math
 
-from fogft.core.reliability import system_unavailability, unavailability
+from fogft.planning.reliability import system_unavailability, unavailability
 from fogft.simulation.model import MarketModel, Timing
 
 

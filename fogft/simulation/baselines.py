@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from fogft.cloud.port import Launch
-from fogft.core.errors import NoCapacity
-from fogft.core.model import Offer, ReplicaId
+from fogft.errors import NoCapacity
+from fogft.model.replica import Offer, ReplicaId
 from fogft.simulation.world import NEVER, Target, World
 
 UID = "0" * 16

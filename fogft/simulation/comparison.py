@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from fogft.core.groups import groups_of, with_spot
-from fogft.core.intent import Intent
-from fogft.core.model import Observed, Offer, Placement
-from fogft.core.placement import choose
-from fogft.core.sizing import size
-from fogft.core.spec import PoolSpec
-from fogft.pool.offers import ask
+from fogft.model.groups import groups_of, with_spot
+from fogft.model.intent import Intent
+from fogft.model.replica import Observed, Offer, Placement
+from fogft.model.spec import PoolSpec
+from fogft.planning.placement import choose
+from fogft.planning.sizing import size
+from fogft.pool.manager.offers import ask
 from fogft.simulation.baselines import SkyServe, Static
 from fogft.simulation.generator import generate
 from fogft.simulation.managed import Managed

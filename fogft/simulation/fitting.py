@@ -13,7 +13,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Mapping
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 from fogft.simulation.model import MAX_CORRELATION, MarketModel
 from fogft.simulation.timeline import Timeline
 

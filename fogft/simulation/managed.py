@@ -10,17 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from fogft.core import migration, quarantine, schedule
-from fogft.core.endings import DRAIN_SETTLE_S
-from fogft.core.health import LONE_SILENCE_FACTOR
-from fogft.core.history import Event, History, compacted
-from fogft.core.intent import Intent
-from fogft.core.model import LinkReport, LinkState, MachinePhase, Membership, ReplicaId
-from fogft.core.planner import DRAIN_LIMIT_S
-from fogft.core.rollout import Trial
-from fogft.core.spec import PoolSpec
-from fogft.pool.reconciler import Reconciler, Tick
-from fogft.pool.store import Identity
+from fogft.model import schedule
+from fogft.model.intent import Intent
+from fogft.model.replica import LinkReport, LinkState, MachinePhase, Membership, ReplicaId
+from fogft.model.spec import PoolSpec
+from fogft.planning import migration
+from fogft.planning.endings import DRAIN_SETTLE_S
+from fogft.planning.observed import backoff
+from fogft.planning.observed.health import LONE_SILENCE_FACTOR
+from fogft.planning.observed.history import Event, History, compacted
+from fogft.planning.planner import DRAIN_LIMIT_S
+from fogft.planning.rollout import Trial
+from fogft.pool.folder.store import Identity
+from fogft.pool.manager.reconciler import Reconciler, Tick
 from fogft.simulation.world import NEVER, TICK_S, UNSEEN, Target, World
 
 UID = "0" * 16
@@ -29,7 +31,7 @@ _COMPACT_AFTER = 2_000
 
 
 class Memory:
-    """Implements `fogft.pool.store.Store` in memory."""
+    """Implements `fogft.pool.folder.store.Store` in memory."""
 
     def __init__(self, spec: PoolSpec, now: float) -> None:
         self.the_spec = spec
@@ -137,7 +139,7 @@ class Managed:
         history, now = self.store.history(), tick.observed.now
         health = tick.spec.health
         waits, restless = tick.plan.waits, {(id.slot, id.generation) for id in tick.plan.restless}
-        times = [quarantine.next_change(history, now, waits=waits, restless=bool(restless))]
+        times = [backoff.next_change(history, now, waits=waits, restless=bool(restless))]
         if tick.spec.schedule is not None:
             times.append(schedule.next_change(tick.spec.schedule, now))
         stay_s = tick.spec.migration.stay_s if tick.spec.migration else NEVER

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fogft.core.model import Offer
+from fogft.model.replica import Offer
 from fogft.simulation.model import Timing
 from fogft.simulation.timeline import Timeline
 

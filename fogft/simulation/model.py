@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 MAX_CORRELATION = 0.95
 HINT = "write `KEY=VALUE,...`, such as `mttf_s=54000,mttr_s=3600,correlation=0.22,boot_s=240`"

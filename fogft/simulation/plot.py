@@ -9,7 +9,7 @@ import math
 from pathlib import Path
 from typing import Any, cast
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 from fogft.simulation.comparison import Row
 from fogft.simulation.meter import DAY_S, HOURS_A_MONTH
 from fogft.simulation.report import Report

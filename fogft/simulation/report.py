@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from fogft.core.errors import FogftError
-from fogft.pool.offers import ask
+from fogft.errors import FogftError
+from fogft.pool.manager.offers import ask
 from fogft.simulation import arithmetic
 from fogft.simulation.comparison import Row, Scenario, compare, replicas_of
 from fogft.simulation.fitting import fit

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fogft.core.errors import FogftError
-from fogft.core.model import Placement
-from fogft.core.spec_tree import nearest
+from fogft.errors import FogftError
+from fogft.model.replica import Placement
+from fogft.poolfile.tree import nearest
 from fogft.simulation.timeline import Timeline, of_samples
 
 FORMAT = 'a trace is `{"metadata": {"gap_seconds": 300}, "data": [1, 1, 0, ...]}`'

@@ -18,8 +18,8 @@ from functools import partial
 from typing import Any, Protocol
 
 from fogft.cloud.port import Launch
-from fogft.core.errors import NoCapacity
-from fogft.core.model import LinkReport, Machine, MachinePhase, Offer, ReplicaId
+from fogft.errors import NoCapacity
+from fogft.model.replica import LinkReport, Machine, MachinePhase, Offer, ReplicaId
 from fogft.simulation.market import Change, Market, changes, rounded_up
 from fogft.simulation.meter import Meter
 

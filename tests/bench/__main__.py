@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 from tests.bench import machine
 from tests.bench.rig import ROOT
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
-from fogft.pool.paths import PoolPaths
-from fogft.pool.status import PoolStatus, ReplicaStatus, ServiceStatus
-from fogft.pool.store import Identity, write_identity
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import Identity, write_identity
+from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
 from tests.bench.caller import milliseconds
 from tests.bench.rig import ROOT
 from tests.bench.statistics import median

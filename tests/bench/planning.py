@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fogft.core.history import History
-from fogft.core.intent import Intent
-from fogft.core.model import Observed, Offer, Placement
-from fogft.core.planner import plan
-from fogft.core.spec import PoolSpec, ServiceSpec
-from fogft.core.spec_choices import AvailabilitySpec, OnDemandSpec
+from fogft.model.choices import AvailabilitySpec, OnDemandSpec
+from fogft.model.intent import Intent
+from fogft.model.replica import Observed, Offer, Placement
+from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.planning.observed.history import History
+from fogft.planning.planner import plan
 from tests.bench.caller import milliseconds
 from tests.bench.statistics import median
 

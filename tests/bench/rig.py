@@ -23,12 +23,13 @@ from types import MappingProxyType
 from typing import Any
 
 from fogft import disk
-from fogft.core import membership as memberships
-from fogft.core import names, topics
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.service_form import to_plain
-from fogft.core.spec_state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
-from fogft.pool import credentials
+from fogft.model import membership as memberships
+from fogft.model import names
+from fogft.model import topic as topics
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.pool.credentials import authority
+from fogft.poolfile.service_form import to_plain
+from fogft.poolfile.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
 from tests.bench.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
@@ -140,7 +141,7 @@ class Rig:
         self._policy: dict[str, Any] = policy or {}
         self.robot_domain, self.bare_domain, *domains = free_domains(2 + 2 * replicas)
         self.domains, self._bare_domains = domains[:replicas], domains[replicas:]
-        credentials.create_authority(folder / "ca", self._uid)
+        authority.create_authority(folder / "ca", self._uid)
         self.replicas = [self._replica(slot, slot in relayed) for slot in range(replicas)]
         self.floor_port = self._floor()
         self.proxy = self._client_proxy()
@@ -213,7 +214,7 @@ class Rig:
         id = ReplicaId(self._uid, slot, 1)
         port, dial_port = free_ports(2)
         name = f"replica-{slot}"
-        self._issue(name, "replica", names.replica_certificate_name(id), credentials.Role.REPLICA)
+        self._issue(name, "replica", names.replica_certificate_name(id), authority.Role.REPLICA)
         config = {
             "pool": "bench",
             "pool_uid": self._uid,
@@ -245,7 +246,7 @@ class Rig:
             "robot",
             "robot",
             names.robot_certificate_name(self._uid, "bench"),
-            credentials.Role.ROBOT,
+            authority.Role.ROBOT,
         )
         self._write_policy()
         return self._start("proxy", "fogft", "proxy", "--config", "proxy.yaml")
@@ -282,8 +283,8 @@ class Rig:
         id = ReplicaId(self._uid, 99, 1)
         folder = self.floor_folder
         for stem, name, role in (
-            ("replica", names.replica_certificate_name(id), credentials.Role.REPLICA),
-            ("robot", names.robot_certificate_name(self._uid, "floor"), credentials.Role.ROBOT),
+            ("replica", names.replica_certificate_name(id), authority.Role.REPLICA),
+            ("robot", names.robot_certificate_name(self._uid, "floor"), authority.Role.ROBOT),
         ):
             self._issue(folder.name, stem, name, role)
         self._start("floor", "tests.bench.floor", str(folder), str(port))
@@ -317,9 +318,9 @@ class Rig:
         """Where the bare round trip's certificates are."""
         return self._folder / "floor"
 
-    def _issue(self, folder: str, stem: str, name: str, role: credentials.Role) -> None:
-        credential = credentials.issue(self._folder / "ca", name, role=role)
-        credentials.write(credential, self._folder / folder, stem)
+    def _issue(self, folder: str, stem: str, name: str, role: authority.Role) -> None:
+        credential = authority.issue(self._folder / "ca", name, role=role)
+        authority.write(credential, self._folder / folder, stem)
 
     def _services(self, of_flag: dict[str, Any]) -> list[dict[str, Any]]:
         flag, other = ({"name": n, "type": t, "timeout_s": 10.0} for n, t in (FLAG, MAP))

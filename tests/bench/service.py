@@ -17,9 +17,9 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from fogft.core.middleware import Speaks
-from fogft.core.spec_topics import action_services
-from fogft.core.topics import Origin, TopicSpec
+from fogft.model.middleware import Speaks
+from fogft.model.topic import Origin, TopicSpec
+from fogft.poolfile.topics import action_services
 from fogft.proxy import middleware
 
 FLAG = ("/bench_flag", "std_srvs/srv/SetBool")

@@ -10,7 +10,7 @@ from typing import Any
 
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers
-from fogft.core.spec import PoolSpec, ServiceSpec
+from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.simulation.comparison import Scenario, policies, unlogged
 from fogft.simulation.market import remembered
 from fogft.simulation.meter import DAY_S

@@ -11,14 +11,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from fogft.core.middleware import Speaks
+from fogft.model.middleware import Speaks
 from tests.bench import machine
 from tests.bench.caller import Caller, Flood, milliseconds, payloads
 from tests.bench.floor import Floor
 from tests.bench.rig import Rig
 from tests.bench.service import FLAG, MAP
 from tests.bench.statistics import Estimate, estimate, median, overhead_ratio, percentile
-from tests.wire import rmw_router
+from tests.rmw_zenoh import rmw_router
 
 _WARM_UP = 30
 _IN_FLIGHT = 64

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from tests.link.wire_pool import wait_for
 from tests.proxy.counting_relay import CountingRelay
 from tests.proxy.gateway_pool import GatewayPool, Robot
-from tests.wire.wire_pool import wait_for
 
 REPLICAS = (1, 2, 4)
 PAYLOAD_BYTES = 100_000

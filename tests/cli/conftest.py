@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft.pool import latency
+from fogft.pool.manager import distances
 
 
 @pytest.fixture(autouse=True)
@@ -16,7 +16,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir(mode=0o700)
     monkeypatch.setenv("FOGFT_HOME", str(folder))
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr(latency, "connect_time", _unreachable)  # no test asks the Internet
+    monkeypatch.setattr(distances, "connect_time", _unreachable)  # no test asks the Internet
     for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE"):
         monkeypatch.delenv(name, raising=False)
     return folder

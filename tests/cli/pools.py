@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
-from fogft.core.intent import Intent, to_json
-from fogft.pool.paths import PoolPaths
-from fogft.pool.status import PoolStatus, ReplicaStatus, ServiceStatus
-from fogft.pool.store import Identity, write_identity
+from fogft.model.intent import Intent, to_json
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import Identity, write_identity
+from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
 
 UID = "0123456789abcdef"
 FILE = "/home/robot/pool.yaml"

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 from fogft.cli import main
-from fogft.core import names
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.pool import bundle, credentials
-from fogft.pool.ledger import Ledger
-from fogft.pool.paths import PoolPaths
-from fogft.pool.store import Identity, write_identity
+from fogft.model import names
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.pool.credentials import authority, bundle
+from fogft.pool.credentials.ledger import Ledger
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import Identity, write_identity
 
 UID = "0123456789abcdef"
 POOL_FILE = """
@@ -37,7 +37,7 @@ def paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PoolPaths:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(bundle._SCRYPT, "n", 2)
     paths = PoolPaths.of("planner")
-    credentials.create_authority(paths.credentials, UID)
+    authority.create_authority(paths.credentials, UID)
     write_identity(paths, Identity("planner", UID, "local", str(tmp_path / "p.yaml"), 0.0))
     paths.spec.write_text(POOL_FILE)
     return paths

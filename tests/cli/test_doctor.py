@@ -18,8 +18,8 @@ from fogft.cloud.local import faults
 from fogft.cloud.local.faults import CloudFaults
 from fogft.doctor import checks, finding, leftovers, machine, pools, ros
 from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
-from fogft.pool import credentials
-from fogft.pool.paths import PoolPaths
+from fogft.pool.credentials import authority
+from fogft.pool.folder.paths import PoolPaths
 
 UID = "0123456789abcdef"
 
@@ -38,9 +38,9 @@ def folder(tmp_path: Path) -> Path:
     """A pool's credentials: its CA and a robot's."""
     path = PoolPaths.of("planner", tmp_path).credentials
     path.parent.mkdir(parents=True)
-    credentials.create_authority(path, UID)
-    issued = credentials.issue(path, f"robot.r.1.{UID}", role=credentials.Role.ROBOT)
-    credentials.write(issued, path, "robot")
+    authority.create_authority(path, UID)
+    issued = authority.issue(path, f"robot.r.1.{UID}", role=authority.Role.ROBOT)
+    authority.write(issued, path, "robot")
     return path
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from fogft import app
 from fogft.cli import main
-from fogft.core.errors import PoolNotFound
+from fogft.errors import PoolNotFound
 
 
 def run_failing(monkeypatch: pytest.MonkeyPatch, problem: BaseException) -> int:

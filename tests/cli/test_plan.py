@@ -12,8 +12,9 @@ import pytest
 
 from fogft import app
 from fogft.cli import main
-from fogft.pool import startup, traffic
-from fogft.pool.paths import PoolPaths
+from fogft.pool.commands import startup
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager import traffic
 
 POOL = """
 name: planner

@@ -15,7 +15,7 @@ import pytest
 from fogft import disk
 from fogft.cli import main
 from fogft.cli.status_text import age, milliseconds, number
-from fogft.pool.status import PoolStatus
+from fogft.pool.manager.status import PoolStatus
 from tests.cli.pools import FILE, STATUS, lay_down
 
 SCREEN = """\

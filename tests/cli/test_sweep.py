@@ -13,8 +13,8 @@ from fogft import disk
 from fogft.cli import main
 from fogft.cloud import sky
 from fogft.cloud.local import processes
-from fogft.core.errors import CloudUnreachable
-from fogft.pool.paths import PoolPaths
+from fogft.errors import CloudUnreachable
+from fogft.pool.folder.paths import PoolPaths
 from tests.cli.pools import STATUS, lay_down
 from tests.cloud.conftest import Local
 from tests.sky.scene import Scene

@@ -10,11 +10,11 @@ import pytest
 from fogft import app, disk
 from fogft.cli import main, progress
 from fogft.cli.lifecycle import is_answering
-from fogft.core.errors import FogftError, SpecError
-from fogft.core.rollout import Trial
-from fogft.pool.seen import Seen
-from fogft.pool.status import PoolStatus, UpdateStatus
-from fogft.pool.store import digest
+from fogft.errors import FogftError, SpecError
+from fogft.planning.rollout import Trial
+from fogft.pool.commands.status import Seen
+from fogft.pool.folder.store import digest
+from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from tests.cli.pools import REPLICA, SPEC, STATUS, lay_down
 
 POOL = SPEC + "resources: {infra: local/us-west-2, use_spot: true}\n"

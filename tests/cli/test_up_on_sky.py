@@ -13,8 +13,8 @@ import pytest
 from fogft import app
 from fogft.cli import main, progress
 from fogft.cloud import sky
-from fogft.core.errors import CloudUnreachable
-from fogft.pool.seen import Seen
+from fogft.errors import CloudUnreachable
+from fogft.pool.commands.status import Seen
 from tests.cli.pools import SPEC, lay_down
 from tests.cli.test_up import UP
 from tests.sky.scene import Scene

@@ -12,7 +12,7 @@ import pytest
 from fogft.cloud.local import LocalCloud, processes
 from fogft.cloud.local.chaos import Chaos
 from fogft.cloud.port import Launch
-from fogft.core.model import Machine, MachinePhase, Placement, ReplicaId
+from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 from tests.cloud.waiting import wait_for
 
 STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in.py")))

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from fogft.cloud.local import LocalCloud
 from fogft.cloud.port import Launch
-from fogft.core.errors import CloudError
-from fogft.core.model import Placement, ReplicaId
+from fogft.errors import CloudError
+from fogft.model.replica import Placement, ReplicaId
 from tests.cloud.conftest import STAND_IN
 
 root, uid, slot, where, step = sys.argv[1:]

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from fogft.cloud.local import faults, processes
-from fogft.core.errors import CloudError, NoCapacity
-from fogft.core.model import MachinePhase, ReplicaId
+from fogft.errors import CloudError, NoCapacity
+from fogft.model.replica import MachinePhase, ReplicaId
 from tests.cloud.waiting import wait_for
 
 CHECKOUT = Path(__file__).parents[2]
@@ -141,7 +141,7 @@ def test_a_blackhole_ends_by_itself_though_its_author_is_gone(local, call):
     machine = local.running()
     caller = call(machine.endpoint)
     code = (
-        "import sys; from pathlib import Path; from fogft.core.model import ReplicaId\n"
+        "import sys; from pathlib import Path; from fogft.model.replica import ReplicaId\n"
         "from fogft.cloud.local.chaos import Chaos\n"
         "Chaos(Path(sys.argv[1])).blackhole(ReplicaId(sys.argv[2], 0, 1), for_s=1.5)"
     )

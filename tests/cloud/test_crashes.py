@@ -15,7 +15,7 @@ import pytest
 
 from fogft.cloud.local import folder as folders
 from fogft.cloud.local import processes
-from fogft.core.model import MachinePhase, ReplicaId
+from fogft.model.replica import MachinePhase, ReplicaId
 from tests.cloud.waiting import wait_for
 
 CHECKOUT = Path(__file__).parents[2]

@@ -14,8 +14,8 @@ import pytest
 
 from fogft.cloud.local import ending, processes
 from fogft.cloud.local import folder as folders
-from fogft.core.errors import CloudError, NoCapacity
-from fogft.core.model import MachinePhase, ReplicaId
+from fogft.errors import CloudError, NoCapacity
+from fogft.model.replica import MachinePhase, ReplicaId
 from tests.cloud.waiting import wait_for
 
 

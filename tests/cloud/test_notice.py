@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fogft.cloud import notice_formats as formats
 from fogft.cloud.notice import Notice, NoticeKind, Watch, watch
-from fogft.core.errors import CloudError
+from fogft.errors import CloudError
 from tests.cloud.fake_metadata import FakeMetadata, serving
 
 REBALANCE, PREEMPTION = NoticeKind.REBALANCE, NoticeKind.PREEMPTION

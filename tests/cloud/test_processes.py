@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from fogft.cloud.local import processes
-from fogft.core.errors import CloudUnreachable
+from fogft.errors import CloudUnreachable
 from tests.cloud.waiting import wait_for
 
 

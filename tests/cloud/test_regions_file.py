@@ -8,7 +8,7 @@ import pytest
 
 from fogft.cloud.local.catalogue import BUILT_IN, Instance, Zone
 from fogft.cloud.local.regions_file import read
-from fogft.core.errors import SpecError
+from fogft.errors import SpecError
 
 
 @pytest.fixture

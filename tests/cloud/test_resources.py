@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fogft.cloud.local.catalogue import BUILT_IN, Catalogue, Instance, Zone
 from fogft.cloud.local.resources import offers
-from fogft.core.errors import SpecError
+from fogft.errors import SpecError
 
 SMALL = Instance("small", 2, 8, 0.2, 0.1)
 LARGE = Instance("large", 8, 64, 0.8, 0.3)

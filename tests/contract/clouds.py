@@ -15,13 +15,13 @@ from typing import Any
 
 from fogft.cloud.local import LocalCloud, processes
 from fogft.cloud.local.chaos import Chaos
-from fogft.cloud.mock import MockCloud, zones
 from fogft.cloud.port import Cloud, Launch
 from fogft.cloud.sky.naming import cluster_name
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import Placement, ReplicaId
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import Placement, ReplicaId
 from tests.cloud.conftest import STAND_IN
 from tests.cloud.waiting import wait_for
+from tests.fakes.cloud import MockCloud, zones
 from tests.sky.scene import Scene as SkyScene
 
 # Not the same in every run: on the local cloud the uid marks real processes of this computer.

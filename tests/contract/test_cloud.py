@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.core.errors import CloudUnreachable, NoCapacity, SpecError
-from fogft.core.model import MachinePhase, ReplicaId
+from fogft.errors import CloudUnreachable, NoCapacity, SpecError
+from fogft.model.replica import MachinePhase, ReplicaId
 from tests.contract.clouds import OTHER_UID, UID, CloudUnderTest, is_unreachable
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros import environment
-from fogft.ros.memory import MemoryDomain
-from tests.wire.rmw_router import Router
+from tests.fakes.ros import MemoryDomain
+from tests.rmw_zenoh.rmw_router import Router
 
 SET_BOOL = "std_srvs/srv/SetBool"
 TRUE = b"\x00\x01\x00\x00\x01"  # SetBool's request, little-endian CDR
@@ -70,7 +70,7 @@ def _rclpy(domain: int) -> World:
 
 
 def _zenoh(router: Router) -> World:
-    from fogft.wire.rmw_node import RmwZenohNode
+    from fogft.rmw_zenoh.node import RmwZenohNode
 
     hashes = {SET_BOOL: "RIHS01_" + "ab" * 32}
     return World(

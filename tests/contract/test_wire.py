@@ -1,4 +1,4 @@
-"""The contract of links and listeners, on every implementation of `wire.port`."""
+"""The contract of links and listeners, on every implementation of `link.port`."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from fogft.core import names
-from fogft.core.definitions import Definition
-from fogft.core.errors import WireError
-from fogft.core.model import LinkState, ReplicaId, doubted_after_s
-from fogft.wire.link_window import ATTEMPTS_LIMIT
-from fogft.wire.memory import MemoryWire
-from fogft.wire.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer, Refusal
-from fogft.wire.zenoh_dialer import ZenohDialer
-from fogft.wire.zenoh_listener import ZenohListener
-from tests.wire.wire_pool import (
+from fogft.errors import WireError
+from fogft.link.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer, Refusal
+from fogft.link.window import ATTEMPTS_LIMIT
+from fogft.link.zenoh.replica.listener import ZenohListener
+from fogft.link.zenoh.robot.dialer import ZenohDialer
+from fogft.model import names
+from fogft.model.replica import LinkState, ReplicaId, doubted_after_s
+from fogft.model.type_definition import Definition
+from tests.fakes.link import MemoryWire
+from tests.link.wire_pool import (
     LIMIT_S,
     POOL_UID,
     SERVICE,

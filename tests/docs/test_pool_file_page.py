@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from fogft.core import spec_keys
-from fogft.core.availability import Assumption, Correlation
-from fogft.core.errors import SpecError
-from fogft.core.middleware import Middleware
-from fogft.core.score import Weights
-from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
-from fogft.core.spec_choices import MigrationSpec, OnDemandSpec, ScheduleSpec
-from fogft.core.spec_keys import (
+from fogft.errors import SpecError
+from fogft.model.choices import MigrationSpec, OnDemandSpec, ScheduleSpec
+from fogft.model.middleware import Middleware
+from fogft.model.scoring import Weights
+from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
+from fogft.planning.availability import Assumption, Correlation
+from fogft.poolfile import file
+from fogft.poolfile import keys as spec_keys
+from fogft.poolfile.keys import (
     FOGFT_KEYS,
     HEALTH_KEYS,
     LATER_KEYS,
@@ -22,8 +23,7 @@ from fogft.core.spec_keys import (
     SERVICE_KEYS,
     TASK_KEYS,
 )
-from fogft.core.spec_state import STATE_KEYS
-from fogft.pool import pool_file
+from fogft.poolfile.state import STATE_KEYS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "pool-file.md").read_text()
 EXAMPLES = [part.split("```")[0] for part in PAGE.split("```yaml\n")[1:4]]
@@ -146,10 +146,10 @@ def test_limits_of_the_plan_are_the_codes(key, high, above):
         top = low = level
     for value, others in ((f"{high:.5f}", top), ("0.00001" if above else "0", low)):
         changed = EXAMPLES[1].replace(level, others)
-        pool_file.parse(re.sub(pattern, f"{key}: {value}", changed), file="p.yaml")
+        file.parse(re.sub(pattern, f"{key}: {value}", changed), file="p.yaml")
     for value in (high * 1.001 + 1e-6, 0 if above else -1):
         with pytest.raises(SpecError, match=rf"{key}: must be"):
-            pool_file.parse(re.sub(pattern, f"{key}: {value:.8f}", EXAMPLES[1]), file="p.yaml")
+            file.parse(re.sub(pattern, f"{key}: {value:.8f}", EXAMPLES[1]), file="p.yaml")
 
 
 def limits():
@@ -172,7 +172,7 @@ def test_limits_are_the_codes(key, low, high, above):
 
     def parse(value):
         assert re.search(rf"\b{key}: \S+", example)
-        pool_file.parse(re.sub(rf"\b{key}: \S+", f"{key}: {value}", example), file="p.yaml")
+        file.parse(re.sub(rf"\b{key}: \S+", f"{key}: {value}", example), file="p.yaml")
 
     parse(high)
     parse(low + 0.001 if above else low)
@@ -183,10 +183,10 @@ def test_limits_are_the_codes(key, low, high, above):
 
 def test_the_examples_are_complete_and_right():
     """They parse, and show every key of ours."""
-    spec = pool_file.parse(EXAMPLE, file="pool.yaml")
+    spec = file.parse(EXAMPLE, file="pool.yaml")
     assert spec.name == "perception"
-    assert pool_file.parse(EXAMPLES[1], file="pool.yaml").name == "picking"
-    assert pool_file.parse(EXAMPLES[2], file="pool.yaml").name == "watching"
+    assert file.parse(EXAMPLES[1], file="pool.yaml").name == "picking"
+    assert file.parse(EXAMPLES[2], file="pool.yaml").name == "watching"
     for key in (
         *FOGFT_KEYS,
         *SERVICE_KEYS,
@@ -198,7 +198,7 @@ def test_the_examples_are_complete_and_right():
 
 def test_the_mistake_is_told_as_printed():
     with pytest.raises(SpecError) as caught:
-        pool_file.parse(EXAMPLE.replace("replicas:", "replcas:"), file="pool.yaml")
+        file.parse(EXAMPLE.replace("replicas:", "replcas:"), file="pool.yaml")
     printed = section("Mistakes")
     assert re.sub(r":\d+:", ":14:", caught.value.message) in printed
     assert f"hint: {caught.value.hint}\n" in printed

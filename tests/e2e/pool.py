@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fogft.pool import seen
-from fogft.pool.paths import PoolPaths
+from fogft.pool.commands import status as seen
+from fogft.pool.folder.paths import PoolPaths
 
 NODES = Path(__file__).parent / "nodes"
 

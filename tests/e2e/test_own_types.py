@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from fogft.pool import init, templates
+from fogft import template_files
+from fogft.pool.commands import init
 from tests.e2e.pool import Pool
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
@@ -25,7 +26,7 @@ if importlib.util.find_spec("rosidl_generator_py") is None:
 
 def build(folder: Path, environ: dict[str, str]) -> None:
     done = subprocess.run(
-        ["bash", str(templates.folder() / "workspace.sh")],
+        ["bash", str(template_files.folder() / "workspace.sh")],
         cwd=folder, env={**environ, "PATH": PATH}, capture_output=True, text=True, timeout=300,
         check=False,
     )  # fmt: skip
@@ -98,7 +99,7 @@ def test_what_was_built_elsewhere_is_not_trusted(pool: Pool, tmp_path: Path):
     environ = {**os.environ, "PATH": f"{fake}:{PATH}", "ROS_DISTRO": "any"}
     for left in (False, True):
         subprocess.run(
-            ["bash", str(templates.folder() / "workspace.sh")],
+            ["bash", str(template_files.folder() / "workspace.sh")],
             cwd=workspace, env=environ, check=True, timeout=60,
         )  # fmt: skip
         assert (install / "left").exists() is left

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fogft import disk
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 from tests.bench import machine
 from tests.bench.rig import ROOT
 from tests.evaluation import registry, running

@@ -1,6 +1,6 @@
 """Experiment `failures`: the paper's failure qualification (III.C), put right and simulated.
 
-Owns: what is compared. Not here: the arithmetic (`fogft.core.reliability`), pools in
+Owns: what is compared. Not here: the arithmetic (`fogft.planning.reliability`), pools in
 simulated markets (`simulated`), the number of replicas for a target (`fogft plan`).
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from fogft.core.reliability import replicas_needed, system_unavailability, unavailability
+from fogft.planning.reliability import replicas_needed, system_unavailability, unavailability
 from fogft.simulation.model import MarketModel, Timing
 from tests.evaluation import plotting
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from fogft import disk
 from fogft.cloud.local import processes
-from fogft.pool import pool_file
+from fogft.poolfile import file as pool_file
 from fogft.ros import shared_memory
 from tests.bench.rig import ROOT, free_domains
 from tests.evaluation.errors import EvaluationError

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers
-from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
+from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.simulation.comparison import SETTLE_S, Scenario, policies, unlogged
 from fogft.simulation.market import remembered
 from fogft.simulation.model import MarketModel, Timing

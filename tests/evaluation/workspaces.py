@@ -16,8 +16,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from fogft import disk
-from fogft.pool import templates
+from fogft import disk, template_files
 from tests.bench.rig import ROOT
 from tests.evaluation.errors import EvaluationError
 
@@ -43,9 +42,9 @@ def ready(example: str) -> Path:
             f"(Debian: apt install {packages or 'python3-colcon-common-extensions'})"
         )
     with disk.locked(FOLDER / f"{example}.lock"):
-        _copy(templates.folder() / example, folder)
+        _copy(template_files.folder() / example, folder)
         done = subprocess.run(
-            ["bash", str(templates.folder() / "workspace.sh")],
+            ["bash", str(template_files.folder() / "workspace.sh")],
             cwd=folder, env={**os.environ, "PATH": path}, capture_output=True, text=True,
             timeout=_BUILD_LIMIT_S, check=False,
         )  # fmt: skip

@@ -8,13 +8,13 @@ import sys
 from collections.abc import Iterator
 from types import ModuleType
 
-from fogft.pool import templates
+from fogft import template_files
 
 
 @contextlib.contextmanager
 def modules(example: str, *names: str) -> Iterator[list[ModuleType]]:
     """Yield modules of an example; afterwards other examples may have others of these names."""
-    folder = templates.folder() / example
+    folder = template_files.folder() / example
     own = {path.stem for path in folder.glob("*.py")}
     before = {name: sys.modules.pop(name) for name in own & sys.modules.keys()}
     sys.path.insert(0, str(folder))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.pool import templates
+from fogft import template_files
 from tests.examples.loading import modules
 
 pytest.importorskip("PIL", reason="not installed: pip install 'fogft[vision]'")
@@ -17,7 +17,7 @@ with modules("detect", "ssd", "pictures", "fetch_weights") as found:
     ssd, pictures, fetch_weights = found
 
 LABELS = ["???", "Cat", "Dog"]
-WEIGHTS = templates.folder() / "detect" / "weights"
+WEIGHTS = template_files.folder() / "detect" / "weights"
 
 
 def encoded(*objects: tuple[int, int, float, tuple[float, float, float, float]]):

@@ -15,27 +15,25 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from fogft.core import (
-    holders,
-    membership,
-    ordering,
-    records,
-    rmw_zenoh,
-    roster,
-    shared_book,
-    shared_orders,
-)
-from fogft.core.definitions import Definition
-from fogft.core.errors import CredentialError, StateError
-from fogft.core.model import LinkState, Member, Membership, ReplicaId
-from fogft.core.record_set import RecordSet
-from fogft.core.records import RecordError, RecordKind, SignedRecord
-from fogft.pool import bundle, credentials, joining
-from fogft.wire import batch_frames, compression, frame, probe_frames, record_frames, topic_frames
-from fogft.wire.frame import FrameError, Greeting
-from fogft.wire.guests import Guests, NotAdmittedError
-from fogft.wire.port import Behind, Probe, ProbeAnswer
-from fogft.wire.signing import Signer, Verifier
+from fogft.core import shared_book, shared_orders
+from fogft.errors import CredentialError, StateError
+from fogft.link import batch_frames, compression, frame, probe_frames
+from fogft.link.frame import FrameError, Greeting
+from fogft.link.port import Behind, Probe, ProbeAnswer
+from fogft.link.zenoh.replica.sessions import Guests, NotAdmittedError
+from fogft.model import certificate_holder, membership
+from fogft.model.replica import LinkState, Member, Membership, ReplicaId
+from fogft.model.type_definition import Definition
+from fogft.ordering import orders
+from fogft.pool.commands import joining
+from fogft.pool.credentials import authority, bundle
+from fogft.records import frames, roster
+from fogft.records import record as records
+from fogft.records.record import RecordError, RecordKind, SignedRecord
+from fogft.records.record_set import RecordSet
+from fogft.records.signing import Signer, Verifier
+from fogft.rmw_zenoh import naming
+from fogft.topics import frames as topic_frames
 
 UID = "0123456789abcdef"
 ROBOT = f"robot.ada.1.{UID}"
@@ -70,13 +68,13 @@ class Target:
 @lru_cache(maxsize=1)
 def _signers() -> tuple[Path, Callable[[str], Signer]]:
     folder = Path(tempfile.mkdtemp(prefix="fogft-fuzz-"))
-    credentials.create_authority(folder, UID)
+    authority.create_authority(folder, UID)
 
     @cache
     def signer(common_name: str) -> Signer:
-        role = holders.holder_of(common_name).role
-        issued = credentials.issue(folder, common_name, role=role)
-        credentials.write(issued, folder, common_name)
+        role = certificate_holder.holder_of(common_name).role
+        issued = authority.issue(folder, common_name, role=role)
+        authority.write(issued, folder, common_name)
         return Signer(folder / f"{common_name}.crt", folder / f"{common_name}.key")
 
     return folder / "ca.crt", signer
@@ -123,15 +121,15 @@ def _guests() -> Guests:
 
 def _stream(data: bytes) -> None:
     """Read a rendezvous's stream, cut in two, and each message as every kind."""
-    unframer = record_frames.Unframer()
+    unframer = frames.Unframer()
     half = len(data) // 2
     for part in (data[:half], data[half:]):
         for message in unframer.feed(part):
             for read in (
-                record_frames.read_challenge,
-                record_frames.read_greeting,
-                record_frames.read_have,
-                record_frames.read_records,
+                frames.read_challenge,
+                frames.read_greeting,
+                frames.read_have,
+                frames.read_records,
             ):
                 with contextlib.suppress(RecordError):
                     read(message)
@@ -151,13 +149,13 @@ def _content(data: bytes) -> None:
 def _order(data: bytes) -> None:
     """Read a sequencer's order, and each answer to one."""
     text = data.decode("latin-1")
-    for read_refusal in (ordering.read_gap, ordering.read_fenced, ordering.read_held):
+    for read_refusal in (orders.read_gap, orders.read_fenced, orders.read_held):
         read_refusal(text)
     for read in (
-        ordering.decode_join,
-        ordering.decode_promise,
-        ordering.decode_index,
-        ordering.decode_snapshot,
+        orders.decode_join,
+        orders.decode_promise,
+        orders.decode_index,
+        orders.decode_snapshot,
         shared_orders.decode_entry,
         shared_orders.decode_vote,
         shared_orders.decode_standing,
@@ -168,9 +166,9 @@ def _order(data: bytes) -> None:
         shared_orders.decode_answer,
         shared_book.decode,
     ):
-        with contextlib.suppress(ordering.OrderError):
+        with contextlib.suppress(orders.OrderError):
             read(data)
-    ordering.decode(data)
+    orders.decode(data)
 
 
 def _judge_greeting(data: bytes) -> None:
@@ -193,7 +191,7 @@ def _json(data: bytes) -> Any:
 
 
 def _token(data: bytes) -> None:
-    if rmw_zenoh.read_token(data.decode("latin-1")) is None:
+    if naming.read_token(data.decode("latin-1")) is None:
         raise ValueError("no token")
 
 
@@ -216,11 +214,11 @@ def targets() -> dict[str, Target]:
     origin = frame.origin("ada", TOKEN)
     stream = b"".join(
         [
-            record_frames.ping(),
-            record_frames.challenge(bytes(record_frames.NONCE_BYTES), "10.0.0.1"),
-            record_frames.greeting(*_signers()[1](ROBOT)(b"proof")),
-            record_frames.have({("slot", "0"): (1, 1)}),
-            *record_frames.records(_records()),
+            frames.ping(),
+            frames.challenge(bytes(frames.NONCE_BYTES), "10.0.0.1"),
+            frames.greeting(*_signers()[1](ROBOT)(b"proof")),
+            frames.have({("slot", "0"): (1, 1)}),
+            *frames.records(_records()),
         ]
     )
     return {
@@ -274,8 +272,8 @@ def targets() -> dict[str, Target]:
         ),
         "order": Target(
             _order,
-            (ordering.OrderError,),
-            (ordering.encode(ordering.Op.APPLY, 1 << 32, 7),),
+            (orders.OrderError,),
+            (orders.encode(orders.Op.APPLY, 1 << 32, 7),),
         ),
         "content of a record": Target(
             _content,
@@ -289,10 +287,10 @@ def targets() -> dict[str, Target]:
         "rmw_zenoh token": Target(
             _token,
             (ValueError,),
-            (f"@ros2_lv/7/a/0/1/SS/%/%/n/%s/a::srv::dds_::B_/{rmw_zenoh.NO_HASH}/::2".encode(),),
+            (f"@ros2_lv/7/a/0/1/SS/%/%/n/%s/a::srv::dds_::B_/{naming.NO_HASH}/::2".encode(),),
         ),
         "common name": Target(
-            lambda data: holders.holder_of(data.decode("latin-1")),
+            lambda data: certificate_holder.holder_of(data.decode("latin-1")),
             (ValueError,),
             (ROBOT.encode(), REPLICA.encode()),
         ),
@@ -311,9 +309,7 @@ def targets() -> dict[str, Target]:
             lambda data: _verifier()(data, b"", b""), recorded, (_records()[0].certificate,)
         ),
         "record stream": Target(_stream, recorded, (stream,)),
-        "records of a link": Target(
-            record_frames.unpack, recorded, (record_frames.pack(_records()),)
-        ),
+        "records of a link": Target(frames.unpack, recorded, (frames.pack(_records()),)),
         "message of a topic": Target(
             topic_frames.decode_message, framed, (topic_frames.encode_message(TOKEN, 7, b"cdr"),)
         ),

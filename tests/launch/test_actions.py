@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 launch = pytest.importorskip(
     "launch", reason="ROS 2'S launch IS NOT INSTALLED: launch files are not tried"

@@ -13,7 +13,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 from fogft.launch.words import FILE_LIMIT_BYTES, NodeWords, pool_tree, run_text
 
 SHOW = "import json, os, sys; print(json.dumps([sys.argv[1:], dict(os.environ)]))"

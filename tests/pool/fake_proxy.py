@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 from fogft import disk
-from fogft.core import membership
-from fogft.pool.paths import PoolPaths
+from fogft.model import membership
+from fogft.pool.folder.paths import PoolPaths
 
 
 def main(folder: str) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.port import Audit, Launch
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import Machine, MachinePhase, Offer, Placement, ReplicaId
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import Machine, MachinePhase, Offer, Placement, ReplicaId
 
 ZONES = [Placement("folder", region, "a", "m1") for region in ("one", "two", "three")]
 

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
-from fogft.pool import pool_file, shutdown, startup
-from fogft.pool.paths import PoolPaths
-from fogft.pool.store import PoolStore, write_identity
+from fogft.pool.commands import startup
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import PoolStore, write_identity
+from fogft.pool.manager import shutdown
+from fogft.poolfile import file as pool_file
 from tests.pool.folder_cloud import FolderCloud
 
 FILE = """\
@@ -60,7 +62,7 @@ class Scene:
         return startup.write(self.store, spec, source=source, file=self.file, cloud="folder")
 
     def command(self, name: str = "pool") -> list[str]:
-        return [sys.executable, "-m", "tests.pool.manager_process", str(self.home), name]
+        return [sys.executable, "-m", "tests.pool.manager.manager_process", str(self.home), name]
 
     def let_hours_pass(self, hours: float) -> None:
         """Make the pool older than it is."""

@@ -21,14 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.records import RecordKind
-from fogft.core.roster import admission_content
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.records.record import RecordKind
+from fogft.records.roster import admission_content
+from tests.link.namespaces import Namespaces, inside
+from tests.link.thin_relay import ThinRelay
+from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.proxy.gateway_pool import GatewayPool, Robot, ServerProxy
-from tests.wire.namespaces import Namespaces, inside
-from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
-from tests.wire.thin_relay import ThinRelay
-from tests.wire.wire_pool import POOL_UID, Authority, wait_for
+from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
 
 LIMIT_S = 90.0
 PLACE, NEAR, REST, FAR = "10.79.1.1", "10.79.1.2", "10.79.2.1", "10.79.2.2"

@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from fogft.core import membership, names
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.topology import Topology
-from fogft.pool import credentials
+from fogft.model import membership, names
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.model.topology import Topology
+from fogft.pool.credentials import authority
 
 UID = "0123456789abcdef"
 LIMIT_S = 60.0
@@ -54,7 +54,7 @@ class Parts:
         self._domain = domain
         self._processes: list[subprocess.Popen[bytes]] = []
         self._version = 0
-        credentials.create_authority(folder / "ca", UID)
+        authority.create_authority(folder / "ca", UID)
 
     def replica(self, slot: int, argument: float | str = 0.001, **environ: str) -> Replica:
         return Replica(self, slot, argument, environ)
@@ -62,9 +62,9 @@ class Parts:
     def robot(self, name: str, *replicas: Replica) -> Robot:
         return Robot(self, name, replicas)
 
-    def issue(self, common_name: str, role: credentials.Role, stem: str) -> None:
-        made = credentials.issue(self.folder / "ca", common_name, role=role)
-        credentials.write(made, self.folder, stem)
+    def issue(self, common_name: str, role: authority.Role, stem: str) -> None:
+        made = authority.issue(self.folder / "ca", common_name, role=role)
+        authority.write(made, self.folder, stem)
 
     def domain(self) -> int:
         return self._domain()
@@ -105,7 +105,7 @@ class Replica:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.endpoint = f"127.0.0.1:{free.getsockname()[1]}"
-        parts.issue(names.replica_certificate_name(self.id), credentials.Role.REPLICA, stem)
+        parts.issue(names.replica_certificate_name(self.id), authority.Role.REPLICA, stem)
         config = parts.folder / f"replica{slot}.{generation}.yaml"
         notice = "auto" if environ else "none"
         config.write_text(
@@ -147,7 +147,7 @@ class Robot:
         self._status = parts.folder / f"{name}-status.json"
         self._config = parts.folder / f"{name}.yaml"
         self.domain = parts.domain()
-        parts.issue(names.robot_certificate_name(UID, name), credentials.Role.ROBOT, name)
+        parts.issue(names.robot_certificate_name(UID, name), authority.Role.ROBOT, name)
         self._config.write_text(
             f'pool: p\npool_uid: "{UID}"\nrobot: {name}\nmembership: {self._members.name}\n'
             f"status: {self._status.name}\nlease: lease.json\nlock: {name}.lock\n"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from fogft.core.errors import RosError
-from fogft.core.model import LinkState, ReplicaId
-from fogft.wire.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.errors import RosError
+from fogft.link.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.model.replica import LinkState, ReplicaId
 
 UID = "0123456789abcdef"
 

@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from fogft.child import tied
-from fogft.core import membership, names
-from fogft.core.holders import Role
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.topology import Gateway, Topology
-from fogft.wire.config import CredentialPaths
-from tests.wire.namespaces import inside
-from tests.wire.rendezvous_pool import free_port
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model import membership, names
+from fogft.model.certificate_holder import Role
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.model.topology import Gateway, Topology
+from tests.link.namespaces import inside
+from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
+from tests.records.rendezvous_pool import free_port
 
 ROOT = Path(__file__).parents[2]
 
@@ -234,7 +234,7 @@ class Robot(Process):
     """A client proxy without ROS; see `plain_robot`."""
 
     def command(self) -> list[str]:
-        return [sys.executable, "-m", "tests.proxy.plain_robot", str(self._config),
+        return [sys.executable, "-m", "tests.proxy.robot.plain_robot", str(self._config),
                 str(self._first)]  # fmt: skip
 
     def tell(self, **command: Any) -> dict[str, Any]:

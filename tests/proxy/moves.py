@@ -16,12 +16,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.records import RecordKind
-from fogft.core.roster import admission_content, slot_state
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.records.record import RecordKind
+from fogft.records.roster import admission_content, slot_state
+from tests.link.wire_pool import POOL_UID, wait_for
 from tests.proxy.gateway_pool import GatewayPool, Robot, ServerProxy
-from tests.wire.rendezvous_pool import Party, Rendezvous, manager_files
-from tests.wire.wire_pool import POOL_UID, wait_for
+from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
 
 LIMIT_S = 60.0
 

@@ -17,13 +17,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from fogft.link.zenoh.handshakes import HandshakeLog
+from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
 from fogft.proxy.process import stop_on_signal
-from fogft.proxy.server import ServerProxy
-from fogft.proxy.supervisor import Supervisor
-from fogft.wire.handshakes import HandshakeLog
-from fogft.wire.zenoh_listener import ZenohListener
+from fogft.proxy.replica.server import ServerProxy
+from fogft.proxy.replica.supervisor import Supervisor
 
 
 class EchoNode:

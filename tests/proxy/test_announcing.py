@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from fogft.core.model import ReplicaId
-from fogft.core.records import Record, RecordKind
-from fogft.core.roster import slot_state
+from fogft.model.replica import ReplicaId
 from fogft.proxy.announcing import LOAD_EVERY_S, Announcer, doors
-from fogft.wire.rendezvous_client import Known
+from fogft.records.client import Known
+from fogft.records.record import Record, RecordKind
+from fogft.records.roster import slot_state
 
 UID = "0123456789abcdef"
 

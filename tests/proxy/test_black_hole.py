@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from tests.link.namespaces import why_not
 from tests.proxy import black_hole
-from tests.wire.namespaces import why_not
 
 pytestmark = pytest.mark.timeout(240)
 ROUTER = pytest.param(

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from fogft.core import membership, names
-from fogft.core.holders import Role
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.records import RecordKind
-from fogft.core.roster import admission_content
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model import membership, names
+from fogft.model.certificate_holder import Role
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.records.client import RendezvousClient
+from fogft.records.record import RecordKind
+from fogft.records.roster import admission_content
 from fogft.ros import environment
-from fogft.wire.config import CredentialPaths
-from fogft.wire.rendezvous_client import RendezvousClient
 from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]

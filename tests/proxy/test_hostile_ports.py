@@ -1,7 +1,7 @@
 """Whatever comes in at a gateway's port, and at the doors of gateways and robots.
 
 No process ends, nothing changes, all is counted. The replica's port and the rendezvous are in
-`tests/wire/test_hostile.py` and `tests/wire/test_rendezvous_hostile.py`.
+`tests/link/zenoh/test_hostile.py` and `tests/records/test_rendezvous_hostile.py`.
 """
 
 from __future__ import annotations
@@ -17,18 +17,20 @@ from typing import Any
 import pytest
 import zenoh
 
-from fogft.core import names
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.records import Record, RecordKind
-from fogft.core.roster import admission_content
-from fogft.wire import config, frame, record_frames
-from fogft.wire.config import CredentialPaths, LinkSettings
-from fogft.wire.port import Peer
-from fogft.wire.signing import Signer
+from fogft.link import frame
+from fogft.link.port import Peer
+from fogft.link.zenoh import settings
+from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.model import names
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.records import frames
+from fogft.records.record import Record, RecordKind
+from fogft.records.roster import admission_content
+from fogft.records.signing import Signer
+from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, hears, knows, wait_for
 from tests.proxy.gateway_pool import GatewayPool
-from tests.wire import hostile
-from tests.wire.rendezvous_pool import free_port, manager_files
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Authority, hears, knows, wait_for
+from tests.records import hostile
+from tests.records.rendezvous_pool import free_port, manager_files
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -94,7 +96,7 @@ class Scene:
         """Return the bare session of somebody whose certificate lets him ask the gateway."""
         name = names.gateway_certificate_name(POOL_UID, "edge")
         peer = Peer(ReplicaId(POOL_UID, SLOT, 1), self.port, name)
-        return zenoh.open(config.to_zenoh(config.robot_settings(peer, files, LinkSettings())))
+        return zenoh.open(settings.to_zenoh(settings.robot_settings(peer, files, LinkSettings())))
 
     def greeting(self, files: CredentialPaths) -> bytes:
         token = bytes(range(8))
@@ -166,7 +168,7 @@ def _manager(
     files: CredentialPaths, kind: RecordKind, sequence: int, content: dict[str, Any]
 ) -> bytes:
     record = Record(POOL_UID, kind, "", 1, sequence, content)
-    return record_frames.pack([hostile.signed(files, record)])
+    return frames.pack([hostile.signed(files, record)])
 
 
 def test_a_replayed_membership_at_a_gateways_port(scene):
@@ -208,7 +210,7 @@ def test_noise_replays_and_impostors_at_a_door(scene, tmp_path, whose):
             hostile.throw(door, make(dice))
             expected["greeting_failed" if kind == "nothing" else "noise"] += 1
         for message in ({"type": "greeting", "v": 9}, {"type": "greeting", "v": 1}):
-            hostile.throw(door, record_frames.frame(message))
+            hostile.throw(door, frames.frame(message))
         expected.update({"greeting_version": 1, "noise": 1})
         for files, event in hostile.impostors(scene.authority, tmp_path):
             with hostile.greet(door, files) as link:

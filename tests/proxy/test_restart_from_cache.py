@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from fogft.core import names
-from fogft.core.model import Member, Membership, ReplicaId
-from fogft.core.records import RecordKind
-from fogft.core.roster import admission_content
-from fogft.core.topology import Gateway, Topology
-from fogft.wire import record_cache
+from fogft.model import names
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.model.topology import Gateway, Topology
+from fogft.records import cache
+from fogft.records.record import RecordKind
+from fogft.records.roster import admission_content
+from tests.link.wire_pool import POOL_UID, wait_for
 from tests.proxy.gateway_pool import GatewayPool, Process, ServerProxy
-from tests.wire.rendezvous_pool import Party, Rendezvous, free_port, manager_files
-from tests.wire.wire_pool import POOL_UID, wait_for
+from tests.records.rendezvous_pool import Party, Rendezvous, free_port, manager_files
 
 pytestmark = pytest.mark.timeout(480)
 
@@ -58,7 +58,7 @@ class Scene:
 
     def cached(self, stem: str) -> int:
         """Return how many records a proxy has on its disk."""
-        return len(record_cache.read(self.pool.folder / f"{stem}-records.json"))
+        return len(cache.read(self.pool.folder / f"{stem}-records.json"))
 
     def serve(self) -> bool:
         """Whether both robots are answered, each request by its own answer."""

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.proxy.by_hand import LIMIT_S, Parts, Replica, Robot, wait_for
-from tests.wire.rmw_router import Router
+from tests.rmw_zenoh.rmw_router import Router
 
 pytestmark = pytest.mark.timeout(180)
 if importlib.util.find_spec("pyzeros") is None:

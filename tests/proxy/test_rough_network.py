@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.link.rough_cable import RoughCable, why_not_rough
+from tests.link.thin_relay import ThinRelay
+from tests.link.wire_pool import SERVICE, wait_for
 from tests.proxy.gateway_pool import GatewayPool, Robot, ran
-from tests.wire.rough_cable import RoughCable, why_not_rough
-from tests.wire.thin_relay import ThinRelay
-from tests.wire.wire_pool import SERVICE, wait_for
 
 ROBOT, CLOUD = "10.85.1.1", "10.85.1.2"
 LIMIT_S = 110.0

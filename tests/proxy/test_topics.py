@@ -6,10 +6,10 @@ import random
 
 import pytest
 
-from fogft.core.topics import Origin, TopicSpec
-from fogft.proxy.topics_replica import HOLD_S, TopicsOnReplica
-from fogft.proxy.topics_robot import TopicsOnRobot
-from fogft.wire.port import Answer, Refusal
+from fogft.link.port import Answer, Refusal
+from fogft.model.topic import Origin, TopicSpec
+from fogft.proxy.replica.topics import HOLD_S, TopicsOnReplica
+from fogft.proxy.robot.topics import TopicsOnRobot
 from tests.proxy.fakes import Clock, FakeLink
 
 

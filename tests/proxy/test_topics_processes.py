@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from fogft.core import service_form, topics
-from fogft.core.spec_topics import action_services, action_topics
-from fogft.core.topics import Origin, TopicSpec
+from fogft.model import topic as topics
+from fogft.model.topic import Origin, TopicSpec
+from fogft.poolfile import service_form
+from fogft.poolfile.topics import action_services, action_topics
 from fogft.ros import environment
 from tests.proxy.by_hand import Parts, Replica, Robot
 from tests.ros.person import Person

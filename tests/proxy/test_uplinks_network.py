@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from tests.link.namespaces import Namespaces
+from tests.link.wire_pool import wait_for
 from tests.proxy.gateway_pool import GatewayPool, ran
-from tests.wire.namespaces import Namespaces
-from tests.wire.wire_pool import wait_for
 
 pytestmark = pytest.mark.timeout(120)
 # One address of the replica, reached through either cable.

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from fogft.core.spec import ServiceSpec
-from fogft.core.uplinks import UplinkPolicy
-from fogft.wire.config import LinkSettings
-from fogft.wire.uplinks import UplinkDialer
-from fogft.wire.zenoh_dialer import ZenohDialer
+from fogft.link.uplinks import UplinkDialer
+from fogft.link.zenoh.robot.dialer import ZenohDialer
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.spec import ServiceSpec
+from fogft.model.uplinks import UplinkPolicy
+from tests.link.thin_relay import ThinRelay
+from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Owner, keys, peer, request_id, wait_for
 from tests.proxy.gateway_pool import GatewayPool, ran
-from tests.wire.thin_relay import ThinRelay
-from tests.wire.wire_pool import POOL_UID, SERVICE, TYPE, Owner, keys, peer, request_id, wait_for
 
 REQUESTS, LIMIT_S = 20, 90.0
 PATIENT: dict[str, Any] = {"suspect_after_s": 60.0, "settings": LinkSettings(stall_after_s=60.0)}

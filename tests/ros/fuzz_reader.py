@@ -9,7 +9,7 @@ import random
 import sys
 from typing import Any
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros import rcl
 from fogft.ros.serialised import CMessage
 from fogft.ros.types import load_service_type

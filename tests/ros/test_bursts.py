@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.entities import BURST, Server
 
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.comparison import Comparison, check_tolerances
 
 pytestmark = pytest.mark.ros

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fogft.ros import environment
-from tests.wire.namespaces import Namespaces
+from tests.link.namespaces import Namespaces
 
 pytestmark = pytest.mark.ros
 SCRIPT = Path(__file__).with_name("ours.py")

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros import environment
 
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from fogft.pool import templates
+from fogft import template_files
 
 pytestmark = pytest.mark.ros
 pytest.importorskip("rclpy")
@@ -50,14 +50,14 @@ def call(folder, environment, *arguments):
 
 def test_echo(ros_domain):
     """The smallest example answers, and says so."""
-    folder = templates.folder() / "echo"
+    folder = template_files.folder() / "echo"
     with service(folder, ros_domain, "echo_service.py") as (environment, _):
         done = call(folder, environment, "echo_client.py", "--count", "2")
     assert (done.returncode, done.stdout) == (0, "heard True\nheard False\n")
 
 
 def test_echo_without_a_service(ros_domain):
-    folder = templates.folder() / "echo"
+    folder = template_files.folder() / "echo"
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
     done = call(folder, environment, "echo_client.py", "--timeout-s", "0.2")
     assert (done.returncode, done.stdout, done.stderr) == (1, "", "no service /echo\n")
@@ -66,7 +66,7 @@ def test_echo_without_a_service(ros_domain):
 def test_planner(ros_domain):
     """Every plan is right, the score adds up, and OMPL keeps quiet to the end."""
     pytest.importorskip("ompl")
-    folder = templates.folder() / "planner"
+    folder = template_files.folder() / "planner"
     with service(folder, ros_domain, "planner_service.py") as (environment, process):
         done = call(folder, environment, "planner_client.py", "--count", "8", "--period-s", "0.05")
         process.send_signal(signal.SIGINT)
@@ -83,7 +83,7 @@ def test_planner(ros_domain):
 def test_the_planners_client_finds_wrong_answers(ros_domain):
     """A service that plans in another scene is caught: the check can fail."""
     pytest.importorskip("ompl")
-    folder = templates.folder() / "planner"
+    folder = template_files.folder() / "planner"
     arguments = ("planner_service.py", "--scene", "8", "--limit-s", "0.2")
     with service(folder, ros_domain, *arguments) as (environment, _):
         done = call(folder, environment, "planner_client.py", "--count", "4", "--period-s", "0.05")
@@ -96,7 +96,7 @@ def test_the_planners_client_finds_wrong_answers(ros_domain):
 
 def test_the_planners_client_counts_what_is_never_answered(ros_domain):
     """A frozen service fails every request, and the client still ends."""
-    folder = templates.folder() / "planner"
+    folder = template_files.folder() / "planner"
     pytest.importorskip("ompl")
     with service(folder, ros_domain, "planner_service.py") as (environment, process):
         process.stderr.readline()  # "ready to plan"

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 
 from .conftest import LIMIT_S, SET_BOOL, wait_for
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.pacing import (
     EVERY_S,
     WAITING_BYTES_LIMIT,

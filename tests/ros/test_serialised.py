@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros import converted, memory_tuning, rcl, serialised, transfer
 from fogft.ros.types import load_service_type
 

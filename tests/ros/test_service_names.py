@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.core import ros_names
-from fogft.core.errors import SpecError
-from fogft.pool import pool_file
+from fogft.errors import SpecError
+from fogft.model import ros_names
+from fogft.poolfile import file
 from fogft.ros import types
 
 pytestmark = pytest.mark.ros
@@ -47,7 +47,7 @@ def test_the_longest_name_that_we_accept_is_accepted_by_ros():
 def fault(service):
     source = f"run: x\nfogft:\n  services: [{{name: a, {service}}}]\n"
     with pytest.raises(SpecError) as caught:
-        pool_file.parse(
+        file.parse(
             source,
             file="p.yaml",
             check_types=types.check_service_type,

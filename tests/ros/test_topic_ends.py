@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.core.errors import RosError, Unreadable
+from fogft.errors import RosError, Unreadable
 from fogft.ros.port import Quality
 
 from .conftest import wait_for

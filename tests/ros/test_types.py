@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fogft.core.definitions import difference
-from fogft.core.errors import RosError
-from fogft.proxy.interruption import CANCEL_TYPE, EMPTY_REQUEST
+from fogft.errors import RosError
+from fogft.model.type_definition import difference
+from fogft.proxy.replica.interruption import CANCEL_TYPE, EMPTY_REQUEST
 from fogft.ros import types
 from fogft.ros.definition import definition
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fogft.core.errors import RosError
+from fogft.errors import RosError
 from fogft.ros.port import Level, Status
 from tests.ros.person import Person
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from itertools import zip_longest
 
-from fogft.core.history import Event
+from fogft.planning.observed.history import Event
 from fogft.simulation.comparison import policies, unlogged
 from fogft.simulation.managed import Managed
 from fogft.simulation.world import World

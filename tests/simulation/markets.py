@@ -7,8 +7,8 @@ from typing import Any
 
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers
-from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
-from fogft.core.spec_choices import MigrationSpec, OnDemandSpec, ScheduleSpec, WindowSpec
+from fogft.model.choices import MigrationSpec, OnDemandSpec, ScheduleSpec, WindowSpec
+from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.simulation.comparison import Scenario
 from fogft.simulation.market import remembered
 from fogft.simulation.model import MarketModel, Timing

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fogft.core.history import Event, History
-from fogft.core.intent import Intent
-from fogft.core.membership import is_newer
-from fogft.core.model import Membership
-from fogft.core.rollout import Trial
-from fogft.core.spec import PoolSpec
-from fogft.pool.store import Identity
+from fogft.model.intent import Intent
+from fogft.model.membership import is_newer
+from fogft.model.replica import Membership
+from fogft.model.spec import PoolSpec
+from fogft.planning.observed.history import Event, History
+from fogft.planning.rollout import Trial
+from fogft.pool.folder.store import Identity
 
 
 class MemoryStore:
-    """Implements `fogft.pool.store.Store`; `crash_point` is called around every write."""
+    """Implements `fogft.pool.folder.store.Store`; `crash_point` is called around every write."""
 
     def __init__(self, identity: Identity, spec: PoolSpec) -> None:
         self._identity = identity

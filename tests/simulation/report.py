@@ -15,9 +15,9 @@ from typing import Any
 from fogft.cli.simulate import duration, percent
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers
-from fogft.core.reliability import replicas_needed
-from fogft.core.spec import HealthSpec, PoolSpec, ServiceSpec
-from fogft.pool import pool_file
+from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
+from fogft.planning.reliability import replicas_needed
+from fogft.poolfile import file
 from fogft.simulation import arithmetic, plot
 from fogft.simulation.comparison import SETTLE_S, Row, Scenario, estimate, policies, unlogged
 from fogft.simulation.market import remembered
@@ -48,7 +48,7 @@ PAPER = MarketModel(mttf_s=54_000.0, mttr_s=7_200.0, together=0.0)
 
 def scenarios(*, quick: bool = False) -> dict[str, Scenario]:
     """Return what is simulated side by side, by name."""
-    pool = pool_file.read(FOLDER / "pool.yaml")
+    pool = file.read(FOLDER / "pool.yaml")
     days, seeds = (1.0, range(2)) if quick else (7.0, range(20))
     return {
         name: Scenario(pool, FIND, Timing(), model, days=days, seeds=tuple(seeds))
@@ -183,7 +183,7 @@ def arithmetic_table(errors: list[dict[str, Any]]) -> Iterator[str]:
     one = 1 - arithmetic.moving(PAPER, WITHOUT_NOTICE)
     needed = replicas_needed(one, 0.9995)
     yield (
-        "Unavailability of spot replicas by `fogft.core.reliability`, which takes them for "
+        "Unavailability of spot replicas by `fogft.planning.reliability`, which takes them for "
         "independent, and as"
     )
     yield (

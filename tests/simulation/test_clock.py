@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.core.history import MOVING, Event, EventKind
+from fogft.planning.observed.history import MOVING, Event, EventKind
 from tests.simulation.test_pools import FAULTS, PLACES, kill_the_manager, make_world, recover
 from tests.simulation.world import UID, World
 

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 from fogft.simulation import fitting, model
 from fogft.simulation.generator import generate
 from fogft.simulation.model import MarketModel, Timing

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.core import intent as intents
-from fogft.core.errors import CloudUnreachable, NoCapacity, QuotaExceeded
-from fogft.core.spec import HealthSpec, PoolSpec
+from fogft.errors import CloudUnreachable, NoCapacity, QuotaExceeded
+from fogft.model import intent as intents
+from fogft.model.spec import HealthSpec, PoolSpec
 from tests.simulation.world import SERVICE, UID, CheckedCloud, World
 
 PLACES = (

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.core import intent as intents
-from fogft.core.errors import CloudUnreachable
+from fogft.errors import CloudUnreachable
+from fogft.model import intent as intents
 from tests.simulation.test_pools import FAULTS, PLACES, live_through_faults, make_world, recover
 from tests.simulation.world import UID, RememberingCloud, World
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.core.spec import HealthSpec, PoolSpec
+from fogft.model.spec import HealthSpec, PoolSpec
 from tests.simulation.test_pools import PLACES, kill_the_manager, preempt, recover
 from tests.simulation.world import SERVICE, UID, World
 

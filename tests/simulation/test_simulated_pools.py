@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.core import planner
-from fogft.core.history import EventKind
-from fogft.core.spec_choices import OnDemandSpec, ScheduleSpec, WindowSpec
+from fogft.model.choices import OnDemandSpec, ScheduleSpec, WindowSpec
+from fogft.planning import planner
+from fogft.planning.observed.history import EventKind
 from fogft.simulation import arithmetic
 from fogft.simulation.comparison import (
     SETTLE_S,
@@ -151,7 +151,7 @@ def test_the_budget_holds_at_every_moment():
 
 @pytest.mark.parametrize("replicas", [1, 2, 3])
 def test_without_correlation_the_product_of_unavailabilities_is_right(replicas):
-    """`core.reliability` for replicas that stay, against eight simulated months."""
+    """`planning.reliability` for replicas that stay, against eight simulated months."""
     wanted = scenario(
         spec(replicas), model=INDEPENDENT, timing=Timing(boot_s=0.0, answer_s=1.0, detect_s=1.0),
         days=40.0,

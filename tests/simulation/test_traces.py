@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from fogft.core.errors import FogftError
-from fogft.core.model import Placement
+from fogft.errors import FogftError
+from fogft.model.replica import Placement
 from fogft.simulation import traces
 from fogft.simulation.market import Market, changes
 from fogft.simulation.model import Timing

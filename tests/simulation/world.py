@@ -10,13 +10,13 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from fogft.cloud.mock import MockCloud, zones
 from fogft.cloud.port import Launch
-from fogft.core.clock import Reading
-from fogft.core.model import LinkReport, LinkState, Machine, MachinePhase, ReplicaId
-from fogft.core.spec import PoolSpec, ServiceSpec
-from fogft.pool.reconciler import Reconciler, Tick
-from fogft.pool.store import Identity
+from fogft.model.replica import LinkReport, LinkState, Machine, MachinePhase, ReplicaId
+from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.planning.observed.clock_jumps import Reading
+from fogft.pool.folder.store import Identity
+from fogft.pool.manager.reconciler import Reconciler, Tick
+from tests.fakes.cloud import MockCloud, zones
 from tests.simulation.memory_store import MemoryStore
 
 UID = "0123456789abcdef"

@@ -9,10 +9,10 @@ from typing import Any
 
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState
-from fogft.core.model import LinkReport, LinkState, Offer, Placement, ReplicaId
-from fogft.core.spec import PoolSpec, ServiceSpec
-from fogft.pool.reconciler import Reconciler, Tick
-from fogft.pool.store import Identity
+from fogft.model.replica import LinkReport, LinkState, Offer, Placement, ReplicaId
+from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.pool.folder.store import Identity
+from fogft.pool.manager.reconciler import Reconciler, Tick
 from tests.simulation.memory_store import MemoryStore
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, WEST, replica

@@ -14,7 +14,7 @@ from typing import Any
 
 from fogft.cloud import sky
 from fogft.cloud.port import Launch
-from fogft.core.model import MachinePhase, ReplicaId
+from fogft.model.replica import MachinePhase, ReplicaId
 
 ID = ReplicaId("00000000000000aa", 0, 1)
 RESOURCES = {"infra": "aws/us-east-1", "cpus": "2", "use_spot": True}

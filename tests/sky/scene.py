@@ -9,7 +9,7 @@ from typing import Any
 from fogft.cloud.port import Launch
 from fogft.cloud.sky.adapter import SkyCloud
 from fogft.cloud.sky.naming import cluster_name
-from fogft.core.model import Machine, Placement, ReplicaId
+from fogft.model.replica import Machine, Placement, ReplicaId
 from tests.sky.scripted_sky import EAST, ScriptedProvider, ScriptedSky, replica
 
 TASK: Mapping[str, Any] = {"run": "python3 serve.py", "resources": {"infra": "aws", "cpus": "2+"}}

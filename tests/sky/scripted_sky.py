@@ -21,8 +21,8 @@ from fogft.cloud.sky.sdk import (
     Request,
     RequestState,
 )
-from fogft.core.errors import CloudError, CloudUnreachable
-from fogft.core.model import Offer, Placement, ReplicaId
+from fogft.errors import CloudError, CloudUnreachable
+from fogft.model.replica import Offer, Placement, ReplicaId
 
 EAST = Placement("aws", "us-east-1", "us-east-1a", "m6i.large")
 WEST = Placement("aws", "us-west-2", "us-west-2a", "m6i.large")

@@ -10,8 +10,8 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.following import DEFAULT_LIMITS, JOB_PAUSE_S
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
-from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
-from fogft.core.model import MachinePhase
+from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
+from fogft.model.replica import MachinePhase
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, WEST, replica
 

@@ -11,8 +11,8 @@ import pytest
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.provider import NotAllowedError
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import ReplicaId
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import ReplicaId
 from tests.sky.scripted_sky import replica
 
 needs_moto = pytest.mark.skipif(

@@ -8,7 +8,7 @@ import pytest
 
 from fogft.cloud.sky.calls import Calls
 from fogft.cloud.sky.sdk import RefusedError
-from fogft.core.errors import CloudError, CloudUnreachable
+from fogft.errors import CloudError, CloudUnreachable
 
 
 class ApiServerConnectionError(RuntimeError):

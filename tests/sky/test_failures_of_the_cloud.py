@@ -9,10 +9,10 @@ import pytest
 from fogft.cloud.sky.naming import cluster_name, infra
 from fogft.cloud.sky.presence import PROVIDER_SURE_AFTER_S
 from fogft.cloud.sky.sdk import JobState
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import ReplicaId
-from fogft.core.quarantine import LIMIT_S
-from fogft.pool import farewell
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import ReplicaId
+from fogft.planning.observed.backoff import LIMIT_S
+from fogft.pool.manager import teardown
 from tests.sky.pool_on_sky import NORTH, UID, PoolOnSky
 from tests.sky.scripted_sky import EAST, WEST, replica
 
@@ -234,7 +234,7 @@ def test_down_without_an_answer_says_what_may_still_run_and_how_to_look(pool: Po
     pool.scene.cloud = pool.scene.another_process()
     pool.sky.unreachable = True
     with pytest.raises(CloudUnreachable) as caught:
-        end(pool, [], known=farewell.Known("perception", ("replica 0.1 (aws/us-east-1)",)))
+        end(pool, [], known=teardown.Known("perception", ("replica 0.1 (aws/us-east-1)",)))
     assert caught.value.message.splitlines() == [
         "it cannot be told what of `perception` still runs: SkyPilot cannot tell",
         "  may still run: replica 0.1 (aws/us-east-1)",
@@ -291,12 +291,12 @@ def test_hours_that_are_over_end_every_vm(pool: PoolOnSky):
     assert pool.ordered() == [infra(EAST)]
 
 
-def end(pool: PoolOnSky, ended: list[str], known: farewell.Known | None = None) -> None:
+def end(pool: PoolOnSky, ended: list[str], known: teardown.Known | None = None) -> None:
     """Do with the machines what `down` does."""
-    farewell.end_machines(
+    teardown.end_machines(
         pool.scene.cloud,
         UID,
-        known=known or farewell.Known("perception", clouds=frozenset({"aws"})),
+        known=known or teardown.Known("perception", clouds=frozenset({"aws"})),
         done=ended.append,
         warned=lambda what: pytest.fail(what),
         limit_s=0.0,

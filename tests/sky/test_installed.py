@@ -22,8 +22,8 @@ import pytest
 from fogft.cloud.sky import answers, guard, task, template
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import Placement
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import Placement
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, ScriptedSky
 
@@ -343,6 +343,6 @@ def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, An
 def test_the_clouds_that_a_pool_file_can_name_are_skypilots():
     import sky
 
-    from fogft.cloud.names import NO_VM_CLOUDS, VM_CLOUDS
+    from fogft.model.clouds import NO_VM_CLOUDS, VM_CLOUDS
 
     assert set(sky.CLOUD_REGISTRY) == {*VM_CLOUDS, *NO_VM_CLOUDS} - {"k8s"}

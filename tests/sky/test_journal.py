@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fogft.cloud.sky.journal import Entry, Journal, Stage
-from fogft.core.errors import StateError
-from fogft.core.model import ReplicaId
+from fogft.errors import StateError
+from fogft.model.replica import ReplicaId
 from tests.sky.scripted_sky import EAST, replica
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.cloud.sky import naming
-from fogft.core.model import Placement, ReplicaId
+from fogft.model.replica import Placement, ReplicaId
 
 ids = st.builds(
     ReplicaId,

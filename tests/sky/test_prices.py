@@ -9,8 +9,8 @@ import pytest
 
 from fogft.cloud.sky.prices import FRESH_S, USABLE_S, Prices
 from fogft.cloud.sky.sdk import RefusedError
-from fogft.core.errors import CloudUnreachable, SpecError
-from fogft.core.model import Offer, Placement
+from fogft.errors import CloudUnreachable, SpecError
+from fogft.model.replica import Offer, Placement
 from tests.sky.scripted_sky import EAST, WEST, ScriptedProvider, ScriptedSky
 
 

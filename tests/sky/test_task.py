@@ -13,8 +13,8 @@ import pytest
 
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming, task, template
-from fogft.core.errors import SpecError
-from fogft.core.model import Placement
+from fogft.errors import SpecError
+from fogft.model.replica import Placement
 from tests.sky.scripted_sky import EAST, WEST, replica
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from fogft.cloud.sky import wheel
-from fogft.core.errors import CloudError
+from fogft.errors import CloudError
 
 METADATA = "Metadata-Version: 2.3\nName: fogft\nVersion: 0.1.0\n"
 WHEEL = "Wheel-Version: 1.0\nGenerator: hatchling\nRoot-Is-Purelib: true\nTag: cp311-none-any\n"

@@ -17,14 +17,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.link.namespaces import why_not
+from tests.link.wire_pool import wait_for
 from tests.proxy.gateway_pool import ran
 from tests.soak import schedule
 from tests.soak.damage import do
 from tests.soak.load import CALM, Load
 from tests.soak.verdict import Outcome, faults_found
 from tests.soak.world import LIMIT_S, World, made
-from tests.wire.namespaces import why_not
-from tests.wire.wire_pool import wait_for
 
 UPLINKS = ("failover", "prefer", "all")
 

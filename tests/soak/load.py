@@ -8,8 +8,8 @@ from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
+from tests.link.wire_pool import SERVICE
 from tests.proxy.gateway_pool import Robot
-from tests.wire.wire_pool import SERVICE
 
 EVERY_S = 0.05
 SIZES = (8, 1000, 10_000, 100_000)

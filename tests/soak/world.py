@@ -23,13 +23,13 @@ from pathlib import Path
 from typing import Any
 
 from fogft.child import tied
-from fogft.core import names
-from fogft.core.model import Member, ReplicaId
+from fogft.model import names
+from fogft.model.replica import Member, ReplicaId
+from tests.link.namespaces import Namespaces, inside
+from tests.link.thin_relay import ThinRelay
+from tests.link.wire_pool import POOL_UID
 from tests.proxy.gateway_pool import GatewayPool, Robot, ran, start_server
-from tests.wire.namespaces import Namespaces, inside
-from tests.wire.rendezvous_pool import Rendezvous, free_port
-from tests.wire.thin_relay import ThinRelay
-from tests.wire.wire_pool import POOL_UID
+from tests.records.rendezvous_pool import Rendezvous, free_port
 
 ADDRESS = "10.82.9.9"
 REPLICAS = 3

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from fogft.core.model import Placement
+from fogft.model.replica import Placement
 
 CLOUD = "local"
 

@@ -20,9 +20,9 @@ from fogft.cloud.local.catalogue import CLOUD
 from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.local.faults import CloudFaults, LinkFaults
 from fogft.cloud.local.folder import Life, MachineFolder
-from fogft.core.errors import CloudError, StateError
-from fogft.core.model import Placement, ReplicaId
-from fogft.core.spec_tree import nearest, shown
+from fogft.errors import CloudError, StateError
+from fogft.model.replica import Placement, ReplicaId
+from fogft.poolfile.tree import nearest, shown
 
 # In an outage a machine is cut off first, and gone so long after.
 OUTAGE_KILL_AFTER_S = 1.0

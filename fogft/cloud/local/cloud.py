@@ -25,9 +25,9 @@ from fogft.cloud.local.catalogue import CLOUD, Catalogue, Zone
 from fogft.cloud.local.folder import Life, MachineFolder, Record, State
 from fogft.cloud.local.resources import offers as offers_for
 from fogft.cloud.port import Audit, Launch
-from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, StateError
-from fogft.core.model import Machine, MachinePhase, Offer, Placement, ReplicaId
-from fogft.core.spec_tree import nearest
+from fogft.errors import CloudError, CloudUnreachable, NoCapacity, StateError
+from fogft.model.replica import Machine, MachinePhase, Offer, Placement, ReplicaId
+from fogft.poolfile.tree import nearest
 
 log = logging.getLogger(__name__)
 

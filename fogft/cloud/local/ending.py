@@ -18,8 +18,8 @@ from fogft import disk
 from fogft.cloud.local import folder as folders
 from fogft.cloud.local import processes
 from fogft.cloud.local.folder import Life, MachineFolder
-from fogft.core.errors import CloudUnreachable, StateError
-from fogft.core.model import ReplicaId
+from fogft.errors import CloudUnreachable, StateError
+from fogft.model.replica import ReplicaId
 
 log = logging.getLogger(__name__)
 

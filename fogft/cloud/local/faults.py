@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
-from fogft.core.errors import StateError
+from fogft.errors import StateError
 
 FILE = "faults.json"
 

@@ -27,8 +27,8 @@ from typing import Any
 
 from fogft import disk
 from fogft.cloud.local import processes
-from fogft.core.errors import CloudError, StateError
-from fogft.core.model import MachinePhase, Placement, ReplicaId
+from fogft.errors import CloudError, StateError
+from fogft.model.replica import MachinePhase, Placement, ReplicaId
 
 RECORD = "machine.json"
 STATE = "state.json"

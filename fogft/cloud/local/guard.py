@@ -15,7 +15,7 @@ import os
 import signal
 from collections.abc import Callable
 
-from fogft.core.errors import FogftError
+from fogft.errors import FogftError
 
 log = logging.getLogger(__name__)
 

@@ -27,8 +27,8 @@ from fogft.cloud.local.ending import sweep_shared_memory
 from fogft.cloud.local.folder import MachineFolder, Record, State
 from fogft.cloud.local.relay import Relay
 from fogft.cloud.local.reservations import Reservation, reserve_domain, reserve_port
-from fogft.core.errors import FogftError, StateError
-from fogft.core.model import MachinePhase
+from fogft.errors import FogftError, StateError
+from fogft.model.replica import MachinePhase
 
 log = logging.getLogger("machine")
 

@@ -16,7 +16,7 @@ import time
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from fogft.core.errors import CloudUnreachable
+from fogft.errors import CloudUnreachable
 
 MACHINE = "FOGFT_MACHINE"
 POOL = "FOGFT_POOL_UID"

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fogft.cloud.local.catalogue import BUILT_IN, Catalogue, Instance, Zone
-from fogft.core.errors import SpecError
-from fogft.core.spec_tree import Node, Section, plain, shown
+from fogft.errors import SpecError
+from fogft.poolfile.tree import Node, Section, plain, shown
 
 if TYPE_CHECKING:
     import yaml

@@ -15,10 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
-from fogft.cloud.names import VM_CLOUDS
-from fogft.core.errors import SpecError
-from fogft.core.model import Offer, Placement
-from fogft.core.spec_tree import nearest, shown
+from fogft.errors import SpecError
+from fogft.model.clouds import VM_CLOUDS
+from fogft.model.replica import Offer, Placement
+from fogft.poolfile.tree import nearest, shown
 
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)
 _PLACE_KEYS = ("infra", "cloud", "region", "zone")

@@ -26,9 +26,9 @@ from fogft.cloud.sky.prices import Prices
 from fogft.cloud.sky.provider import Provider
 from fogft.cloud.sky.sdk import RefusedError, Sky
 from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
-from fogft.core.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
-from fogft.core.model import Machine, Offer, ReplicaId
 from fogft.disk import write_whole
+from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
+from fogft.model.replica import Machine, Offer, ReplicaId
 
 log = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from fogft.cloud.sky.failures import plain
 from fogft.cloud.sky.sdk import Cluster, ClusterState, JobState, RefusedError, Request, RequestState
-from fogft.core.errors import CloudError, CloudUnreachable
-from fogft.core.model import Placement
+from fogft.errors import CloudError, CloudUnreachable
+from fogft.model.replica import Placement
 
 # Their meaning is "nobody knows": the server, the network or the credentials, not the cluster.
 _UNKNOWN = frozenset(

@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.failures import Cause, classify
 from fogft.cloud.sky.provider import Instance, NotAllowedError
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import Placement
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import Placement
 
 T = TypeVar("T")
 

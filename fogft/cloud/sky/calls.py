@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from fogft.cloud.sky.answers import translated
-from fogft.core.errors import CloudUnreachable
+from fogft.errors import CloudUnreachable
 
 T = TypeVar("T")
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from fogft.cloud.sky.journal import Entry
 from fogft.cloud.sky.provider import Instance, NotAllowedError, Provider
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import ReplicaId
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import ReplicaId
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ refresh from the cloud, and the provider is asked itself where it can be. What S
 forgotten is ended through the provider, by its labels.
 
 Owns: the order of these steps.
-Not here: which replicas shall end (`fogft.core.planner`).
+Not here: which replicas shall end (`fogft.planning.planner`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from fogft.cloud.sky.journal import Journal
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.provider import Instance, NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError, RequestState, Sky
-from fogft.core.errors import CloudError, CloudUnreachable
-from fogft.core.model import ReplicaId
+from fogft.errors import CloudError, CloudUnreachable
+from fogft.model.replica import ReplicaId
 
 log = logging.getLogger(__name__)
 

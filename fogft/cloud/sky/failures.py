@@ -5,7 +5,7 @@ clouds' own codes on in their texts. The codes decide, not the exception's class
 without spot capacity and an account without quota come in the same class.
 
 Owns: the table of codes.
-Not here: catching exceptions (`sdk`) and what to do next (`fogft.core.quarantine`).
+Not here: catching exceptions (`sdk`) and what to do next (`fogft.planning.observed.backoff`).
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from fogft.cloud.sky.journal import Entry, Journal, Stage
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
 from fogft.cloud.sky.task import SETUP_LIMIT_S
-from fogft.core.errors import CloudError, CloudUnreachable
-from fogft.core.model import ReplicaId
+from fogft.errors import CloudError, CloudUnreachable
+from fogft.model.replica import ReplicaId
 
 log = logging.getLogger(__name__)
 

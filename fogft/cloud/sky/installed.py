@@ -21,8 +21,8 @@ from fogft.cloud.sky import guard
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
 from fogft.cloud.sky.calls import Calls
 from fogft.cloud.sky.sdk import Cluster, JobState, Request
-from fogft.core.errors import CloudError
-from fogft.core.model import Offer, Placement
+from fogft.errors import CloudError
+from fogft.model.replica import Offer, Placement
 
 T = TypeVar("T")
 

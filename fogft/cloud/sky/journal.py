@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.sky.naming import cluster_name, replica_of
-from fogft.core.errors import StateError
-from fogft.core.model import Placement, ReplicaId
 from fogft.disk import locked, make_folder, read_json, write_json, write_whole
+from fogft.errors import StateError
+from fogft.model.replica import Placement, ReplicaId
 
 
 class Stage(str, Enum):

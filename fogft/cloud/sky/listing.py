@@ -10,7 +10,7 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.journal import Entry, Stage
 from fogft.cloud.sky.provider import Instance
 from fogft.cloud.sky.sdk import Cluster, ClusterState
-from fogft.core.model import Machine, MachinePhase, Placement, ReplicaId
+from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 
 NOWHERE = Placement("", "", "", "")
 

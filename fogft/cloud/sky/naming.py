@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from fogft.core.model import Placement, ReplicaId
-from fogft.core.names import POOL_UID_PATTERN
+from fogft.model.names import POOL_UID_PATTERN
+from fogft.model.replica import Placement, ReplicaId
 
 PREFIX = "fogft-"
 POOL = "fogft-pool"

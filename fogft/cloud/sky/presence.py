@@ -16,8 +16,8 @@ from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.journal import Entry, Journal, Stage
 from fogft.cloud.sky.naming import cluster_name, replica_of
 from fogft.cloud.sky.sdk import Cluster, RequestState, Sky
-from fogft.core.errors import CloudError
-from fogft.core.model import Machine, ReplicaId
+from fogft.errors import CloudError
+from fogft.model.replica import Machine, ReplicaId
 
 log = logging.getLogger(__name__)
 

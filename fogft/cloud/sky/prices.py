@@ -21,8 +21,8 @@ from typing import Any
 from fogft.cloud.sky.failures import classify
 from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError, Sky
-from fogft.core.errors import CloudUnreachable, SpecError
-from fogft.core.model import Offer
+from fogft.errors import CloudUnreachable, SpecError
+from fogft.model.replica import Offer
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from fogft.core.model import Placement, ReplicaId
+from fogft.model.replica import Placement, ReplicaId
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol
 
-from fogft.core.errors import CloudError
-from fogft.core.model import Offer, Placement
+from fogft.errors import CloudError
+from fogft.model.replica import Offer, Placement
 
 
 class RefusedError(CloudError):

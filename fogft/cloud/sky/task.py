@@ -15,11 +15,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fogft.cloud.names import NO_VM_CLOUDS
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming
-from fogft.core.errors import SpecError
-from fogft.core.model import Placement
+from fogft.errors import SpecError
+from fogft.model.clouds import NO_VM_CLOUDS
+from fogft.model.replica import Placement
 
 LINK_PORT = 7447
 SETUP_LIMIT_S = 3600

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fogft.core.errors import CloudError
+from fogft.errors import CloudError
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 

@@ -13,8 +13,8 @@ import io
 import zipfile
 from pathlib import Path
 
-from fogft.core.errors import CloudError
 from fogft.disk import make_folder, write_whole
+from fogft.errors import CloudError
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _EPOCH = (2020, 1, 1, 0, 0, 0)

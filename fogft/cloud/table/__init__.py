@@ -21,9 +21,9 @@ from typing import Any
 
 from fogft.cloud.local.catalogue import Instance
 from fogft.cloud.local.resources import alternatives, suffices, use_spot
-from fogft.core.errors import SpecError
-from fogft.core.model import Offer, Placement
-from fogft.core.spec_tree import shown
+from fogft.errors import SpecError
+from fogft.model.replica import Offer, Placement
+from fogft.poolfile.tree import shown
 
 _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
 

@@ -24,7 +24,7 @@ import pyzeros.service_server
 import zenoh
 from pyzeros.qos import QosProfile
 
-from fogft.wire import rmw_session
+from fogft.rmw_zenoh import session as rmw_session
 
 _HEADER = b"\x00\x01\x00\x00"
 

@@ -18,8 +18,8 @@ from typing import Any
 
 from fogft.cloud.port import Launch
 from fogft.cloud.sky.adapter import SkyCloud
-from fogft.core.errors import CloudUnreachable
-from fogft.core.model import Machine, MachinePhase, Offer, ReplicaId
+from fogft.errors import CloudUnreachable
+from fogft.model.replica import Machine, MachinePhase, Offer, ReplicaId
 from tests.sky.emulated_aws.emulation import Steps, control, running, until
 from tests.sky.emulated_aws.pool import kill_server
 from tests.sky.emulated_aws.under_contract import RESOURCES, adapter, stub_server

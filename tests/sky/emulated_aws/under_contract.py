@@ -13,7 +13,7 @@ from fogft.cloud.sky import template
 from fogft.cloud.sky.adapter import SkyCloud
 from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.installed import InstalledSky
-from fogft.core.model import ReplicaId
+from fogft.model.replica import ReplicaId
 from tests.sky.emulated_aws.emulation import control, running, until
 
 RESOURCES: Mapping[str, Any] = {

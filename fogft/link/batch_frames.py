@@ -1,0 +1,115 @@
+"""Several small requests, or several small answers, in one message. Pure.
+
+A message costs both ends far more than the few bytes in it, so what leaves a connection at the
+same moment leaves together. Like `frame`, a decoder returns a value or raises `FrameError`.
+
+Owns: the bytes. Not here: what is sent together (`held`, `reply_queue`).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+from fogft.link import frame
+from fogft.link.frame import NO_STAMP, STAMP_BYTES, FrameError, RequestHeader
+from fogft.link.port import Answer
+from fogft.model.names import REQUEST_ID_BYTES
+
+LIMIT = 64  # entries
+ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload leaves alone: it does not wait, nor make wait
+BYTES_LIMIT = 16 << 10  # of all payloads together
+
+_FIRST = bytes((frame.VERSION | 0x10,))
+_STAMPED = len(_FIRST) + STAMP_BYTES
+_REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdI")  # id, remaining seconds, length
+_ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s?I")  # id, whether it is a refusal, length
+
+Requests = Sequence[tuple[bytes, float, bytes]]
+Answers = Sequence[tuple[bytes, bytes, str]]
+
+
+def is_batch(header: bytes) -> bool:
+    """Whether a message with this header carries several."""
+    return header[:1] == _FIRST
+
+
+def encode_requests(
+    requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
+) -> tuple[bytes, bytes]:
+    """Return header and payload for requests: id, remaining seconds and payload of each.
+
+    Args:
+        requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
+        origin: From `frame.origin`.
+        seen: The stamp of the last answer that the connection has seen.
+    """
+    parts = []
+    for id, remaining_s, payload in requests:
+        parts.append(_REQUEST.pack(id, remaining_s, len(payload)))
+        parts.append(payload)
+    return _FIRST + seen + origin, b"".join(parts)
+
+
+def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
+    """Return the requests of a batch, each with a header of its own.
+
+    Raises:
+        FrameError: It is not one: then none of it is to be believed.
+    """
+    if not is_batch(header):
+        raise FrameError("no batch of requests")
+    seen = header[1:_STAMPED]
+    token, robot = frame.read_origin(header[_STAMPED:])
+    found = []
+    for (id, remaining_s, _), part in _entries(_REQUEST, payload):
+        frame.check_remaining(remaining_s)
+        found.append((RequestHeader(id, remaining_s, token, robot, seen), part))
+    return found
+
+
+def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
+    """Return header and payload for answers: id, payload and refusal of each.
+
+    A refusal takes the place of the payload where it is not empty.
+    """
+    parts = []
+    for id, payload, refusal in answers:
+        said = refusal.encode("ascii") if refusal else payload
+        parts.append(_ANSWER.pack(id, bool(refusal), len(said)))
+        parts.append(said)
+    return _FIRST + stamp, b"".join(parts)
+
+
+def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
+    """Return the stamp and the answers of a batch.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if not is_batch(header) or len(header) != _STAMPED:
+        raise FrameError("no batch of answers")
+    return header[1:], [
+        Answer(id, None, frame.read_reason(part)) if refused else Answer(id, part)
+        for (id, refused, _), part in _entries(_ANSWER, payload)
+    ]
+
+
+def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[bytes, float, int], bytes]]:
+    """Return each entry's fields, the last of which is its length, and its bytes."""
+    found = []
+    at, end = 0, len(payload)
+    while at < end:
+        begin = at + form.size
+        if begin > end:
+            raise FrameError("a batch that is cut short")
+        fields = form.unpack_from(payload, at)
+        at = begin + fields[2]
+        if at > end:
+            raise FrameError("a batch that is cut short")
+        found.append((fields, payload[begin:at]))
+        if len(found) > LIMIT:
+            raise FrameError(f"a batch of more than {LIMIT}")
+    if not found:
+        raise FrameError("an empty batch")
+    return found

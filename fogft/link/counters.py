@@ -1,0 +1,45 @@
+"""Counts of what happened, by name, and a line in the log for what people should know.
+
+Owns: numbers. Not here: what they are shown as (`fogft.proxy`, `fogft.pool`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Mapping
+
+from fogft.log_limits import worth_logging
+
+
+class Counters:
+    """Counts by event name, from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+
+    def add(self, event: str, times: int = 1) -> int:
+        """Count an event; return how often it has happened."""
+        with self._lock:
+            self._counts[event] += times
+            return self._counts[event]
+
+    def warn(self, log: logging.Logger, event: str, message: str, *values: object) -> None:
+        """Count an event and log it, the more often it happens the more seldom.
+
+        Args:
+            log: Whose log.
+            event: Under which name it is counted.
+            message: The line, with a place for each of `values`; the count is added to it.
+            values: What happened.
+        """
+        count = self.add(event)
+        if worth_logging(count):
+            log.warning(f"{message} count=%d", *values, count)
+
+    def snapshot(self) -> Mapping[str, int]:
+        """Return all counts."""
+        with self._lock:
+            return dict(self._counts)

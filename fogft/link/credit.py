@@ -1,0 +1,70 @@
+"""How much may be sent without any risk that sending blocks. Pure.
+
+Sending blocks only when the peer takes nothing and all buffers on the way are full. So a few
+bytes may be sent from a thread that must never block, as long as all that was sent since the
+peer's last sign is less than those buffers surely hold: the smallest send buffer of a Linux
+socket with the smallest receive buffer, and two batches of Zenoh's, together over 200 KB.
+
+Owns: the sum. Not here: what a sign is. Kept true by tests/link/zenoh/robot/test_memory_bounds.py.
+"""
+
+from __future__ import annotations
+
+import threading
+
+CREDIT_BYTES = 64 << 10
+SMALL_BYTES = 16 << 10
+_FRAME_BYTES = 256  # what travels with a payload: key, header, encryption
+
+
+class Credit:
+    """Bytes on the way to one peer, queued ones included, after the last of which a sign came.
+
+    Args:
+        limit: Bytes that may be on the way.
+    """
+
+    def __init__(self, limit: int = CREDIT_BYTES) -> None:
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._sent = 0
+        self._heard = 0
+        self._queued = 0
+
+    @property
+    def on_the_way(self) -> int:
+        """Bytes sent of which no sign has come."""
+        return self._sent - self._heard
+
+    def take(self, size: int) -> int | None:
+        """Reserve a small send; return its mark, or None where it might block."""
+        if size > SMALL_BYTES:
+            return None
+        with self._lock:
+            if self._queued:
+                return None
+            mark = self._sent + size + _FRAME_BYTES
+            if mark - self._heard > self._limit:
+                return None
+            self._sent = mark
+            return mark
+
+    def queue(self, size: int) -> int:
+        """Count a send of any size for the thread that may block; return its mark.
+
+        Until `dequeued` nothing is taken: that thread may be in the midst of it.
+        """
+        with self._lock:
+            self._queued += 1
+            self._sent += size + _FRAME_BYTES
+            return self._sent
+
+    def dequeued(self) -> None:
+        """The thread that may block has done with one."""
+        with self._lock:
+            self._queued -= 1
+
+    def heard(self, mark: int | None = None) -> None:
+        """A sign came that all up to a mark has arrived; without a mark, all so far."""
+        with self._lock:
+            self._heard = max(self._heard, self._sent if mark is None else mark)

@@ -1,0 +1,106 @@
+"""What cannot arrive before its deadline is not sent, and what would wait too long is declined.
+
+Where more is asked of a thin link than it carries, each request leaves after those before it, with
+too little of its time left: every one arrives too late, and none in time. So the window follows
+from the rate at which the link was seen to carry (`carried`) and from the time that is left; who is
+declined at once may be sent on another uplink, or to another replica.
+
+Known for ten seconds only: then a request is let through again, by which the link is measured anew.
+
+Owns: the judgement. Not here: rates, the bounds by bytes and by count (`link_window`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterable
+from typing import Protocol
+
+from fogft.link.compression import Compression
+from fogft.log_limits import worth_logging
+
+log = logging.getLogger(__name__)
+
+
+class Sized(Protocol):
+    """What must be known of an attempt."""
+
+    @property
+    def service(self) -> str:
+        """Name of the service."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of its payload."""
+
+
+class InTime:
+    """Of one connection. Any thread.
+
+    Args:
+        timed: Services whose requests are of no use after their time.
+        carries: Returns what the link carries, by the clock, in bytes a second; None where that is
+            not known.
+        left: Returns how many bytes sent before have not arrived, by the clock and that rate.
+        packs: Returns a service's compression; None where its payloads leave as they are.
+
+    Attributes:
+        declined: How often there was not enough time.
+    """
+
+    def __init__(
+        self,
+        timed: Collection[str],
+        carries: Callable[[float], float | None],
+        left: Callable[[float, float], float],
+        packs: Callable[[str], Compression | None],
+    ) -> None:
+        self.declined = 0
+        self._timed = timed
+        self._carries = carries
+        self._left = left
+        self._packs = packs
+
+    def may_arrive(
+        self,
+        attempt: Sized,
+        remaining_s: float,
+        now: float,
+        before: Callable[[str], Iterable[Sized]] = lambda service: (),
+    ) -> bool:
+        """Whether an attempt may arrive while there is time, for all that is known.
+
+        Args:
+            attempt: The attempt.
+            remaining_s: The time that it has.
+            now: The clock.
+            before: Returns what leaves before a request to a service.
+        """
+        rate = self._carries(now)
+        if rate is None or attempt.service not in self._timed:
+            return True
+        size = self._left(now, rate) + sum(
+            map(self._on_the_way, (attempt, *before(attempt.service)))
+        )
+        if enough(size, rate, remaining_s):
+            return True
+        self.declined += 1
+        if worth_logging(self.declined):
+            log.warning(
+                "request_too_slow service=%s bytes=%d bytes_per_s=%d remaining_s=%.3f count=%d",
+                attempt.service, size, rate, remaining_s, self.declined,
+            )  # fmt: skip
+        return False
+
+    def _on_the_way(self, attempt: Sized) -> float:
+        """Return how many bytes an attempt will be at least; 0 where that is not known."""
+        compression = self._packs(attempt.service)
+        if compression is None:
+            return attempt.size
+        ratio = compression.ratio
+        return 0.0 if ratio is None else attempt.size * min(1.0, ratio)
+
+
+def enough(size_bytes: float, bytes_per_s: float, remaining_s: float) -> bool:
+    """Whether so many bytes leave in the time that remains."""
+    return size_bytes <= bytes_per_s * remaining_s

@@ -1,0 +1,164 @@
+"""Come to robots and gateways that cannot come to us: the replica's side of dial-out.
+
+It keeps two connections waiting at each door. When one is taken into use, it is joined with
+this replica's own listener, and another one takes its place.
+
+Owns: connections to doors. Not here: the door (`dial_in`), the listener (`zenoh_listener`).
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+import socket
+import threading
+import time
+from collections.abc import Iterable, Mapping
+
+from fogft.link.dial_out import first_message
+from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
+from fogft.link.dial_out.splice import Tunnel, hang_up, keep_alive
+from fogft.records import frames
+from fogft.records.record import RecordError, Sign
+
+log = logging.getLogger(__name__)
+
+WAITING = 2
+TARGETS_LIMIT = 64
+_BACKOFF_S = 0.3
+_CONNECT_TIMEOUT_S = 1.5
+_GREETING_TIMEOUT_S = 5.0
+
+
+class DialOut:
+    """Keeps connections waiting at doors.
+
+    Args:
+        local: ``host:port`` of this replica's own listener.
+        pool_uid: The pool.
+        sign: Proves who we are.
+    """
+
+    def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:
+        host, _, port = local.rpartition(":")
+        everywhere = {"0.0.0.0": "127.0.0.1", "[::]": "::1"}
+        self._local = (everywhere.get(host, host.strip("[]")), int(port))
+        self._pool_uid = pool_uid
+        self._sign = sign
+        self._lock = threading.Lock()
+        self._targets: dict[str, threading.Event] = {}  # set when the door is not wanted any more
+        self._details: dict[str, str] = {}
+        self._tunnels: set[Tunnel] = set()
+
+    def follow(self, doors: Iterable[str]) -> None:
+        """Wait at these doors (``host:port``) and at no others. What is in use goes on."""
+        wanted = list(dict.fromkeys(doors))[:TARGETS_LIMIT]
+        with self._lock:
+            for door in [d for d in self._targets if d not in wanted]:
+                self._targets.pop(door).set()
+                self._details.pop(door, None)
+            new = [door for door in wanted if door not in self._targets]
+            for door in new:
+                self._targets[door] = threading.Event()
+        for door in new:
+            for number in range(WAITING):
+                threading.Thread(
+                    target=self._keep_waiting,
+                    args=(door, self._targets[door]),
+                    name=f"fogft-dial-out-{number}",
+                    daemon=True,
+                ).start()
+
+    def details(self) -> Mapping[str, str]:
+        """Return for each door what is wrong; empty where we wait or are in use."""
+        with self._lock:
+            return dict(self._details)
+
+    def close(self) -> None:
+        """Leave all doors and end what is in use. Repeatable."""
+        self.follow(())
+        with self._lock:
+            tunnels = list(self._tunnels)
+        for tunnel in tunnels:
+            tunnel.close()
+
+    # -- a thread for each waiting connection -------------------------------------------------
+
+    def _keep_waiting(self, door: str, stop: threading.Event) -> None:
+        while not stop.is_set():
+            link: socket.socket | None = None
+            try:
+                link = self._come(door)
+                self._say(door, "")
+                if self._wait(link, stop):
+                    self._join(link)
+                    link = None
+                    continue  # at once: another one takes its place
+            except (OSError, EOFError, RecordError) as error:
+                self._say(door, str(error) or type(error).__name__)
+            finally:
+                if link is not None:
+                    hang_up(link)
+            stop.wait(_BACKOFF_S)
+
+    def _come(self, door: str) -> socket.socket:
+        """Return a connection on which the door was told who we are."""
+        host, _, port = door.rpartition(":")
+        link = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_TIMEOUT_S)
+        try:
+            keep_alive(link)
+            nonce, _ = frames.read_challenge(
+                first_message.receive(link, 4 << 10, _GREETING_TIMEOUT_S)
+            )
+            link.settimeout(_GREETING_TIMEOUT_S)
+            proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
+            link.sendall(frames.greeting(*self._sign(proof)))
+        except BaseException:
+            link.close()
+            raise
+        return link
+
+    def _wait(self, link: socket.socket, stop: threading.Event) -> bool:
+        """Wait until the connection is taken into use; return False where we are to leave.
+
+        Raises:
+            OSError: It is broken, or the door is silent.
+            EOFError: The door hung up.
+        """
+        heard_at = time.monotonic()
+        while not stop.is_set():
+            if select.select([link], [], [], SIGN_EVERY_S)[0]:
+                data = link.recv(1)
+                if data == GO:
+                    link.sendall(GO)
+                    return True
+                if data != SIGN:
+                    raise EOFError("the door was shut")
+                heard_at = time.monotonic()
+                link.sendall(SIGN)
+            elif time.monotonic() - heard_at > SILENCE_S:
+                raise TimeoutError("the door is silent")
+        return False
+
+    def _join(self, link: socket.socket) -> None:
+        try:
+            own = socket.create_connection(self._local, _CONNECT_TIMEOUT_S)
+        except OSError:
+            hang_up(link)
+            raise
+        own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        tunnel = Tunnel(link, own, self._ended)
+        with self._lock:
+            self._tunnels.add(tunnel)
+        tunnel.start()
+
+    def _ended(self, tunnel: Tunnel) -> None:
+        with self._lock:
+            self._tunnels.discard(tunnel)
+
+    def _say(self, door: str, detail: str) -> None:
+        with self._lock:
+            if door not in self._targets or self._details.get(door) == detail:
+                return
+            self._details[door] = detail
+        log.info("door_%s door=%s reason=%r", "shut" if detail else "reached", door, detail)

@@ -1,0 +1,333 @@
+"""A door through which replicas that cannot be reached come in: the robot's side of dial-out.
+
+A replica dials the door, proves who it is, and waits. A link to that replica dials a port on
+this machine's loopback instead of a far address; the door then joins both connections. From
+there on all is as with a replica that can be reached: the robot is the TLS client, the
+replica the TLS server, end to end, so no certificate needs any other right, and the door can
+neither read nor change what passes.
+
+Owns: the door's port, the connections that wait, a loopback port for each replica.
+Not here: the replica's side (`dial_out`), links (`zenoh_link`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import secrets
+import select
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+
+from fogft.errors import WireError
+from fogft.link.counters import Counters
+from fogft.link.dial_out import first_message
+from fogft.link.dial_out.splice import Tunnel, hang_up, keep_alive
+from fogft.model.certificate_holder import Role, holder_of
+from fogft.model.replica import ReplicaId
+from fogft.records import frames
+from fogft.records.record import RecordError, Verify
+
+log = logging.getLogger(__name__)
+
+PURPOSE = "dial-in"
+SIGN, GO = b".", b"G"
+SIGN_EVERY_S = 1.0
+SILENCE_S = 3.0
+WAITING_LIMIT = 4  # of one replica
+REPLICAS_LIMIT = 64
+GREETINGS_LIMIT = 64
+_GREETING_TIMEOUT_S = 5.0
+_PATIENCE_S = 1.0
+
+
+class _Waiting:
+    """A replica's connection that waits to be used."""
+
+    def __init__(self, link: socket.socket) -> None:
+        self.link = link
+        self.lock = threading.Lock()  # held by whoever talks on it; the taker keeps it
+        self.taken = False
+
+
+class DialIn:
+    """The door of one robot or gateway.
+
+    Args:
+        listen: ``host:port``; port 0 for any that is free.
+        pool_uid: Replicas of other pools are turned away.
+        verify: Tells who signed a greeting.
+        revoked: Common names that are turned away.
+
+    Raises:
+        WireError: The port cannot be had.
+    """
+
+    def __init__(
+        self,
+        listen: str,
+        pool_uid: str,
+        verify: Verify,
+        *,
+        revoked: Callable[[], Collection[str]] = frozenset,
+    ) -> None:
+        self._pool_uid = pool_uid
+        self._verify = verify
+        self._revoked = revoked
+        self._counters = Counters()
+        self._lock = threading.Condition()
+        self._waiting: dict[ReplicaId, deque[_Waiting]] = {}
+        self._local: dict[ReplicaId, socket.socket] = {}
+        self._tunnels: set[Tunnel] = set()
+        self._greeting = 0
+        self._closed = False
+        self._door = _listening(listen)
+        host, port = listen.rpartition(":")[0], self._door.getsockname()[1]
+        self.endpoint = f"{host}:{port}"
+        threading.Thread(target=self._accept, name="fogft-dial-in", daemon=True).start()
+
+    # -- replicas come in ---------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        while not self._closed:
+            try:
+                link, address = self._door.accept()
+            except OSError as error:
+                if not self._closed:
+                    self._count("accept_failed", str(error))
+                    time.sleep(0.1)
+                continue
+            with self._lock:
+                full = self._greeting >= GREETINGS_LIMIT
+                self._greeting += not full
+            if full:
+                self._count("refused_full", str(address[0]))
+                link.close()
+                continue
+            threading.Thread(
+                target=self._attend, args=(link, str(address[0])), name="fogft-greet", daemon=True
+            ).start()
+
+    def _attend(self, link: socket.socket, host: str) -> None:
+        try:
+            try:
+                id = self._greet(link, host)
+            finally:
+                with self._lock:
+                    self._greeting -= 1
+        except RecordError as error:
+            self._count(f"greeting_{error.reason}", f"{host}: {error}")
+            hang_up(link)
+        except (OSError, EOFError) as error:
+            self._count("greeting_failed", f"{host}: {error}")
+            hang_up(link)
+        else:
+            self._wait(id, _Waiting(link))
+
+    def _greet(self, link: socket.socket, host: str) -> ReplicaId:
+        keep_alive(link)
+        link.settimeout(_GREETING_TIMEOUT_S)
+        nonce = secrets.token_bytes(frames.NONCE_BYTES)
+        link.sendall(frames.challenge(nonce, host))
+        message = first_message.receive(link, 16 << 10, _GREETING_TIMEOUT_S)
+        certificate, signature = frames.read_greeting(message)
+        proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
+        writer = self._verify(certificate, signature, proof)
+        try:
+            holder = holder_of(writer.common_name)
+        except ValueError as error:
+            raise RecordError("role", str(error)) from error
+        if (holder.role, writer.role) != (Role.REPLICA, Role.REPLICA.value):
+            raise RecordError("role", f"`{writer.common_name}` is no replica")
+        if holder.pool_uid != self._pool_uid:
+            raise RecordError("pool", f"`{writer.common_name}` is another pool's")
+        if writer.common_name in self._revoked():
+            raise RecordError("revoked", f"`{writer.common_name}` is revoked")
+        return ReplicaId(self._pool_uid, int(holder.name), holder.generation)
+
+    def _wait(self, id: ReplicaId, one: _Waiting) -> None:
+        """Hold a connection until it is used, broken, silent, or one too many."""
+        with self._lock:
+            queue = self._waiting.setdefault(id, deque())
+            too_many = len(queue) >= WAITING_LIMIT or len(self._waiting) > REPLICAS_LIMIT
+            if too_many or self._closed:
+                if not queue:
+                    del self._waiting[id]
+                hang_up(one.link)
+                self._counters.add("refused_full")
+                return
+            queue.append(one)
+            self._lock.notify_all()
+        self._counters.add("admitted")
+        log.info("replica_dialled_in replica=%s", id.short)
+        why = self._tend(one)
+        if why:
+            log.info("replica_left_door replica=%s reason=%s", id.short, why)
+            self._forget(id, one)
+            hang_up(one.link)
+
+    def _tend(self, one: _Waiting) -> str:
+        """Exchange signs of life; return why it ended, empty where it was taken into use."""
+        heard_at = time.monotonic()
+        while True:
+            readable = select.select([one.link], [], [], SIGN_EVERY_S)[0]
+            with one.lock:
+                if one.taken:
+                    return ""
+                try:
+                    if readable:
+                        one.link.settimeout(0.0)
+                        data = one.link.recv(64)
+                        if data.strip(SIGN):
+                            return "it said something odd"
+                        if not data:
+                            return "it hung up"
+                        heard_at = time.monotonic()
+                    else:
+                        one.link.settimeout(0.5)
+                        one.link.sendall(SIGN)
+                except (OSError, ValueError) as error:
+                    return str(error)
+            if self._closed:
+                return "the door is closed"
+            if time.monotonic() - heard_at > SILENCE_S:
+                return "it is silent"
+
+    def _forget(self, id: ReplicaId, one: _Waiting) -> None:
+        with self._lock:
+            queue = self._waiting.get(id)
+            if queue is not None:
+                with contextlib.suppress(ValueError):
+                    queue.remove(one)
+                if not queue:
+                    del self._waiting[id]
+
+    # -- links go out -------------------------------------------------------------------------
+
+    def local(self, id: ReplicaId) -> str:
+        """Return the ``host:port`` on this machine through which a link reaches a replica."""
+        with self._lock:
+            port = self._local.get(id)
+            if port is None:
+                port = self._local[id] = _listening("127.0.0.1:0")
+                threading.Thread(
+                    target=self._accept_local, args=(id, port), name="fogft-door", daemon=True
+                ).start()
+            return f"127.0.0.1:{port.getsockname()[1]}"
+
+    def keep(self, ids: Collection[ReplicaId]) -> None:
+        """Give back the loopback ports of all other replicas."""
+        with self._lock:
+            gone = [self._local.pop(id) for id in list(self._local) if id not in ids]
+        for port in gone:
+            hang_up(port)
+
+    def _accept_local(self, id: ReplicaId, port: socket.socket) -> None:
+        while True:
+            try:
+                link, _ = port.accept()
+            except OSError:
+                return  # given back
+            one = self._take(id)
+            if one is None:
+                link.close()  # the link tries again soon
+                continue
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            tunnel = Tunnel(link, one.link, self._tunnel_ended)
+            with self._lock:
+                self._tunnels.add(tunnel)
+            tunnel.start()
+            self._counters.add("tunnels")
+
+    def _take(self, id: ReplicaId) -> _Waiting | None:
+        """Take a replica's connection into use, after a moment's wait if need be."""
+        until = time.monotonic() + _PATIENCE_S
+        while True:
+            with self._lock:
+                while not self._waiting.get(id):
+                    if not self._lock.wait(until - time.monotonic()) or self._closed:
+                        return None
+                one = self._waiting[id].pop()  # the latest is the likeliest to live
+                if not self._waiting[id]:
+                    del self._waiting[id]
+            with one.lock:
+                one.taken = True
+                try:
+                    one.link.settimeout(0.5)
+                    one.link.sendall(GO)
+                except OSError:
+                    hang_up(one.link)
+                    continue
+                if _drained(one.link):
+                    return one
+            hang_up(one.link)
+
+    def _tunnel_ended(self, tunnel: Tunnel) -> None:
+        with self._lock:
+            self._tunnels.discard(tunnel)
+
+    # -- the owner ----------------------------------------------------------------------------
+
+    def waiting(self) -> Mapping[ReplicaId, int]:
+        """Return how many connections of each replica wait."""
+        with self._lock:
+            return {id: len(queue) for id, queue in self._waiting.items()}
+
+    def counters(self) -> Mapping[str, int]:
+        """Counts since the start: ``admitted``, ``tunnels``, ``greeting_...``, ``refused_full``."""
+        return self._counters.snapshot()
+
+    def _count(self, event: str, detail: str) -> None:
+        self._counters.warn(log, event, "dial_in_refused event=%s detail=%r", event, detail[:200])
+
+    def close(self) -> None:
+        """Close the door and all that came through it. Repeatable."""
+        self._closed = True
+        hang_up(self._door)
+        self.keep(())
+        with self._lock:
+            waiting = [one for queue in self._waiting.values() for one in queue]
+            tunnels = list(self._tunnels)
+            self._lock.notify_all()
+        for one in waiting:
+            with contextlib.suppress(OSError):
+                one.link.shutdown(socket.SHUT_RDWR)
+        for tunnel in tunnels:
+            tunnel.close()
+
+
+def _drained(link: socket.socket) -> bool:
+    """Read signs of life away up to the replica's `GO`, behind which TLS begins.
+
+    A replica sends nothing between its `GO` and the first byte of its service's, and the
+    TLS client speaks first: so nothing behind `GO` can be here yet.
+    """
+    link.settimeout(SILENCE_S)
+    try:
+        while True:
+            data = link.recv(1)
+            if data == GO:
+                return True
+            if data != SIGN:
+                return False
+    except OSError:
+        return False
+
+
+def _listening(listen: str) -> socket.socket:
+    host, _, port = listen.rpartition(":")
+    try:
+        bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind((host.strip("[]"), int(port)))
+        bound.listen(64)
+    except (OSError, ValueError, OverflowError) as error:
+        words = getattr(error, "strerror", None) or str(error)
+        raise WireError(
+            f"cannot listen at `{listen}` for replicas that dial in: {words}",
+            "give `host:port` with a free port",
+        ) from error
+    return bound

@@ -1,0 +1,300 @@
+"""What travels besides the serialised messages: headers, refusals, greetings. Pure.
+
+Whatever bytes come in, a decoder returns a value or raises `FrameError`, nothing else: the
+peer is another process, perhaps of another version. Each frame begins with its version.
+
+Owns: the bytes. Not here: sending them, what they mean, and other frames (`probe_frames`,
+`batch_frames`, `record_frames`, `topic_frames`).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from fogft.model.names import REQUEST_ID_BYTES
+from fogft.poolfile.service_form import LONGEST_S
+
+VERSION = 4
+# Beside the version, only towards peers that have said that they know them.
+_PACKED = 0x80  # the payload is compressed
+_MAY_PACK = 0x40  # the answer may be
+_READS_PACKED = 0x20  # the answer may be where the replica finds the link to be thin
+_REQUEST_FLAGS = _PACKED | _MAY_PACK | _READS_PACKED
+TOKEN_BYTES = 8
+STAMP_BYTES = 4
+NO_STAMP = bytes(STAMP_BYTES)  # nothing was seen yet, or nobody asks
+ROBOT_BYTES_LIMIT = 64
+REASON_LIMIT = 64
+REMAINING_LIMIT_S = LONGEST_S
+CANCEL_LIMIT = 4096
+_CANCEL_BYTES_LIMIT = 1 + CANCEL_LIMIT * REQUEST_ID_BYTES
+
+GREETING_LIMIT = 4096
+
+_REQUEST = struct.Struct(f">B{REQUEST_ID_BYTES}sd{STAMP_BYTES}s")
+_ANSWER = struct.Struct(f">B{STAMP_BYTES}s{REQUEST_ID_BYTES}s")
+_TOKEN = struct.Struct(f">B{TOKEN_BYTES}s")
+_GREETING = struct.Struct(f">B{TOKEN_BYTES}sH")
+_ORIGIN_AT = _REQUEST.size
+
+
+class FrameError(ValueError):
+    """These bytes are not a frame of this version."""
+
+
+class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass costs thrice as much
+    """What precedes a request.
+
+    Attributes:
+        request_id: 16 bytes, made by the client proxy.
+        remaining_s: Time left when it was sent, in seconds.
+        token: Names the robot's connection, so that replies queue apart.
+        robot: Who asks.
+        seen: The stamp of the last answer that its connection has seen.
+        packed: The payload is compressed.
+        may_pack: The answer may be.
+        reads_packed: It may be where the replica itself finds the link to be thin.
+    """
+
+    request_id: bytes
+    remaining_s: float
+    token: bytes
+    robot: str
+    seen: bytes = NO_STAMP
+    packed: bool = False
+    may_pack: bool = False
+    reads_packed: bool = False
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """What accompanies a probe: whose connection this is.
+
+    Attributes:
+        token: Names the robot's connection; requests under it are the greeter's.
+        certificate: The robot's (DER), with the first probe; empty once it was answered.
+        signature: Over `greeted_bytes`, with that certificate's key (DER).
+    """
+
+    token: bytes
+    certificate: bytes = b""
+    signature: bytes = b""
+
+
+def origin(robot: str, token: bytes) -> bytes:
+    """Return the part of a request's header that is the same for a whole connection.
+
+    Raises:
+        ValueError: The token is not 8 bytes, or the name not 1 to 64 printable bytes.
+    """
+    name = robot.encode()
+    if len(token) != TOKEN_BYTES:
+        raise ValueError(f"a token has {TOKEN_BYTES} bytes")
+    if not 0 < len(name) <= ROBOT_BYTES_LIMIT or not robot.isprintable():
+        raise ValueError(f"a robot's name has 1 to {ROBOT_BYTES_LIMIT} printable bytes: {robot!r}")
+    return token + name
+
+
+@lru_cache(maxsize=256)  # a robot says the same in each request of a connection
+def read_origin(origin: bytes) -> tuple[bytes, str]:
+    """Return the token and the robot's name of what `origin` wrote.
+
+    Raises:
+        FrameError: It is no such thing.
+    """
+    token, name = origin[:TOKEN_BYTES], origin[TOKEN_BYTES:]
+    if not 0 < len(name) <= ROBOT_BYTES_LIMIT:
+        raise FrameError(f"a robot's name of {len(name)} bytes")
+    try:
+        robot = name.decode()
+    except UnicodeDecodeError as error:
+        raise FrameError("a robot's name that is not UTF-8") from error
+    if not robot.isprintable():
+        raise FrameError("a robot's name that is not printable")
+    return token, robot
+
+
+def check_remaining(remaining_s: float) -> None:
+    """Refuse a remaining time that is none.
+
+    Raises:
+        FrameError: It is negative, too long, or no number.
+    """
+    if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
+        raise FrameError(f"a remaining time of {remaining_s} s")
+
+
+def encode_request(
+    request_id: bytes,
+    remaining_s: float,
+    origin: bytes,
+    *,
+    seen: bytes = NO_STAMP,
+    packed: bool = False,
+    may_pack: bool = False,
+    reads_packed: bool = False,
+) -> bytes:
+    """Return a request's header; `origin` comes from the function of that name."""
+    first = VERSION | _PACKED * packed | _MAY_PACK * may_pack | _READS_PACKED * reads_packed
+    return _REQUEST.pack(first, request_id, remaining_s, seen) + origin
+
+
+def decode_request(frame: bytes) -> RequestHeader:
+    """Read a request's header.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if len(frame) < _ORIGIN_AT:
+        raise FrameError(f"a request's header of {len(frame)} bytes")
+    first, request_id, remaining_s, seen = _REQUEST.unpack_from(frame)
+    _check_first(first, _REQUEST_FLAGS)
+    check_remaining(remaining_s)
+    token, robot = read_origin(frame[_ORIGIN_AT:])
+    return RequestHeader(
+        request_id,
+        remaining_s,
+        token,
+        robot,
+        seen,
+        first & _PACKED != 0,
+        first & _MAY_PACK != 0,
+        first & _READS_PACKED != 0,
+    )
+
+
+def encode_answer(stamp: bytes, request_id: bytes, *, packed: bool = False) -> bytes:
+    """Return an answer's header."""
+    return _ANSWER.pack(VERSION | _PACKED * packed, stamp, request_id)
+
+
+def decode_answer(frame: bytes) -> tuple[bytes, bytes, bool]:
+    """Return stamp and request id of an answer's header, and whether its payload is compressed.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if len(frame) != _ANSWER.size:
+        raise FrameError(f"an answer's header of {len(frame)} bytes")
+    first, stamp, request_id = _ANSWER.unpack(frame)
+    _check_first(first, _PACKED)
+    return stamp, request_id, bool(first & _PACKED)
+
+
+def encode_refusal(stamp: bytes, request_id: bytes, reason: str) -> bytes:
+    """Return a refusal; `reason` is one of `port.Refusal`, or any short ASCII text."""
+    return _ANSWER.pack(VERSION, stamp, request_id) + reason.encode("ascii")
+
+
+def decode_refusal(frame: bytes) -> tuple[bytes, bytes, str]:
+    """Return the stamp, the request id and the reason of a refusal.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if len(frame) < _ANSWER.size:
+        raise FrameError(f"a refusal of {len(frame)} bytes")
+    version, stamp, request_id = _ANSWER.unpack_from(frame)
+    check_version(version)
+    return stamp, request_id, read_reason(frame[_ANSWER.size :])
+
+
+def read_reason(said: bytes) -> str:
+    """Return the reason of a refusal.
+
+    Raises:
+        FrameError: It is none.
+    """
+    if not 0 < len(said) <= REASON_LIMIT:
+        raise FrameError(f"a reason of {len(said)} bytes")
+    try:
+        reason = said.decode("ascii")
+    except UnicodeDecodeError as error:
+        raise FrameError("a reason that is not ASCII") from error
+    if not reason.isprintable():
+        raise FrameError("a reason that is not printable")
+    return reason
+
+
+def greeted_bytes(token: bytes, replica: str) -> bytes:
+    """Return what a greeting's signature covers: good for one connection to one replica.
+
+    Args:
+        token: The connection's.
+        replica: The replica's common name.
+    """
+    return b"fogft greeting 1\n" + token + replica.encode()
+
+
+def encode_greeting(greeting: Greeting) -> bytes:
+    """Return a greeting, or the bare token where it has no certificate.
+
+    Raises:
+        ValueError: It would be too long.
+    """
+    if not greeting.certificate:
+        return _TOKEN.pack(VERSION, greeting.token)
+    frame = (
+        _GREETING.pack(VERSION, greeting.token, len(greeting.certificate))
+        + greeting.certificate
+        + greeting.signature
+    )
+    if len(frame) > GREETING_LIMIT:
+        raise ValueError(f"a greeting of {len(frame)} bytes")
+    return frame
+
+
+def decode_greeting(frame: bytes) -> Greeting:
+    """Read a greeting; nothing in it is verified.
+
+    Raises:
+        FrameError: It is not one.
+    """
+    if len(frame) == _TOKEN.size:
+        version, token = _TOKEN.unpack(frame)
+        check_version(version)
+        return Greeting(token)
+    if not _GREETING.size < len(frame) <= GREETING_LIMIT:
+        raise FrameError(f"a greeting of {len(frame)} bytes")
+    version, token, length = _GREETING.unpack_from(frame)
+    check_version(version)
+    end = _GREETING.size + length
+    if not length or end >= len(frame):
+        raise FrameError("a greeting that is cut short")
+    return Greeting(token, frame[_GREETING.size : end], frame[end:])
+
+
+def encode_cancel(ids: Sequence[bytes]) -> bytes:
+    """Return the ids of requests that are no longer wanted, at most `CANCEL_LIMIT`."""
+    return bytes((VERSION,)) + b"".join(ids[:CANCEL_LIMIT])
+
+
+def decode_cancel(frame: bytes) -> list[bytes]:
+    """Return the ids of requests that are no longer wanted.
+
+    Raises:
+        FrameError: It is not a list of ids.
+    """
+    if not frame or (len(frame) - 1) % REQUEST_ID_BYTES or len(frame) > _CANCEL_BYTES_LIMIT:
+        raise FrameError(f"a cancellation of {len(frame)} bytes")
+    check_version(frame[0])
+    return [frame[at : at + REQUEST_ID_BYTES] for at in range(1, len(frame), REQUEST_ID_BYTES)]
+
+
+def _check_first(first: int, flags: int) -> None:
+    if first & ~flags != VERSION:
+        check_version(first)
+
+
+def check_version(version: Any) -> None:
+    """Refuse what another version wrote.
+
+    Raises:
+        FrameError: It is not of this version.
+    """
+    if version is True or version != VERSION:
+        raise FrameError(f"version {version!r}, where {VERSION} is spoken here")

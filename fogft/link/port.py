@@ -1,0 +1,352 @@
+"""The port between proxies: a robot's links on one side, a replica's listener on the other.
+
+What flows: a request (id, service, remaining time, bytes) from the robot; one answer
+(bytes, or a refusal with a reason) from the replica; probes, which the server proxy
+answers at once whatever the service does.
+
+Law of this port: `Link.offer` never blocks, whatever the peer does; a slow or dead peer
+costs its own link only. Callbacks come from the wire's threads; they must not block.
+Implementations: `fogft.link.zenoh.robot.link` and `zenoh_listener`, `tests.fakes.link`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+from fogft.link.send_options import Ways
+from fogft.model.replica import LinkState, ReplicaId
+from fogft.model.type_definition import Definition
+from fogft.records.record import SignedRecord
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a robot tells a replica with each probe.
+
+    Attributes:
+        manager_age_s: Since the robot last saw a sign of the pool's manager; None if
+            it never did.
+        describe: The answer shall tell the definitions of the services' types.
+    """
+
+    robot: str
+    manager_age_s: float | None = None
+    describe: bool = False
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What a gateway sees of one replica behind it. Durations in seconds.
+
+    Attributes:
+        through: The gateways on the way, beginning with the one that is asked, and its name
+            left out: ``lab`` or ``lab/edge``; empty for none.
+    """
+
+    slot: int
+    generation: int
+    state: LinkState
+    ready: frozenset[str] = frozenset()
+    draining: bool = False
+    at_risk: bool = False
+    silent_for_s: float = 0.0
+    rtt_s: float | None = None
+    restarts: int = 0
+    detail: str = ""
+    through: str = ""
+
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> Behind:
+        """Return one from what a client proxy reports of a link."""
+        return cls(
+            slot=report["slot"],
+            generation=report["generation"],
+            state=LinkState(report["state"]),
+            ready=frozenset(report["ready"]),
+            draining=report["draining"],
+            at_risk=report["at_risk"],
+            silent_for_s=report["silent_for_s"],
+            rtt_s=report["rtt_s"],
+            restarts=report["restarts"],
+            detail=report["detail"],
+            through=report.get("through", ""),
+        )
+
+
+@dataclass(frozen=True)
+class ProbeAnswer:
+    """What a replica says of itself with each probe.
+
+    Attributes:
+        ready: Names of the services that it can answer now.
+        incarnation: Random text made when the server proxy started. A new one at the
+            same id means that it forgot every request.
+        draining: It asks to be left alone: its machine will be taken.
+        at_risk: Its cloud recommends to move it; it serves on meanwhile.
+        restarts: How often it restarted the user's `run` command.
+        in_flight: Requests that it holds.
+        work: What became of requests since its start, by name (`Responder.report`).
+        detail: Why it is not ready, in words; empty when it is.
+        offered: Service name -> type of what `run` offers, where it is to be found out.
+        types: Type name -> its definition on the replica. Told only where a probe asks for
+            it; a link keeps what it was told.
+        behind: The replicas behind a gateway.
+        accepts: Names of compressions that it reads, or does by itself.
+    """
+
+    slot: int
+    generation: int
+    incarnation: str
+    ready: frozenset[str] = frozenset()
+    draining: bool = False
+    at_risk: bool = False
+    restarts: int = 0
+    in_flight: int = 0
+    detail: str = ""
+    work: Mapping[str, float] = field(default_factory=dict)
+    offered: Mapping[str, str] = field(default_factory=dict)
+    types: Mapping[str, Definition] = field(default_factory=dict)
+    behind: tuple[Behind, ...] = ()
+    accepts: frozenset[str] = frozenset()
+
+
+class Refusal:
+    """Reasons of a refusal, as they travel. The robot tries elsewhere, or again later."""
+
+    NOT_READY = "not-ready"  # the local service is not there
+    OVERLOADED = "overloaded"  # the replica's own window is full
+    CRASHED = "crashed"  # the service died while it worked on this
+    EXPIRED = "expired"  # its deadline had passed on arrival
+    FORGOTTEN = "forgotten"  # it was run, but the answer is no longer kept
+    MALFORMED = "malformed"  # the request could not be read
+    NOT_ADMITTED = "not-admitted"  # who asks may not, or did not say who it is
+    REVOKED = "revoked"  # the certificate of who asks was taken back
+    EXPIRED_CERTIFICATE = "expired-certificate"  # by the replica's clock
+    CANCELLED = "cancelled"  # dropped, because the robot had its answer from elsewhere
+    LATE = "late"  # it was run, but the robot had its answer from elsewhere
+    SUPERSEDED = "superseded"  # made locally: a newer request took its place before it was sent
+    TOO_SLOW = "too-slow"  # made locally: over this link it would not have arrived in time
+    LOST = "lost"  # made locally: the link died before an answer came
+
+
+class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
+    """The end of one attempt: `payload` if the service answered, else a `refusal`.
+
+    Attributes:
+        service: The name given to `Link.offer`.
+    """
+
+    request_id: bytes
+    payload: bytes | None = None
+    refusal: str = ""
+    service: str = ""
+
+
+class LinkEvents(Protocol):
+    """What a link tells its owner. Called from the link's threads; must not block."""
+
+    def answered(self, link: Link, answer: Answer) -> None:
+        """One attempt has ended. Exactly one call for each accepted `offer`.
+
+        An attempt whose link dies ends with ``Refusal.LOST``; a later answer of the
+        old connection is dropped by the link.
+        """
+
+    def late(self, link: Link, service: str, request_id: bytes) -> None:
+        """An answer came to an attempt that was forgotten: the replica worked for nothing.
+
+        Its bytes are dropped. Of a connection that was given up it may not be told.
+        """
+
+    def changed(self, link: Link) -> None:
+        """The link's `state`, `probe_answer` or room in its window has changed."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A replica to dial: its endpoint (``host:port``) and the name its certificate must have.
+
+    Attributes:
+        interface: Through which of our network interfaces; empty for whatever the routes say.
+    """
+
+    id: ReplicaId
+    endpoint: str
+    certificate_name: str
+    interface: str = ""
+
+
+@dataclass(frozen=True)
+class LinkStatus:
+    """A snapshot of a link. Durations in seconds."""
+
+    state: LinkState
+    probe_answer: ProbeAnswer | None
+    heard_age_s: float | None
+    silent_for_s: float
+    rtt_s: float | None
+    in_flight: int
+    in_flight_bytes: int
+    reopened: int
+    detail: str
+
+
+class Link(Protocol):
+    """A robot's connection to one replica: own session, own sender thread, bounded window."""
+
+    @property
+    def peer(self) -> Peer:
+        """Whom it talks to."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether requests may be offered: state UP. Cheap, called for each request."""
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that the last probe answer called ready; empty unless UP. Cheap."""
+
+    @property
+    def draining(self) -> bool:
+        """Whether the replica asked to be left alone. Cheap."""
+
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
+        """Take one attempt, or return False when the window is full or the link not usable.
+
+        Never blocks. `service` is the name in the pool; its key was set by `services`.
+        Not to be called from within a `LinkEvents` callback: it may send.
+
+        Args:
+            more: Others follow at once, then `send`: it may wait for them, to leave in one message.
+        """
+
+    def send(self) -> None:
+        """Send what was offered with `more`. Cheap; never blocks."""
+
+    def forget(self, request_id: bytes) -> None:
+        """Free the window of a request whose answer is no longer wanted. Unknown ids are fine.
+
+        The replica is told: at once if the request has been out for a while, else by `flush`.
+        """
+
+    def flush(self) -> None:
+        """Tell the replica of all that was forgotten and not answered. Cheap; never blocks."""
+
+    def status(self) -> LinkStatus:
+        """Return a snapshot, for people and for the manager."""
+
+    def close(self) -> None:
+        """End the link. Attempts still open end with `Refusal.LOST`. Repeatable, quick."""
+
+
+class Dialer(Protocol):
+    """Makes links. One for each client proxy."""
+
+    def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
+        """Start a link; return at once, in state CONNECTING.
+
+        Args:
+            peer: Whom to reach.
+            services: Service name -> key (from `names.service_key`).
+            events: Whom to tell.
+        """
+
+    def adopt(self, ways: Ways) -> None:
+        """Set what services want of their links, from the next connection on."""
+
+    def renew(self) -> None:
+        """Take the credentials that now stand in their files into use. No request is lost."""
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Tell every replica these records, now and whenever a link comes up."""
+
+    def certificate(self) -> str:
+        """Return the common name of the certificate that every link uses.
+
+        Empty while some still use another one, and where there are no certificates.
+        """
+
+    def close(self) -> None:
+        """Close every link."""
+
+
+class Incoming(Protocol):
+    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing."""
+
+    @property
+    def service(self) -> str:
+        """Name of the service asked for."""
+
+    @property
+    def request_id(self) -> bytes:
+        """16 bytes, made by the client proxy."""
+
+    @property
+    def robot(self) -> str:
+        """Who asks; replies to one robot never wait for another."""
+
+    @property
+    def remaining_s(self) -> float:
+        """Time that was left when the robot sent it."""
+
+    @property
+    def payload(self) -> bytes:
+        """The serialised request (CDR)."""
+
+    def reply(self, payload: bytes, *, more: bool = False) -> None:
+        """Send the serialised response. Never blocks.
+
+        Args:
+            payload: The response.
+            more: Others will soon follow, to leave in one message with it.
+        """
+
+    def refuse(self, reason: str) -> None:
+        """Send a refusal. Never blocks."""
+
+
+class Listener(Protocol):
+    """A replica's end: it hears requests and probes of robots that its CA admits."""
+
+    @property
+    def endpoint(self) -> str:
+        """``host:port`` as bound; the port is the real one where 0 was asked for."""
+
+    def serve(
+        self,
+        services: Mapping[str, str],
+        on_request: Callable[[Incoming], None],
+        on_probe: Callable[[Probe], ProbeAnswer],
+        on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
+    ) -> None:
+        """Begin to listen. Callbacks come from the wire's threads and must not block.
+
+        Args:
+            services: Service name -> key.
+            on_request: Takes a request.
+            on_probe: Answers a probe.
+            on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
+                block for a moment, which holds up nothing but probes.
+        """
+
+    def add(self, services: Mapping[str, str]) -> None:
+        """Hear requests for further services too (name -> key); only after `serve`."""
+
+    def revoke(self, names: Collection[str]) -> None:
+        """Let the holders of these certificates (common names) in no more. Repeatable."""
+
+    def counters(self) -> Mapping[str, int]:
+        """Counts by event name: ``malformed``, ``refused``, ``reply_dropped``, ..."""
+
+    def close(self) -> None:
+        """Stop. Repeatable."""

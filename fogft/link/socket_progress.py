@@ -1,0 +1,128 @@
+"""How fast one connection drains, and since when it does not. Pure: `now` is an argument.
+
+A send that takes long is no fault on a thin uplink: 1 MB needs eight seconds at 1 Mbit/s. It is
+one when nothing moves. The kernel knows: it counts the bytes that the peer has acknowledged. So
+how long a link may take follows from what is measured, and no time-out has to be guessed.
+
+Owns: the rate, and what counts as progress. Not here: where the counts come from (`sockets`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fogft.link.throughput import Carried
+
+# A frozen peer's kernel acknowledges probes and small requests; only more than these is a queue.
+BULK_BYTES = 16 << 10
+# Less than that in one look is no flow: probes' answers are a few hundred bytes.
+_TRICKLE_BYTES = 2048
+_SHARE_OF_NEW = 0.3  # in the average of the rate
+_SHORTEST_LOOK_S = 0.05
+
+
+@dataclass(frozen=True)
+class Flow:
+    """What the kernel says of one connection.
+
+    Attributes:
+        acknowledged: Bytes that the peer's kernel has acknowledged so far.
+        received: Bytes that came from the peer so far.
+        outstanding: Bytes handed to the kernel that are not acknowledged.
+        round_trip_s: The smoothed time to an acknowledgement, with four times its variation.
+        unsent: Bytes among the outstanding ones that have not left: the path takes no more now.
+    """
+
+    acknowledged: int
+    received: int
+    outstanding: int
+    round_trip_s: float = 0.0
+    unsent: int = 0
+
+
+class Drain:
+    """Of one connection. Times are monotonic seconds.
+
+    Attributes:
+        carried: What it was seen to carry over some time.
+    """
+
+    def __init__(self) -> None:
+        self.carried = Carried()
+        self._last: Flow | None = None
+        self._last_at = 0.0
+        self._progress_at: float | None = None  # None: nothing is outstanding
+        self._waited_s = 0.0  # with a queue, since the last look that found it moved
+        self._rate: float | None = None
+
+    @property
+    def bytes_per_s(self) -> float | None:
+        """Measured while more waited than the kernel could send at once; None before that."""
+        return self._rate
+
+    def look(self, flow: Flow, now: float, sending_for_s: float = 0.0) -> float:
+        """Take a new count; return for how many of the seconds since the last one bulk moved.
+
+        These are not to be held against the peer: whatever it says queues behind that.
+
+        Args:
+            flow: The count.
+            now: The clock.
+            sending_for_s: For how long something large has been on its way into the kernel.
+        """
+        last, since_s = self._last, now - self._last_at
+        if last is not None and since_s < _SHORTEST_LOOK_S:
+            return 0.0
+        self._last, self._last_at = flow, now
+        if last is None or flow.acknowledged > last.acknowledged or not flow.outstanding:
+            self._progress_at = now if flow.outstanding else None
+        elif self._progress_at is None:
+            self._progress_at = now
+        if last is None:
+            return 0.0
+        moved = flow.acknowledged - last.acknowledged
+        sending = sending_for_s >= since_s
+        queued = sending or last.outstanding >= BULK_BYTES
+        # On a long path much is on its way without any queue.
+        full = sending or (last.unsent > 0 and flow.unsent > 0)
+        self.carried.look(moved, since_s, now, queued=full)
+        if sending or (queued and flow.outstanding >= BULK_BYTES):
+            self._measured(moved / since_s)
+        if (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES:
+            waited_s, self._waited_s = self._waited_s, 0.0
+            return waited_s + since_s
+        # Acknowledgements come in steps: what was waited for one counts when it has come.
+        self._waited_s = self._waited_s + since_s if queued else 0.0
+        return 0.0
+
+    def _measured(self, rate: float) -> None:
+        old = self._rate
+        self._rate = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
+
+    def left_bytes(self, now: float, bytes_per_s: float) -> float:
+        """Return what of the outstanding bytes will not have arrived yet.
+
+        Args:
+            now: The clock.
+            bytes_per_s: At which they leave.
+        """
+        outstanding = self._last.outstanding if self._last is not None else 0
+        return max(0.0, outstanding - bytes_per_s * (now - self._last_at))
+
+    def stuck_s(self, now: float) -> float:
+        """Return since when bytes are outstanding of which none is acknowledged, in seconds."""
+        return 0.0 if self._progress_at is None else max(0.0, now - self._progress_at)
+
+    def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
+        """Whether a queue has stood still for longer than this path's own pauses explain.
+
+        Args:
+            now: The clock.
+            shortest_s: However quick the path: its peer's processor may be busy.
+            longest_s: However slow the path, no longer than that.
+        """
+        last = self._last
+        if last is None or last.outstanding < BULK_BYTES:
+            return False
+        pause_s = max(shortest_s, 4 * last.round_trip_s)
+        return self.stuck_s(now) > min(pause_s, longest_s)

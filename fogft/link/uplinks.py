@@ -1,0 +1,323 @@
+"""Several uplinks at once: one link a replica *and* interface, put together as one link.
+
+Whoever uses it sees one link to one replica. A request goes out on one uplink or on all, as
+its service's policy says, under one id: the replica runs it once, whichever copies arrive.
+When an uplink is lost with requests on it, they go out on another one, without the caller's
+policy hearing of it. Only when no uplink is left an attempt ends as lost.
+
+Owns: which uplinks an attempt is on. Not here: the links themselves (`zenoh_link`), policies
+(`fogft.model.uplinks`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from fogft.link.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer, Refusal
+from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.model.replica import LinkState
+from fogft.model.spec import ServiceSpec
+from fogft.model.uplinks import UplinkPolicy, choose
+from fogft.records.record import SignedRecord
+
+_ANSWERED_KEPT = 1024
+# Another uplink may do.
+_ELSEWHERE = frozenset({Refusal.LOST, Refusal.TOO_SLOW})
+_STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
+
+
+@dataclass
+class _Attempt:
+    """One accepted offer: what it needs to go out again, and the uplinks that it is on."""
+
+    service: str
+    payload: bytes
+    deadline: float
+    on: set[int] = field(default_factory=set)
+
+
+class UplinksLink:
+    """Links to one replica, one an interface; see `port.Link`. Made by `UplinkDialer`."""
+
+    def __init__(
+        self, dialer: UplinkDialer, peer: Peer, services: Mapping[str, str], events: LinkEvents
+    ) -> None:
+        self._dialer = dialer
+        self._peer = peer
+        self._events = events
+        self._lock = threading.Lock()
+        self._attempts: dict[bytes, _Attempt] = {}
+        self._again: list[bytes] = []  # on no uplink now
+        self._answered: OrderedDict[bytes, None] = OrderedDict()
+        self._current: int | None = None
+        self._closed = False
+        self._links: list[Link] = []
+        for interface in dialer.interfaces:
+            one = replace(peer, interface=interface)
+            self._links.append(dialer.inner.dial(one, services, _Events(self, len(self._links))))
+
+    # -- port.Link ------------------------------------------------------------------------
+
+    @property
+    def peer(self) -> Peer:
+        """Whom it talks to."""
+        return self._peer
+
+    @property
+    def usable(self) -> bool:
+        """Whether an uplink is up."""
+        return any(link.usable for link in self._links)
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that the replica called ready, by any uplink that is up."""
+        return frozenset(name for link in self._links for name in link.ready)
+
+    @property
+    def draining(self) -> bool:
+        """Whether the replica asked to be left alone."""
+        return any(link.draining for link in self._links)
+
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
+        """Take one attempt, or return False when no uplink takes it. Never blocks."""
+        attempt = _Attempt(service, payload, time.monotonic() + remaining_s)
+        with self._lock:
+            if self._closed or request_id in self._attempts:
+                return False
+            self._attempts[request_id] = attempt
+        if self._send(request_id, attempt):
+            return True
+        with self._lock:  # unless it has ended meanwhile, which was told
+            return self._attempts.pop(request_id, None) is None
+
+    def _send(self, request_id: bytes, attempt: _Attempt) -> bool:
+        """Offer an attempt to the uplinks that its policy chooses; whether one took it."""
+        policy = self._dialer.policy(attempt.service)
+        taken = False
+        usable = [i for i, link in enumerate(self._links) if link.usable]
+        while usable and not taken:
+            chosen, current = choose(policy, usable, self._current)
+            if policy is UplinkPolicy.FAILOVER:
+                self._current = current
+            for index in chosen:
+                taken = self._send_on(index, request_id, attempt) or taken
+            usable = [index for index in usable if index not in chosen]
+        with self._lock:
+            # One uplink may have been lost while the next one declined.
+            if taken and not attempt.on and self._attempts.get(request_id) is attempt:
+                self._again.append(request_id)
+        return taken
+
+    def _send_on(self, index: int, request_id: bytes, attempt: _Attempt) -> bool:
+        with self._lock:
+            if self._attempts.get(request_id) is not attempt:
+                return True  # it was answered by another uplink, or is not wanted any more
+            attempt.on.add(index)
+        left_s = attempt.deadline - time.monotonic()
+        if not self._links[index].offer(attempt.service, request_id, attempt.payload, left_s):
+            with self._lock:
+                attempt.on.discard(index)
+            return False
+        with self._lock:
+            ended = self._attempts.get(request_id) is not attempt
+        if ended:  # while it was sent: `forget` could not reach this uplink
+            self._links[index].forget(request_id)
+        return True
+
+    def send(self) -> None:
+        """Do nothing: no uplink is told of more to come."""
+
+    def forget(self, request_id: bytes) -> None:
+        """Free the window of a request whose answer is no longer wanted, on every uplink."""
+        with self._lock:
+            attempt = self._attempts.pop(request_id, None)
+            on = tuple(attempt.on) if attempt is not None else ()
+        for index in on:
+            self._links[index].forget(request_id)
+
+    def flush(self) -> None:
+        """Send again what lost its uplink, and tell the replica of what was forgotten."""
+        with self._lock:
+            again, self._again = self._again, []
+        for request_id in again:
+            attempt = self._attempts.get(request_id)
+            if attempt is not None and not attempt.on and not self._send(request_id, attempt):
+                self._end(request_id, Answer(request_id, None, Refusal.LOST, attempt.service))
+        for link in self._links:
+            link.flush()
+
+    def status(self) -> LinkStatus:
+        """Return a snapshot: the best uplink's, with all that is in flight."""
+        found = [link.status() for link in self._links]
+        best = min(found, key=lambda s: (_STATES.index(s.state), s.silent_for_s))
+        return replace(
+            best,
+            in_flight=sum(status.in_flight for status in found),
+            in_flight_bytes=sum(status.in_flight_bytes for status in found),
+            reopened=sum(status.reopened for status in found),
+        )
+
+    def uplinks(self) -> list[dict[str, Any]]:
+        """Return how each uplink does, for people."""
+        return [
+            {
+                "interface": link.peer.interface,
+                "state": status.state.value,
+                "rtt_s": status.rtt_s,
+                "detail": status.detail,
+            }
+            for link in self._links
+            for status in (link.status(),)
+        ]
+
+    def close(self) -> None:
+        """End every uplink's link. Attempts still open end with `Refusal.LOST`."""
+        with self._lock:
+            self._closed = True
+            waiting, self._again = self._again, []
+        for link in self._links:
+            link.close()
+        for request_id in waiting:
+            attempt = self._attempts.get(request_id)
+            if attempt is not None:
+                self._end(request_id, Answer(request_id, None, Refusal.LOST, attempt.service))
+
+    # -- events of the uplinks' links (their threads) -------------------------------------
+
+    def ended(self, index: int, answer: Answer) -> None:
+        """Take the end of an attempt on one uplink: the first answer, or the last refusal."""
+        with self._lock:
+            attempt = self._attempts.get(answer.request_id)
+            if attempt is None:
+                return
+            attempt.on.discard(index)
+            if answer.payload is None and attempt.on:
+                return  # it is under way elsewhere
+            elsewhere = answer.payload is None and answer.refusal in _ELSEWHERE
+            again = elsewhere and not self._closed
+            if again:
+                self._again.append(answer.request_id)
+        if again:
+            self._events.changed(self)  # `flush` follows; from here nothing may be sent
+        else:
+            self._end(answer.request_id, answer)
+
+    def _end(self, request_id: bytes, answer: Answer) -> None:
+        with self._lock:
+            attempt = self._attempts.pop(request_id, None)
+            if attempt is None:
+                return
+            others = tuple(attempt.on)
+            if answer.payload is not None and others:
+                self._answered[request_id] = None
+                if len(self._answered) > _ANSWERED_KEPT:
+                    self._answered.popitem(last=False)
+        for index in others:
+            self._links[index].forget(request_id)
+        self._events.answered(self, answer)
+
+    def late(self, service: str, request_id: bytes) -> None:
+        """Tell of work in vain; a second copy of an answer is none: the replica ran it once."""
+        with self._lock:
+            copy = request_id in self._answered
+        if not copy:
+            self._events.late(self, service, request_id)
+
+    def changed(self) -> None:
+        """Tell that an uplink has changed."""
+        self._events.changed(self)
+
+
+class _Events:
+    """Tells a link of several uplinks what one of them says."""
+
+    def __init__(self, owner: UplinksLink, index: int) -> None:
+        self._owner = owner
+        self._index = index
+
+    def answered(self, link: Link, answer: Answer) -> None:
+        """One attempt on this uplink has ended."""
+        self._owner.ended(self._index, answer)
+
+    def late(self, link: Link, service: str, request_id: bytes) -> None:
+        """An answer came to an attempt that was forgotten."""
+        self._owner.late(service, request_id)
+
+    def changed(self, link: Link) -> None:
+        """This uplink's state, or room, has changed."""
+        self._owner.changed()
+
+
+class UplinkDialer:
+    """Makes links that use several uplinks; see `port.Dialer`.
+
+    Args:
+        inner: Makes the link of one uplink.
+
+    Attributes:
+        interfaces: Names of network interfaces, the preferred one first; none for whatever the
+            routes say.
+    """
+
+    def __init__(self, inner: Dialer) -> None:
+        self.inner = inner
+        self.interfaces: tuple[str, ...] = ()
+        self._policies: Mapping[str, UplinkPolicy] = {}
+        self._ways = PLAIN_WAYS
+
+    def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
+        """Set the uplinks and what services want; whether links have to be dialled anew."""
+        ways = Ways.of(services)
+        # Not `timed`: who becomes stateful, or comes anew, has its links dialled anyway.
+        old = (self.interfaces, self._ways.latest, self._ways.plain)
+        changed = (tuple(interfaces), ways.latest, ways.plain) != old
+        self.interfaces, self._ways = tuple(interfaces), ways
+        self._policies = {service.name: service.uplinks for service in services}
+        self.adopt(ways)
+        return changed
+
+    def adopt(self, ways: Ways) -> None:
+        """Set what services want of their links, from the next connection on."""
+        self.inner.adopt(ways)
+
+    def policy(self, service: str) -> UplinkPolicy:
+        """Return a service's policy."""
+        return self._policies.get(service, UplinkPolicy.PREFER)
+
+    def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
+        """Start a link; return at once, in state CONNECTING.
+
+        What is reached on this machine, such as a door for replicas that dial in, takes no uplink.
+        """
+        if not self.interfaces or peer.endpoint.startswith(("127.", "[::1]")):
+            return self.inner.dial(peer, services, events)
+        return UplinksLink(self, peer, services, events)
+
+    def renew(self) -> None:
+        """Take the credentials that now stand in their files into use."""
+        self.inner.renew()
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Tell every replica these records."""
+        self.inner.tell(records)
+
+    def certificate(self) -> str:
+        """Return the common name of the certificate that every link uses."""
+        return self.inner.certificate()
+
+    def close(self) -> None:
+        """Close every link."""
+        self.inner.close()

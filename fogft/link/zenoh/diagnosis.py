@@ -1,0 +1,140 @@
+"""Why a link does not open, in words. Zenoh only says "unable to connect".
+
+Asks the endpoint again with plain TCP and TLS. Called after a failure only, never on the
+way to an answer; `fogft doctor` may call it too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import socket
+import ssl
+
+from fogft.errors import CredentialError
+from fogft.link.port import Peer
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.link.zenoh.validity import judged_here, judged_there, validity_of
+
+# OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
+_OUT_OF_TIME = (9, 10)
+_ALERTS = {
+    "unknown ca": "our certificate is of another CA than the replica's",
+    "decrypt error": "our certificate is of another CA than the replica's",
+    "certificate expired": "our certificate has expired, by the replica's clock",
+    "certificate required": "the replica asks for a certificate and we have none",
+    "unsupported certificate": "our certificate is not a robot's",
+    "bad certificate": "the replica does not accept our certificate",
+    "certificate unknown": "the replica does not accept our certificate",
+}
+
+
+def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
+    """Return in words why `peer` cannot be reached, as far as TCP and TLS can tell.
+
+    Args:
+        peer: Whom to reach.
+        credentials: Our side.
+        timeout_s: The most that each of its steps may take.
+    """
+    host, _, port = peer.endpoint.rpartition(":")
+    try:
+        context = _context(credentials)
+    except CredentialError as error:
+        return error.message
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as raw:
+            with context.wrap_socket(raw) as link:
+                return _after_handshake(link, peer)
+    except ssl.SSLError as error:
+        return _clock_words(error, peer, credentials, timeout_s) or _tls_words(error)
+    except TimeoutError:
+        return f"`{peer.endpoint}` does not answer: frozen, blackholed or overloaded"
+    except (OSError, ValueError) as error:
+        words = getattr(error, "strerror", None) or str(error)
+        return f"`{peer.endpoint}`: {words.lower()}"
+
+
+def _context(credentials: CredentialPaths) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    try:
+        context.load_verify_locations(credentials.ca)
+    except (OSError, ssl.SSLError):
+        raise CredentialError(f"the CA `{credentials.ca}` cannot be used") from None
+    try:
+        context.load_cert_chain(credentials.certificate, credentials.key)
+    except (OSError, ssl.SSLError):
+        message = f"`{credentials.certificate}` or its key cannot be used"
+        raise CredentialError(message) from None
+    return context
+
+
+def _after_handshake(link: ssl.SSLSocket, peer: Peer) -> str:
+    found = _common_name(link)
+    if found != peer.certificate_name:
+        return wrong_name(found, peer)
+    # In TLS 1.3 our own certificate is judged after our side of the handshake: the verdict
+    # comes with the first read. No verdict in time means that it was accepted.
+    link.settimeout(min(0.3, link.gettimeout() or 0.3))
+    with contextlib.suppress(TimeoutError):
+        link.recv(1)
+    return f"`{peer.endpoint}` accepts TLS but no Zenoh session"
+
+
+def wrong_name(found: str | None, peer: Peer) -> str:
+    """Return the words for a peer whose certificate is another's."""
+    return f"`{peer.endpoint}` has the certificate of `{found}`, not of `{peer.certificate_name}`"
+
+
+def _common_name(link: ssl.SSLSocket) -> str | None:
+    certificate = link.getpeercert() or {}
+    subject = certificate.get("subject", ())
+    for part in subject:
+        for entry in part:
+            if isinstance(entry, tuple) and entry[0] == "commonName":
+                return str(entry[1])
+    return None
+
+
+def _clock_words(
+    error: ssl.SSLError, peer: Peer, credentials: CredentialPaths, timeout_s: float
+) -> str:
+    """Return whose clock is wrong where a certificate was refused for its time, else nothing."""
+    now = datetime.datetime.now(datetime.timezone.utc)
+    if isinstance(error, ssl.SSLCertVerificationError):
+        if error.verify_code not in _OUT_OF_TIME:
+            return ""
+        validity = validity_of(_certificate_of(peer, credentials, timeout_s))
+        why = judged_here(validity, now) if validity is not None else ""
+        return f"the replica's certificate is refused: {why}" if why else ""
+    if "certificate expired" not in str(error).lower():
+        return ""
+    with contextlib.suppress(OSError):
+        validity = validity_of(credentials.certificate.read_bytes())
+        if validity is not None:
+            return judged_there(validity, now)
+    return ""
+
+
+def _certificate_of(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> bytes:
+    """Return the certificate (DER) that stands at an endpoint, whoever's it is; to look at only."""
+    host, _, port = peer.endpoint.rpartition(":")
+    context = _context(credentials)
+    context.verify_mode = ssl.CERT_NONE
+    with contextlib.suppress(OSError, ValueError):
+        with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as raw:
+            with context.wrap_socket(raw) as link:
+                return link.getpeercert(binary_form=True) or b""
+    return b""
+
+
+def _tls_words(error: ssl.SSLError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        verdict = error.verify_message or str(error)
+        return f"the replica's certificate is refused: {verdict}"
+    text = str(error).lower()
+    for alert, words in _ALERTS.items():
+        if alert in text:
+            return words
+    return f"TLS fails: {error.reason or error}"

@@ -1,0 +1,116 @@
+"""Watch what flows through one link's connection, and end it beneath Zenoh where nothing does.
+
+Owns: a connection's socket and its `Drain`. Not here: the judgement (`drain`), when to look
+(`zenoh_link`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from fogft.link.socket_progress import BULK_BYTES, Drain
+from fogft.link.zenoh import sockets
+from fogft.link.zenoh.sockets import Address, OwnSocket
+
+# Below, what is large is kept short in the kernel: 16 KiB take longer than 10 ms.
+THIN_BYTES_PER_S = 2_000_000.0
+_LOOK_AGAIN_S = 0.002
+_QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
+
+
+class FlowWatch:
+    """Of one connection; used by one thread, but for `end_when_safe`.
+
+    Args:
+        own: The address of its own end.
+        peer: The address of the other end.
+    """
+
+    def __init__(self, own: Address, peer: Address) -> None:
+        self._socket = OwnSocket(own, peer)
+        self._drain = Drain()
+        self._kept_short = False
+
+    @property
+    def bytes_per_s(self) -> float | None:
+        """How fast it drains, once that was seen."""
+        return self._drain.bytes_per_s
+
+    @property
+    def thin(self) -> bool:
+        """Whether it was seen to drain slowly."""
+        rate = self._drain.bytes_per_s
+        return rate is not None and rate < THIN_BYTES_PER_S
+
+    def carries_bytes_per_s(self, now: float) -> float | None:
+        """What it was lately seen to carry; None where that is not known."""
+        return self._drain.carried.bytes_per_s(now)
+
+    def left_bytes(self, now: float, bytes_per_s: float) -> float:
+        """What is still on its way in the kernel; see `Drain.left_bytes`."""
+        return self._drain.left_bytes(now, bytes_per_s)
+
+    def look(self, now: float, sending_for_s: float = 0.0) -> float:
+        """Look once; return for how many of the last seconds large things moved."""
+        connection = self._socket.borrow()
+        if connection is None:
+            return 0.0
+        with connection:
+            flow = sockets.flow(connection)
+            if flow is None:
+                return 0.0
+            moved_s = self._drain.look(flow, now, sending_for_s)
+            if self.thin and not self._kept_short:
+                sockets.keep_short(connection)
+                self._kept_short = True
+        return moved_s
+
+    def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
+        """Whether a queue stands still, as of the last look; see `Drain.stalled`."""
+        return self._drain.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
+
+    def end_when_safe(
+        self, sending: Callable[[], bool], asked: Callable[[], bool], within_s: float
+    ) -> None:
+        """End the connection where something large may be on its way, either way; may block.
+
+        Zenoh's thread and a sender may wait for each other where an end meets a flow: see
+        `docs/design/links.md`. So what flows fast is let through, and what is stuck is ended.
+
+        Args:
+            sending: Whether something large is being sent.
+            asked: Whether answers may come.
+            within_s: Wait no longer.
+        """
+        deadline = time.monotonic() + within_s
+        received, quiet_since = -1, 0.0
+        while time.monotonic() < deadline:
+            connection = self._socket.borrow()
+            if connection is None:
+                return
+            with connection:
+                flow = sockets.flow(connection)
+                if flow is None or not (sending() or asked()):
+                    break
+                if sending():
+                    if not sockets.takes_more(connection):
+                        sockets.end_sending(connection)  # at once: soon it may take more
+                        return
+                elif flow.received != received:
+                    received, quiet_since = flow.received, time.monotonic()
+                elif time.monotonic() - quiet_since > _QUIET_S:
+                    break
+            time.sleep(_LOOK_AGAIN_S)
+        self._end(sending=sending(), asked=asked())
+
+    def _end(self, *, sending: bool, asked: bool) -> None:
+        connection = self._socket.borrow()
+        if connection is None:
+            return
+        with connection:
+            flow = sockets.flow(connection)
+            if sending or (flow is not None and flow.outstanding >= BULK_BYTES):
+                sockets.end_sending(connection)
+            elif asked:
+                sockets.abort(connection)

@@ -1,0 +1,184 @@
+"""What a robot asks a replica beside its requests: to be let in, probed, believed and answered.
+
+These are queries. Zenoh's threads only decode them and hand them over; the thread for chores
+answers them, and their ends queue behind the replies of their robot.
+
+Owns: who is let in. Not here: requests and their replies (`zenoh_listener`, `reply_queue`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import zenoh
+
+from fogft.link import frame, probe_frames
+from fogft.link.compression import ACCEPTED
+from fogft.link.counters import Counters
+from fogft.link.port import Probe, ProbeAnswer, Refusal
+from fogft.link.zenoh.replica.query_ends import QueryEnd
+from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from fogft.link.zenoh.replica.reply_streams import Streams
+from fogft.link.zenoh.replica.sessions import Guests, NotAdmittedError
+from fogft.link.zenoh.work_queue import Chores
+from fogft.records import frames
+from fogft.records.record import RecordError, SignedRecord
+from fogft.records.record_set import RecordSet, Verdict
+
+log = logging.getLogger(__name__)
+
+_STRANGERS = b""  # in place of a token: replies to whose connection is not known
+
+
+class Asides:
+    """Answers the queries of robots.
+
+    Args:
+        guests: Who was let in.
+        records: What the pool has signed, as far as it is known here.
+        streams: Where each connection's answers go.
+        queues: End queries.
+        chores: The thread that answers.
+        counters: Count what came.
+    """
+
+    def __init__(
+        self,
+        *,
+        guests: Guests,
+        records: RecordSet,
+        streams: Streams,
+        queues: ReplyQueues,
+        chores: Chores,
+        counters: Counters,
+    ) -> None:
+        self._guests = guests
+        self._records = records
+        self._streams = streams
+        self._queues = queues
+        self._chores = chores
+        self._counters = counters
+
+    # -- Zenoh's threads ------------------------------------------------------------------
+
+    def open_answers(self, query: zenoh.Query, turn: int) -> None:
+        """A connection that was let in asks for its answers to come."""
+        try:
+            greeting = _greeting(query)
+        except frame.FrameError as error:
+            self._malformed(error, query, turn)
+            return
+        if not self._guests.admits(greeting.token):
+            self._turn_away(QueryEnd(query, turn, Refusal.NOT_ADMITTED), "it did not greet")
+            return
+        for token, ended in self._streams.opened(
+            greeting.token, query, self._guests.holder(greeting.token)
+        ):
+            self._queues.end(token, "gone", QueryEnd(ended, turn))
+
+    def probe(
+        self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query, turn: int
+    ) -> None:
+        """Somebody greets and asks how we are."""
+        self._counters.add("probes")
+        try:
+            probe = probe_frames.decode_probe(_content(query))
+            greeting = _greeting(query)
+        except frame.FrameError as error:
+            self._malformed(error, query, turn)
+            return
+        answer = partial(self._answer_probe, on_probe, probe, greeting, query, turn)
+        self.later(answer, query, turn)
+
+    def records(self, query: zenoh.Query, turn: int) -> None:
+        """Somebody brings what the pool has signed."""
+        self._counters.add("records")
+        try:
+            greeting = _greeting(query)
+            offered = frames.unpack(_content(query))
+        except (frame.FrameError, RecordError) as error:
+            self._malformed(error, query, turn)
+            return
+        self.later(partial(self._take_records, greeting, offered, query, turn), query, turn)
+
+    def later(self, chore: Callable[[], None], query: zenoh.Query, turn: int) -> None:
+        """Have the other thread do something; where too much waits for it, the query just ends."""
+        if not self._chores.offer(chore):
+            self._queues.end(_STRANGERS, "strangers", QueryEnd(query, turn))
+
+    def _turn_away(self, refused: QueryEnd, why: str) -> None:
+        self._counters.warn(log, "not_admitted", "robot_not_admitted reason=%r", why)
+        self._queues.end(_STRANGERS, "strangers", refused)
+
+    def _malformed(self, error: ValueError, query: zenoh.Query, turn: int) -> None:
+        self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
+        self._queues.end(_STRANGERS, "strangers", QueryEnd(query, turn, Refusal.MALFORMED))
+
+    # -- the thread for chores ------------------------------------------------------------
+
+    def _answer_probe(
+        self,
+        on_probe: Callable[[Probe], ProbeAnswer],
+        probe: Probe,
+        greeting: frame.Greeting,
+        query: zenoh.Query,
+        turn: int,
+    ) -> None:
+        if not self._greeted(greeting, query, turn):
+            return
+        try:
+            answer = replace(on_probe(probe), accepts=ACCEPTED)
+            content = probe_frames.encode_probe_answer(answer)
+            query.reply(query.key_expr, content, express=True)
+        finally:
+            self._end(greeting, query, turn)
+
+    def _take_records(
+        self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query, turn: int
+    ) -> None:
+        """Judge records by their own signatures: whoever brings them has no say in them."""
+        if not self._greeted(greeting, query, turn):
+            return
+        try:
+            for one in offered:
+                verdict = self._records.offer(one)
+                if verdict is Verdict.REFUSED:
+                    self._counters.add("records_refused")
+                    log.warning("record_refused reason=%r", self._records.last_refusal)
+                elif verdict is Verdict.OLDER:
+                    self._counters.add("records_older")
+            query.reply(query.key_expr, b"")
+        finally:
+            self._end(greeting, query, turn)
+        self._guests.revoke(self._records.revoked)
+
+    def _greeted(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> bool:
+        """Whether this is somebody who is let in; else it is told why not."""
+        try:
+            self._guests.greet(greeting)
+        except NotAdmittedError as error:
+            self._turn_away(QueryEnd(query, turn, error.refusal), str(error))
+            return False
+        return True
+
+    def _end(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> None:
+        """End a query in its robot's own thread: unlike the answer, that queues behind replies."""
+        self._queues.end(greeting.token, "probe", QueryEnd(query, turn))
+
+
+def _greeting(query: zenoh.Query) -> frame.Greeting:
+    """Read who asks.
+
+    Raises:
+        FrameError: It does not say so.
+    """
+    attachment = query.attachment
+    return frame.decode_greeting(attachment.to_bytes() if attachment else b"")
+
+
+def _content(query: zenoh.Query) -> bytes:
+    payload = query.payload
+    return payload.to_bytes() if payload else b""

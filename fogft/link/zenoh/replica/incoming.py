@@ -1,0 +1,97 @@
+"""A request that came over Zenoh, until it is answered: once, or refused where it is forgotten.
+
+Owns: that there is one answer. Not here: when it leaves (`reply_queue`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from fogft.link import frame
+from fogft.link.port import Refusal
+from fogft.link.zenoh.replica.replies import Reply
+from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from fogft.link.zenoh.replica.reply_streams import Stream
+from fogft.link.zenoh.work_queue import Chores
+
+
+class ZenohIncoming:
+    """A request that came over Zenoh; see `port.Incoming`."""
+
+    __slots__ = ("_chores", "_header", "_payload", "_queues", "_service", "_streams", "_thin")
+
+    def __init__(
+        self,
+        service: str,
+        header: frame.RequestHeader,
+        payload: bytes,
+        *,
+        stream: Stream,
+        queues: ReplyQueues,
+        chores: Chores,
+        thin: Callable[[bytes], bool],
+    ) -> None:
+        self._thin = thin
+        self._service = service
+        self._header = header
+        self._payload = payload
+        self._streams = [stream]  # taken by the first answer; list.pop is atomic
+        self._queues = queues
+        self._chores = chores
+
+    @property
+    def service(self) -> str:
+        """Name of the service asked for."""
+        return self._service
+
+    @property
+    def request_id(self) -> bytes:
+        """16 bytes, made by the client proxy."""
+        return self._header.request_id
+
+    @property
+    def robot(self) -> str:
+        """Who asks."""
+        return self._header.robot
+
+    @property
+    def remaining_s(self) -> float:
+        """Time that was left when the robot sent it."""
+        return self._header.remaining_s
+
+    @property
+    def payload(self) -> bytes:
+        """The serialised request (CDR)."""
+        return self._payload
+
+    def reply(self, payload: bytes, *, more: bool = False) -> None:
+        """Send the serialised response. Never blocks. With `more`, others will soon follow."""
+        self._send(payload, "", more=more)
+
+    def refuse(self, reason: str) -> None:
+        """Send a refusal. Never blocks."""
+        self._send(b"", reason, more=True)
+
+    def _send(self, payload: bytes, refusal: str, *, more: bool) -> None:
+        try:
+            stream = self._streams.pop()
+        except IndexError:
+            return  # answered before
+        self._payload = b""
+        header = self._header
+        packs = header.may_pack or (header.reads_packed and self._thin(header.token))
+        reply = Reply(stream, header.request_id, payload, refusal, may_pack=packs)
+        self._queues.put(header.token, header.robot, reply, more=more)
+
+    def __del__(self) -> None:
+        """Refuse what its owner forgot: the robot must not wait for it until its deadline.
+
+        The collector may call this anywhere, even while a lock of ours is held; a
+        `SimpleQueue` may be put into from here.
+        """
+        if self._streams:
+            forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)
+            header = self._header
+            refuse = partial(self._queues.put, header.token, header.robot, forgotten, more=True)
+            self._chores.add(refuse)

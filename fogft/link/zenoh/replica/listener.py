@@ -1,0 +1,345 @@
+"""A replica's end over Zenoh: hear requests and probes, queue the answers of each robot apart.
+
+Requests are published to us; a connection's answers are the replies to one query of its own,
+which it asks once we have let it in, and which stays open.
+
+Zenoh's threads only decode and hand over. Replies leave through one thread for each
+connection of a robot, because replying to a frozen robot can block; probes are answered by
+one more thread, ahead of all replies.
+
+Owns: the session, its queryables, the reply threads. Not here: what a request is worth
+(`fogft.proxy.replica.responder`), duplicates included.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from typing import TypeVar
+
+import zenoh
+from zenoh import handlers
+
+from fogft.errors import WireError
+from fogft.link import batch_frames, frame
+from fogft.link.compression import unpack
+from fogft.link.counters import Counters
+from fogft.link.port import Incoming, Probe, ProbeAnswer, Refusal
+from fogft.link.zenoh import settings as config
+from fogft.link.zenoh import sockets, threads
+from fogft.link.zenoh.handshakes import HandshakeLog
+from fogft.link.zenoh.join_at_exit import see_off
+from fogft.link.zenoh.replica.connection_reaper import Doorkeeper
+from fogft.link.zenoh.replica.control_queries import Asides
+from fogft.link.zenoh.replica.incoming import ZenohIncoming
+from fogft.link.zenoh.replica.query_ends import QueryTurns
+from fogft.link.zenoh.replica.replies import Reply
+from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from fogft.link.zenoh.replica.reply_streams import Stream, Streams
+from fogft.link.zenoh.replica.sessions import Guests
+from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.sockets import Address, address
+from fogft.link.zenoh.work_queue import Chores
+from fogft.model import names
+from fogft.model.replica import ReplicaId
+from fogft.records.record_set import RecordSet
+from fogft.records.signing import LazyVerifier
+
+log = logging.getLogger(__name__)
+
+Heard = TypeVar("Heard", zenoh.Query, zenoh.Sample)
+
+_CLOSE_WAIT_S = 1.0
+
+
+class ZenohListener:
+    """Listens for robots; see `port.Listener`.
+
+    Args:
+        listen: ``host:port``; port 0 for any that is free.
+        credentials: The replica's certificate and key, and the pool's CA.
+        id: Which replica this is: it hears the keys of its slot only.
+        settings: Zenoh's times.
+        handshakes: Tells which handshakes were refused; None where they need not be counted.
+        certificate_name: The common name of its certificate, where that is not the replica's.
+
+    Raises:
+        WireError: `listen` is not ``host:port``.
+    """
+
+    def __init__(
+        self,
+        listen: str,
+        credentials: CredentialPaths,
+        id: ReplicaId,
+        *,
+        settings: LinkSettings | None = None,
+        handshakes: HandshakeLog | None = None,
+        certificate_name: str = "",
+    ) -> None:
+        self._endpoint = _with_port(listen)
+        self._handshakes = handshakes
+        self._doorkeeper: Doorkeeper | None = None
+        self._id = id
+        self._settings = settings or LinkSettings()
+        self._config = config.replica_settings(self._endpoint, id, credentials, self._settings)
+        self._guests = Guests(
+            id.pool_uid,
+            certificate_name or names.replica_certificate_name(id),
+            LazyVerifier(credentials.ca),
+        )
+        self._counters = Counters()
+        self._turns = QueryTurns()
+        self._queues = ReplyQueues(self._counters, self._turns)
+        self._chores = Chores(self._counters)
+        self._session: zenoh.Session | None = None
+        self._declared: list[object] = []
+        self._streams = Streams(slow=self._slow)
+        self._asides = Asides(
+            guests=self._guests,
+            records=RecordSet(id.pool_uid, LazyVerifier(credentials.ca)),
+            streams=self._streams,
+            queues=self._queues,
+            chores=self._chores,
+            counters=self._counters,
+        )
+        self._services: dict[str, str] = {}  # key -> service
+
+    @property
+    def _port(self) -> int:
+        return int(self._endpoint.rpartition(":")[2])
+
+    @property
+    def endpoint(self) -> str:
+        """``host:port`` as bound."""
+        return self._endpoint
+
+    def serve(
+        self,
+        services: Mapping[str, str],
+        on_request: Callable[[Incoming], None],
+        on_probe: Callable[[Probe], ProbeAnswer],
+        on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
+    ) -> None:
+        """Begin to listen.
+
+        Raises:
+            WireError: The port is taken, or the credentials cannot be used.
+        """
+        try:
+            session = self._session = zenoh.open(config.to_zenoh(self._config))
+        except zenoh.ZError as error:
+            raise WireError(
+                f"cannot listen at `{self._endpoint}`: {str(error).split(' at /')[0]}",
+                "see that the port is free and that the certificate, its key and the CA exist",
+            ) from error
+        self._chores.start()
+        self._doorkeeper = Doorkeeper(
+            self._port,
+            self._peers,
+            lambda: self._guests.revoked,
+            self._counters,
+            also=self._count_handshakes,
+            stuck_after_s=self._settings.stuck_after_s,
+        )
+        self.add(services)
+        place = self._id.pool_uid, self._id.slot
+        self._hear(session, names.services_key(*place), partial(self._request, on_request))
+        self._hear(session, names.cancel_key(*place), partial(self._cancel, on_cancel))
+        self._declare(session, names.answers_key(*place), self._asides.open_answers)
+        self._declare(session, names.records_key(*place), self._asides.records)
+        # Last: who is told that this replica is ready finds every service.
+        self._declare(session, names.probe_key(*place), partial(self._asides.probe, on_probe))
+
+    def add(self, services: Mapping[str, str]) -> None:
+        """Hear requests for further services too (name -> key)."""
+        self._services.update((key, name) for name, key in services.items())
+
+    def _peers(self) -> dict[Address, str]:
+        session = self._session
+        links = [] if session is None else session.info.links()
+        return {address(link.dst): link.auth_identifier or "" for link in links}
+
+    def _slow(self, holder: str) -> bool:
+        """Whether what a robot is sent was seen to leave slowly."""
+        doorkeeper = self._doorkeeper
+        return doorkeeper is not None and holder in doorkeeper.thin
+
+    def _thin(self, token: bytes) -> bool:
+        return self._slow(self._guests.holder(token))
+
+    def _count_handshakes(self) -> None:
+        for reason in self._handshakes.refusals() if self._handshakes else ():
+            self._counters.warn(
+                log, "handshakes_refused", "handshake_refused reason=%r", str(reason)
+            )
+
+    def _declare(
+        self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query, int], None]
+    ) -> None:
+        callback = handlers.Callback(self._taken(f"query at {key}", heard), indirect=False)
+        self._declared.append(session.declare_queryable(key, callback, complete=True))
+
+    def _hear(
+        self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Sample], None]
+    ) -> None:
+        def told(sample: zenoh.Sample, turn: int) -> None:
+            heard(sample)
+
+        callback = handlers.Callback(self._taken(f"message at {key}", told), indirect=False)
+        self._declared.append(session.declare_subscriber(key, callback))
+
+    def _taken(self, what: str, heard: Callable[[Heard, int], None]) -> Callable[[Heard], None]:
+        """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
+
+        def guarded(one: Heard) -> None:
+            turn = self._turns.came()
+            threads.note()
+            try:
+                heard(one, turn)
+            except Exception:
+                self._counters.add("failed")
+                log.exception("not_taken what=%r", what)
+
+        return guarded
+
+    # -- Zenoh's threads ------------------------------------------------------------------
+
+    def _request(self, on_request: Callable[[Incoming], None], sample: zenoh.Sample) -> None:
+        attachment = sample.attachment
+        head = attachment.to_bytes() if attachment else b""
+        try:
+            if batch_frames.is_batch(head):
+                requests = batch_frames.decode_requests(head, sample.payload.to_bytes())
+            else:
+                requests = [(frame.decode_request(head), sample.payload.to_bytes())]
+        except frame.FrameError as error:
+            self._malformed(error)
+            return
+        self._take_requests(on_request, str(sample.key_expr), requests)
+        self._counters.add("requests", len(requests))
+
+    def _take_requests(
+        self,
+        on_request: Callable[[Incoming], None],
+        key: str,
+        requests: Sequence[tuple[frame.RequestHeader, bytes]],
+    ) -> None:
+        token = requests[0][0].token
+        stream = self._streams.of(token)
+        if stream is None or not self._guests.admits(token):
+            self._counters.warn(
+                log, "not_admitted", "robot_not_admitted reason=%r", "it did not greet"
+            )
+            if stream is not None:
+                self._refuse_all(requests, stream, Refusal.NOT_ADMITTED)
+            return
+        service = self._services.get(key)
+        if service is None:
+            self._refuse_all(requests, stream, Refusal.NOT_READY)
+            return
+        for header, payload in requests:
+            try:
+                request = unpack(payload) if header.packed else payload
+            except ValueError as error:
+                self._malformed(error)
+                self._refuse(header, stream, Refusal.MALFORMED)
+                continue
+            incoming = ZenohIncoming(
+                service,
+                header,
+                request,
+                stream=stream,
+                queues=self._queues,
+                chores=self._chores,
+                thin=self._thin,
+            )
+            try:
+                on_request(incoming)
+            except Exception:  # the others that came with it go on
+                self._counters.add("failed")
+                log.exception("request_not_taken service=%s", service)
+                incoming.refuse(Refusal.LOST)
+        stream.seen(requests[0][0].seen)
+
+    def _refuse_all(
+        self, requests: Sequence[tuple[frame.RequestHeader, bytes]], stream: Stream, reason: str
+    ) -> None:
+        for header, _ in requests:
+            self._refuse(header, stream, reason)
+
+    def _refuse(self, header: frame.RequestHeader, stream: Stream, reason: str) -> None:
+        self._queues.put(
+            header.token, header.robot, Reply(stream, header.request_id, b"", reason), more=True
+        )
+
+    def _malformed(self, error: ValueError) -> None:
+        self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
+
+    def _cancel(self, on_cancel: Callable[[Sequence[bytes]], None], sample: zenoh.Sample) -> None:
+        self._counters.add("cancellations")
+        try:
+            ids = frame.decode_cancel(sample.payload.to_bytes())
+        except frame.FrameError as error:
+            self._malformed(error)
+            return
+        self._chores.offer(partial(on_cancel, ids))
+
+    # -- the owner ------------------------------------------------------------------------
+
+    def revoke(self, names: Collection[str]) -> None:
+        """Let these holders in no more; what they ask from now on is refused."""
+        self._guests.revoke(names)
+
+    def counters(self) -> Mapping[str, int]:
+        """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
+        ``malformed``, ``records``, ``records_refused``, ``records_older``, ``not_admitted``,
+        ``handshakes_refused``, ``unauthenticated``, ``revoked_links``, ``stuck_links``,
+        ``reply_dropped``, ``failed``, ``cancellations``, ``chores_dropped``.
+        """
+        return self._counters.snapshot()
+
+    def close(self) -> None:
+        """Send what is queued, then stop. Repeatable; takes a second at most."""
+        session, self._session = self._session, None
+        if session is None:
+            return
+        self._declared.clear()
+        self._streams.clear()
+        if self._doorkeeper is not None:
+            self._doorkeeper.close()
+        self._queues.close(_CLOSE_WAIT_S / 2)
+        sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
+        self._chores.close()
+        closer = threading.Thread(
+            target=_close, args=(session,), name="fogft-close-listener", daemon=True
+        )
+        closer.start()
+        see_off(closer)
+        closer.join(_CLOSE_WAIT_S / 2)
+
+
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()  # type: ignore[no-untyped-call]
+    except zenoh.ZError as error:  # a robot is frozen with replies in flight; Zenoh waits 10 s
+        log.debug("session_closed_late reason=%r", str(error))
+
+
+def _with_port(listen: str) -> str:
+    host, separator, port = listen.rpartition(":")
+    if not separator or not host or not port.isdigit() or int(port) > 65535:
+        raise WireError(f"`{listen}` is not `host:port`", "for instance `0.0.0.0:7447`")
+    if int(port) != 0:
+        return listen
+    # Zenoh does not tell which port it was given, so we ask the kernel for a free one first.
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.bind((host.strip("[]"), 0))
+            return f"{host}:{probe.getsockname()[1]}"
+    except OSError as error:
+        raise WireError(f"cannot listen at `{listen}`: {error.strerror or error}") from error

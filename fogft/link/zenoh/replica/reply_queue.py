@@ -1,0 +1,208 @@
+"""Replies on their way out: a queue and a thread for each connection of a robot.
+
+A reply to a frozen robot blocks until Zenoh gives that robot's session up. So each
+connection has its own thread; it ends when it has had nothing to do for a while. What cannot
+block (`streams`) leaves at once, from the thread that brings it, where that is none of Zenoh's.
+
+Queries that are to be ended take the same way: that sends something, too.
+
+Owns: the order and the bounds of replies. Not here: what is replied (`replies`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from functools import partial
+from queue import Empty, SimpleQueue
+
+from fogft.link import batch_frames
+from fogft.link.counters import Counters
+from fogft.link.port import Refusal
+from fogft.link.zenoh import threads
+from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
+from fogft.link.zenoh.replica.replies import Reply, send_together
+
+log = logging.getLogger(__name__)
+
+REPLIES_LIMIT = 1024
+BYTES_LIMIT = 64 << 20
+_IDLE_S = 5.0
+_END_LOOK_S = 0.2  # nobody waits for an end
+
+
+class ReplyQueue:
+    """The replies for one connection of a robot."""
+
+    def __init__(self) -> None:
+        self.replies: SimpleQueue[Reply | QueryEnd | None] = SimpleQueue()
+        self.waiting = 0
+        self.waiting_bytes = 0
+        self.thread: threading.Thread | None = None
+        self._taken: list[Reply | QueryEnd | None] = []  # it did not fit to what was taken before
+
+    def next(self, timeout_s: float) -> list[Reply] | QueryEnd:
+        """Wait for what is to be sent next, together, or to be ended; nothing where all ends.
+
+        Raises:
+            Empty: Nothing came.
+        """
+        first = self._taken.pop() if self._taken else self.replies.get(timeout=timeout_s)
+        if first is None:
+            return []
+        if isinstance(first, QueryEnd):
+            return first
+        together, size = [first], len(first.payload)
+        while first.joins and len(together) < batch_frames.LIMIT:
+            try:
+                reply = self.replies.get_nowait()
+            except Empty:
+                break
+            if not isinstance(reply, Reply):
+                self._taken.append(reply)
+                break
+            size += len(reply.payload)
+            fits = size <= batch_frames.BYTES_LIMIT
+            if not fits or not reply.joins or reply.stream is not first.stream:
+                self._taken.append(reply)
+                break
+            together.append(reply)
+        return together
+
+
+class ReplyQueues:
+    """All reply queues of a listener.
+
+    Args:
+        counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
+        turns: Tells when a query may be ended.
+        idle_s: A thread that had nothing to send for so long ends.
+    """
+
+    def __init__(
+        self, counters: Counters, turns: QueryTurns | None = None, *, idle_s: float = _IDLE_S
+    ) -> None:
+        self._counters = counters
+        self._turns = turns or QueryTurns()
+        self._idle_s = idle_s
+        self._lock = threading.Lock()
+        self._queues: dict[bytes, ReplyQueue] = {}
+        self._closed = False
+
+    def __len__(self) -> int:
+        return len(self._queues)
+
+    def put(self, token: bytes, robot: str, reply: Reply, *, more: bool) -> None:
+        """Send a reply, or queue it. Never blocks; where too much waits, the robot gets none.
+
+        Args:
+            token: The robot's connection: replies of one never wait for another's.
+            robot: Its name, for people.
+            reply: What to send.
+            more: Others will soon follow, to leave in one message with it.
+        """
+        may_send = not more and reply.small and not threads.is_this()
+        if may_send and not self._closed and self._sent_at_once(reply):
+            self._count(reply)
+            return
+        size = len(reply.payload)
+        with self._lock:
+            if self._closed:
+                return
+            queue = self._queue(token, robot)
+            full = queue.waiting >= REPLIES_LIMIT or queue.waiting_bytes + size > BYTES_LIMIT
+            dropped = full and queue.waiting > 0
+            if dropped:
+                reply.payload, reply.refusal, size = b"", Refusal.LOST, 0
+            queue.waiting += 1
+            queue.waiting_bytes += size
+            queue.replies.put(reply)
+        if dropped:
+            self._counters.add("reply_dropped")
+        else:
+            self._count(reply)
+
+    def end(self, token: bytes, robot: str, query: QueryEnd) -> None:
+        """Queue a query that is to be ended. Never blocks."""
+        with self._lock:
+            if self._closed:
+                return
+            queue = self._queue(token, robot)
+            queue.waiting += 1
+            queue.replies.put(query)
+        if query.refusal:
+            self._counters.add("refused")
+
+    def _sent_at_once(self, reply: Reply) -> bool:
+        try:
+            return reply.stream.send_at_once(reply.send)
+        except Exception as error:
+            self._failed(error)
+            return True
+
+    def _count(self, reply: Reply) -> None:
+        self._counters.add("refused" if reply.refusal else "replies")
+
+    def _queue(self, token: bytes, robot: str) -> ReplyQueue:
+        queue = self._queues.get(token)
+        if queue is not None:
+            return queue
+        queue = ReplyQueue()
+        queue.thread = threading.Thread(
+            target=self._run, args=(token, queue), name=f"fogft-reply-{robot}", daemon=True
+        )
+        queue.thread.start()  # where that fails, the next reply tries it again
+        self._queues[token] = queue
+        return queue
+
+    def _run(self, token: bytes, queue: ReplyQueue) -> None:
+        unended = Unended(self._turns)
+        while True:
+            try:
+                taken = queue.next(_END_LOOK_S if unended else self._idle_s)
+            except Empty:
+                if unended:
+                    self._guarded(unended.look)
+                    continue
+                with self._lock:
+                    if queue.waiting:
+                        continue  # one came between the time-out and the lock
+                    self._queues.pop(token, None)
+                    return
+            if isinstance(taken, QueryEnd):
+                self._guarded(taken.say)
+                self._guarded(partial(unended.add, taken))
+                done, size = 1, 0
+            elif taken:
+                done, size = len(taken), sum(len(reply.payload) for reply in taken)
+                self._guarded(partial(taken[0].stream.send, partial(send_together, taken)))
+            else:
+                return
+            if unended:
+                self._guarded(unended.look)
+            with self._lock:
+                queue.waiting -= done
+                queue.waiting_bytes -= size
+            del taken  # its payloads, while this thread waits
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except Exception as error:
+            self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        self._counters.warn(log, "failed", "reply_failed reason=%r", str(error))
+
+    def close(self, timeout_s: float) -> None:
+        """Take nothing more; wait a moment for what is queued."""
+        with self._lock:
+            self._closed = True
+            queues = list(self._queues.values())
+            self._queues.clear()
+        for queue in queues:
+            queue.replies.put(None)
+        for queue in queues:
+            if queue.thread is not None:
+                queue.thread.join(timeout_s / max(len(queues), 1))

@@ -1,0 +1,133 @@
+"""Whose connection a request came through, and whether its holder is still let in.
+
+TLS has let the connection in; but Zenoh does not tell a listener whose query it hands over.
+So each connection greets: it sends its certificate, and a signature over its own random
+token and this replica's name. From then on the token, which only the two ends know, stands
+for the holder. A holder who is revoked is let in no more, whatever connections are open.
+
+Owns: which tokens are good, and whose. Not here: signatures (`signing`), TLS (`config`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Collection
+
+from fogft.link import frame
+from fogft.link.frame import Greeting
+from fogft.link.port import Refusal
+from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.records.record import RecordError, Verify
+
+HOLDERS_LIMIT = 256
+TOKENS_LIMIT = 64  # of one holder: nobody's connections push out another's
+_MAY_ASK = frozenset({Role.ROBOT, Role.GATEWAY})
+
+
+class NotAdmittedError(Exception):
+    """Somebody is not let in.
+
+    Args:
+        refusal: One of `port.Refusal`, as it travels.
+        detail: The reason for people.
+    """
+
+    def __init__(self, refusal: str, detail: str) -> None:
+        super().__init__(detail)
+        self.refusal = refusal
+
+
+class Guests:
+    """The connections that may ask here. Safe to use from several threads.
+
+    Args:
+        pool_uid: Holders of other pools are not let in.
+        replica: This replica's common name, which a greeting is made out to.
+        verify: Checks a signature and its certificate.
+    """
+
+    def __init__(self, pool_uid: str, replica: str, verify: Verify) -> None:
+        self._pool_uid = pool_uid
+        self._replica = replica
+        self._verify = verify
+        self._lock = threading.Lock()
+        self._tokens: dict[bytes, str] = {}
+        self._holders: OrderedDict[str, OrderedDict[bytes, None]] = OrderedDict()
+        self._revoked: frozenset[str] = frozenset()
+
+    def greet(self, greeting: Greeting) -> None:
+        """Let a connection in, or find that it was let in before.
+
+        Raises:
+            NotAdmittedError: Its holder may not ask here.
+        """
+        if not greeting.certificate:
+            if greeting.token not in self._tokens:
+                raise NotAdmittedError(Refusal.NOT_ADMITTED, "a connection that did not greet")
+            return
+        message = frame.greeted_bytes(greeting.token, self._replica)
+        try:
+            writer = self._verify(greeting.certificate, greeting.signature, message)
+            holder = holder_of(writer.common_name)
+        except RecordError as error:
+            expired = error.reason == "expired"
+            raise NotAdmittedError(
+                Refusal.EXPIRED_CERTIFICATE if expired else Refusal.NOT_ADMITTED, str(error)
+            ) from error
+        except ValueError as error:
+            raise NotAdmittedError(Refusal.NOT_ADMITTED, str(error)) from error
+        if holder.role.value != writer.role or holder.role not in _MAY_ASK:
+            raise NotAdmittedError(Refusal.NOT_ADMITTED, f"`{writer.common_name}` may not ask")
+        if holder.pool_uid != self._pool_uid:
+            raise NotAdmittedError(
+                Refusal.NOT_ADMITTED, f"`{writer.common_name}` is no holder here"
+            )
+        self._admit(greeting.token, holder)
+
+    def _admit(self, token: bytes, holder: Holder) -> None:
+        name = holder.common_name
+        with self._lock:
+            if name in self._revoked:
+                raise NotAdmittedError(Refusal.REVOKED, f"`{name}` is revoked")
+            if self._tokens.get(token, name) != name:
+                raise NotAdmittedError(Refusal.NOT_ADMITTED, "a token that is another's")
+            if name not in self._holders and len(self._holders) >= HOLDERS_LIMIT:
+                self._forget(next(iter(self._holders)))
+            tokens = self._holders.setdefault(name, OrderedDict())
+            self._holders.move_to_end(name)
+            tokens[token] = None
+            self._tokens[token] = name
+            if len(tokens) > TOKENS_LIMIT:
+                oldest, _ = tokens.popitem(last=False)
+                del self._tokens[oldest]
+
+    def _forget(self, name: str) -> None:
+        for token in self._holders.pop(name, ()):
+            del self._tokens[token]
+
+    def holder(self, token: bytes) -> str:
+        """Return whose connection a token names; empty for nobody's."""
+        return self._tokens.get(token, "")
+
+    def admits(self, token: bytes) -> bool:
+        """Whether requests under this token are let in. Cheap, asked for each request."""
+        return token in self._tokens
+
+    def revoke(self, names: Collection[str]) -> None:
+        """Let these holders in no more. Names that were revoked before stay so."""
+        with self._lock:
+            self._revoked |= frozenset(names)
+            for name in self._revoked & self._holders.keys():
+                self._forget(name)
+
+    @property
+    def revoked(self) -> frozenset[str]:
+        """Common names that are let in no more."""
+        return self._revoked
+
+    @property
+    def names(self) -> list[str]:
+        """Common names of those who greeted, sorted."""
+        with self._lock:
+            return sorted(self._holders)

@@ -1,0 +1,405 @@
+"""The requests open on one connection: taken, sent, and ended, each once.
+
+A request is sent by whoever offers it where that cannot block (`credit`), else by a thread of its
+connection's own, so a peer that takes nothing costs nobody else.
+
+Owns: open attempts, what waits for the sender thread, and that thread. Not here: the session
+(`zenoh_connection`), which requests there are and what becomes of them
+(`fogft.proxy.robot.dispatcher`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
+
+from fogft.link import batch_frames, frame
+from fogft.link.cancellations import Recalls
+from fogft.link.compression import Compression
+from fogft.link.credit import Credit
+from fogft.link.deadline_filter import InTime
+from fogft.link.large_send_gate import LARGE_BYTES, Turns
+from fogft.link.port import Answer, Refusal
+from fogft.link.send_options import Ways
+from fogft.link.window import ATTEMPTS_LIMIT, LinkWindow
+from fogft.link.zenoh.flow_watch import FlowWatch
+from fogft.link.zenoh.join_at_exit import see_off
+from fogft.link.zenoh.robot.attempt import OpenAttempt
+from fogft.link.zenoh.robot.batch_buffer import Held
+from fogft.link.zenoh.robot.send_queue import SendQueue
+from fogft.link.zenoh.robot.unanswered import Unanswered
+
+# Attempts that wait for the sender, forgotten ones included: those have freed their room in the
+# window, so without a bound of its own the queue of a sender that is stuck would grow.
+_QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
+# A `put` that took this long was stuck behind a full queue: see whether the session survived.
+_STUCK_S = 0.1
+# What Zenoh itself may hold of a large request once its sending has returned: two batches.
+_ZENOH_HOLDS_BYTES = 2 * 65535
+# How long the keeper looks often after the last large request began to leave.
+_WATCH_S = 5.0
+
+# In the queue, in place of an attempt: tell the replica of what was forgotten.
+_TELL = OpenAttempt("", b"", b"", offered=0.0, remaining_s=0.0)
+
+
+class Outlet(Protocol):
+    """What attempts need of their connection."""
+
+    @property
+    def flow(self) -> FlowWatch:
+        """What flows through its socket."""
+
+    def publish(self, service: str, content: bytes, header: bytes) -> None:
+        """Send a message to a service. May block for as long as the peer takes nothing."""
+
+    def recall(self, ids: Sequence[bytes]) -> None:
+        """Tell the replica that these are no longer wanted. May block likewise."""
+
+    def alive(self) -> bool:
+        """Whether there is still a link beneath."""
+
+    def lose(self, because: str) -> None:
+        """It is of no more use. Any thread, perhaps more than once."""
+
+
+class Attempts:
+    """The attempts of one connection.
+
+    Args:
+        outlet: The connection.
+        services: What may be asked for.
+        origin: What the headers of all its requests say (`frame.origin`).
+        ways: How the services' payloads are sent.
+        turns: Shared with the robot's other connections.
+        recalls: Of whom the replica is told that it may stop; None to tell of nobody.
+        answered: Called with each attempt's end, once. Must not block.
+        late: Called with service and id when a forgotten request was answered. Must not block.
+        room: Called when a window that was full has room again.
+        large: Called when something large is sent and `watched` is not set. Must not block.
+        ended: What the sender thread does last.
+        name: Of that thread.
+
+    Attributes:
+        window: Those that are open.
+        packs: Whether the replica reads what is compressed.
+        packs_answers: Whether it finds out by itself when to compress answers.
+        watched: Something large was sent lately: the keeper looks often.
+    """
+
+    def __init__(
+        self,
+        outlet: Outlet,
+        services: Iterable[str],
+        origin: bytes,
+        *,
+        ways: Ways,
+        turns: Turns,
+        recalls: Recalls | None,
+        answered: Callable[[Answer], None],
+        late: Callable[[str, bytes], None],
+        room: Callable[[], None],
+        large: Callable[[], None],
+        ended: Callable[[], None],
+        name: str,
+    ) -> None:
+        self._outlet = outlet
+        self._services = frozenset(services)
+        self._origin = origin
+        self._turns = turns
+        self._recalls = recalls
+        self._answered = answered
+        self._late = late
+        self._room = room
+        self._on_large = large
+        self._ended = ended
+        self.window: LinkWindow[OpenAttempt] = LinkWindow()
+        self.packs = False
+        self.packs_answers = False
+        self.watched = False
+        self._large_since = float("-inf")
+        self._sending_since: float | None = None
+        self._held_by_zenoh = (0.0, 0)  # since when, so many bytes at most
+        self._seen = frame.NO_STAMP  # the stamp of the last answer
+        self._telling = False
+        self._unanswered = Unanswered()
+        self._held = Held()
+        self._credit = Credit()
+        self._queue = SendQueue(ways.latest)
+        self._compressions = {name: Compression() for name in self._services - ways.plain}
+        self._flow = outlet.flow
+        self._in_time = InTime(
+            ways.timed, self._flow.carries_bytes_per_s, self._left_bytes, self._compression
+        )
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    # -- requests (any thread) ------------------------------------------------------------
+
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
+        """Take an attempt, or return False. Never blocks. With `more`, `send` must follow."""
+        if service not in self._services or self._queue.qsize() >= _QUEUE_LIMIT:
+            return False
+        now = time.monotonic()
+        attempt = OpenAttempt(service, request_id, payload, offered=now, remaining_s=remaining_s)
+        if not self._in_time.may_arrive(attempt, remaining_s, now, self._before):
+            return False
+        if not self.window.admit(attempt) and not self._displace(attempt):
+            return False
+        mark = self._credit.take(attempt.size)
+        if mark is None:
+            self.send()
+            attempt.mark = self._credit.queue(attempt.size)
+            self._queue.put(attempt)
+            return True
+        # It cannot block: the hop to another thread is saved.
+        attempt.mark = mark
+        if (more or self._held) and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
+            self._send_together(self._held.add(attempt))
+        else:
+            self._send_at_once(attempt, payload, remaining_s)
+        if not more:
+            self.send()
+        return True
+
+    def _send_at_once(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
+        """Send something small that was just offered, and cannot block."""
+        attempt.payload = None
+        try:
+            self._publish(attempt, payload, max(remaining_s, 0.0))
+        except Exception as error:  # whatever it is, the attempt must end
+            self._outlet.lose(f"sending failed: {error}")
+            self._end(attempt, None, Refusal.LOST)
+
+    def send(self) -> None:
+        """Send what was offered with `more`. Never blocks: it was small, and reserved."""
+        self._send_together(self._held.take())
+
+    def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
+        if len(attempts) < 2 or self._flow.thin:  # there, each is compressed
+            for attempt in attempts:
+                self._send_or_lose(attempt)
+            return
+        now = time.monotonic()
+        parts = []
+        for attempt in attempts:
+            payload = attempt.payload  # read once, as in `_send`
+            attempt.payload = None
+            if payload is not None and self.window.holds(attempt):
+                parts.append((attempt.request_id, max(attempt.deadline - now, 0.0), payload))
+                self._unanswered.add(attempt)
+        if not parts:
+            return
+        header, content = batch_frames.encode_requests(parts, self._origin, seen=self._seen)
+        try:
+            self._outlet.publish(attempts[0].service, content, header)
+        except Exception as error:  # whatever it is, the attempts must end
+            self._outlet.lose(f"sending failed: {error}")
+            for attempt in attempts:
+                self._end(attempt, None, Refusal.LOST)
+
+    def _before(self, service: str) -> list[OpenAttempt]:
+        """Return what leaves before an attempt that comes now."""
+        if self._queue.overtakes(service):
+            return []
+        return [one for one in self.window.attempts() if one.payload is not None]
+
+    def _left_bytes(self, now: float, bytes_per_s: float) -> float:
+        """Return what was sent and has not arrived: in the kernel, and in Zenoh above it."""
+        since, held = self._held_by_zenoh
+        left = max(0.0, held - bytes_per_s * (now - since))
+        return left + self._flow.left_bytes(now, bytes_per_s)
+
+    def _compression(self, service: str) -> Compression | None:
+        return self._compressions.get(service) if self.packs else None
+
+    def _displace(self, attempt: OpenAttempt) -> bool:
+        """Let a newer attempt in for the stalest unsent one, where its service wants that."""
+        stale = self._queue.stalest(attempt)
+        if stale is None:
+            return False
+        self._end(stale, None, Refusal.SUPERSEDED)
+        return self.window.admit(attempt)
+
+    def forget(self, request_id: bytes) -> None:
+        """Free the room and the bytes of a request, also where its sender is stuck."""
+        attempt = self.window.forget(request_id)
+        if attempt is None:
+            return
+        sent, recalls, now = attempt.payload is None, self._recalls, time.monotonic()
+        if sent and recalls is not None and recalls.add(request_id, attempt.offered, now):
+            self.flush()
+        attempt.payload = None
+        if self.window.regained_room():
+            self._room()
+
+    def flush(self) -> None:
+        """Have the replica told of what was forgotten and not answered."""
+        if self._recalls and not self._telling:  # there are some
+            self._telling = True
+            self._queue.put(_TELL)
+
+    def _end(self, attempt: OpenAttempt, payload: bytes | None, refusal: str = "") -> None:
+        if self.window.remove(attempt):
+            attempt.payload = None
+            self._answered(Answer(attempt.request_id, payload, refusal, attempt.service))
+            if self.window.regained_room():
+                self._room()
+
+    # -- the sender thread ----------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            attempt = self._queue.get()
+            if attempt is None:
+                break
+            if attempt is _TELL:
+                self._tell()
+                continue
+            self._send_or_lose(attempt)
+            self._credit.dequeued()
+        self._ended()
+
+    def _tell(self) -> None:
+        self._telling = False
+        ids = self._recalls.take() if self._recalls is not None else []
+        if not ids:
+            return
+        try:
+            self._outlet.recall(ids)
+        except Exception as error:
+            self._outlet.lose(f"sending failed: {error}")
+
+    def _send_or_lose(self, attempt: OpenAttempt) -> None:
+        try:
+            self._send(attempt)
+        except Exception as error:  # whatever it is, the attempt must end
+            self._outlet.lose(f"sending failed: {error}")
+            self._end(attempt, None, Refusal.LOST)
+
+    def _send(self, attempt: OpenAttempt) -> None:
+        payload = attempt.payload  # read once: `forget` may take it away at any moment
+        if payload is None or not self.window.holds(attempt):
+            return  # forgotten while it waited
+        remaining_s = attempt.deadline - time.monotonic()
+        if remaining_s <= 0:
+            self._end(attempt, None, Refusal.LOST)
+            return
+        if not self._in_time.may_arrive(attempt, remaining_s, time.monotonic()):
+            self._end(attempt, None, Refusal.TOO_SLOW)
+            return
+        attempt.payload = None
+        large = attempt.size >= LARGE_BYTES
+        turn = self._turns.take() if large else None
+        began = time.monotonic()
+        if large:
+            self._large_since = self._sending_since = began
+            self._sends_large()
+        try:
+            if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
+                self._publish(attempt, payload, remaining_s)
+        finally:
+            self._sending_since = None
+            self._turns.give(turn)
+        if large:
+            self._held_by_zenoh = time.monotonic(), min(attempt.size, _ZENOH_HOLDS_BYTES)
+        if time.monotonic() - began > _STUCK_S and not self._outlet.alive():
+            self._outlet.lose("it took nothing more, and Zenoh gave the session up")
+
+    def _sends_large(self) -> None:
+        """Have the keeper look whether it flows, from now on and for a while."""
+        if not self.watched:
+            self.watched = True
+            self._on_large()
+
+    def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
+        compression = self._compression(attempt.service)
+        packed = None
+        if compression is not None:
+            packed = compression.pack(payload, self._flow.bytes_per_s)
+        self._unanswered.add(attempt)
+        header = frame.encode_request(
+            attempt.request_id,
+            remaining_s,
+            self._origin,
+            seen=self._seen,
+            packed=packed is not None,
+            may_pack=compression is not None and self._flow.thin,
+            reads_packed=self.packs_answers and compression is not None,
+        )
+        content = payload if packed is None else packed
+        self._outlet.publish(attempt.service, content, header)
+
+    # -- what came (Zenoh's threads) ------------------------------------------------------
+
+    def heard(self, stamp: bytes, answers: Iterable[Answer]) -> None:
+        """Take answers to requests, and the stamp that they came with."""
+        self._seen = stamp
+        for answer in answers:
+            self._take_answer(answer)
+
+    def _take_answer(self, answer: Answer) -> None:
+        attempt = self._unanswered.answered(answer.request_id)
+        if attempt is None:
+            return  # it was answered before
+        if answer.payload is not None:
+            self._credit.heard(attempt.mark)  # requests of one connection arrive in order
+        if self.window.holds(attempt):
+            self._end(attempt, answer.payload, answer.refusal)
+            return
+        if self._recalls is not None:  # it was forgotten, or has ended
+            self._recalls.answered(answer.request_id)
+        if answer.payload is not None or answer.refusal == Refusal.LATE:
+            self._late(attempt.service, answer.request_id)
+
+    # -- the keeper -----------------------------------------------------------------------
+
+    @property
+    def sending(self) -> bool:
+        """Whether something large is being sent."""
+        return self._sending_since is not None
+
+    @property
+    def awaits_answers(self) -> bool:
+        """Whether answers may still come, late ones included."""
+        return len(self._unanswered) > 0
+
+    def look(self, now: float) -> float:
+        """Note whether large things are still sent; return for how long the present one is."""
+        if self.watched and now - self._large_since > _WATCH_S and not self._queue.qsize():
+            self.watched = False
+        since = self._sending_since
+        return 0.0 if since is None else now - since
+
+    def sweep(self) -> None:
+        """End the attempts whose time is up and of which Zenoh told nothing."""
+        now = time.monotonic()
+        for attempt in self.window.attempts():
+            if attempt.deadline <= now:
+                self._end(attempt, None, Refusal.LOST)
+
+    def close(self) -> None:
+        """Take nothing more: what is open is lost. Returns at once; `end` must follow."""
+        ended = self.window.close()
+        see_off(self._thread)
+        for attempt in ended:
+            attempt.payload = None
+            self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
+
+    def end(self) -> None:
+        """Have the sender thread end, once it is through with what it sends."""
+        self._queue.put(None)
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
+        self._thread.join(timeout_s)

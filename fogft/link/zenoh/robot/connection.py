@@ -1,0 +1,339 @@
+"""One Zenoh session of a robot towards one replica, used once and thrown away.
+
+A request is published at its service's key; the answers to all of them come as the replies to
+one query, which stays open for as long as the connection. A query for each request would cost
+a third more (its state, two timers and its end, at both ends), and its time-out at the replica
+would be sent by the one thread that all else there needs, too.
+
+Everything of Zenoh's that can block (`put`, `close`) is called by the sender thread of its
+attempts, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's threads.
+
+Owns: a session. Not here: the requests open on it (`attempts`), when to open and when to give
+up (`zenoh_link`).
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import zenoh
+from zenoh import handlers
+
+from fogft.errors import WireError
+from fogft.link import frame
+from fogft.link.cancellations import Recalls
+from fogft.link.large_send_gate import Turns
+from fogft.link.port import Answer, Peer, Refusal
+from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.link.zenoh import threads
+from fogft.link.zenoh.diagnosis import wrong_name
+from fogft.link.zenoh.flow_watch import FlowWatch
+from fogft.link.zenoh.join_at_exit import see_off
+from fogft.link.zenoh.robot.attempt import read_reply
+from fogft.link.zenoh.robot.attempts import Attempts
+from fogft.link.zenoh.sockets import address
+from fogft.model import names
+from fogft.records.record import Sign
+
+log = logging.getLogger(__name__)
+
+_ALL = zenoh.QueryTarget.ALL
+# NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
+# last replica has answered. Kept true by tests/link/zenoh/robot/test_first_reply_is_not_held_back.
+_AT_ONCE = zenoh.ConsolidationMode.NONE
+# How long a closed connection may still flow.
+_END_WITHIN_S = 1.0
+# For as long as the connection: Zenoh ends the query when the session closes.
+_ANSWERS_TIMEOUT_S = 1e9
+
+
+_REFUSED = {
+    Refusal.REVOKED: "our certificate is revoked",
+    Refusal.NOT_ADMITTED: "the replica does not let us in: our certificate is not good for asking",
+    Refusal.EXPIRED_CERTIFICATE: "our certificate is not valid now, by the replica's clock",
+}
+
+
+_TELL_RECORDS_TIMEOUT_S = 5.0
+
+
+class Connection:
+    """An open session whose peer was found to be the right one.
+
+    Args:
+        config: Zenoh's configuration of the session.
+        peer: Whom it must reach.
+        robot: Who we are.
+        keys: Service name -> key.
+        sign: Signs our greeting.
+        ways: How the services' payloads are sent.
+        turns: Shared with the robot's other connections.
+        recalls: Of whom the replica is told that it may stop; None to tell of nobody.
+        answered: Called with each attempt's end, once. Must not block.
+        late: Called with service and id when a forgotten request was answered. Must not block.
+        lost: Called, from any thread and perhaps more than once, when it is no longer of use.
+        room: Called when a window that was full has room again.
+        large: Called when something large is sent and it is not `watched`. Must not block.
+
+    Attributes:
+        attempts: The requests open on it.
+        certificate: Ours (DER), which it uses.
+        flow: What flows through its socket.
+        lost_because: Why it is of no more use; empty while it is.
+        told: The records that the replica has taken from us.
+
+    Raises:
+        zenoh.ZError: Nothing was reached.
+        WireError: Somebody else was reached. Nothing was sent to them.
+        CredentialError: Our own certificate or key cannot be used.
+    """
+
+    def __init__(
+        self,
+        config: zenoh.Config,
+        peer: Peer,
+        robot: str,
+        keys: Mapping[str, str],
+        *,
+        sign: Sign,
+        ways: Ways = PLAIN_WAYS,
+        turns: Turns,
+        recalls: Recalls | None = None,
+        answered: Callable[[Answer], None],
+        late: Callable[[str, bytes], None],
+        lost: Callable[[], None],
+        room: Callable[[], None],
+        large: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._on_lost = lost
+        self._begun = False
+        self._token = secrets.token_bytes(frame.TOKEN_BYTES)
+        self.certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
+        greeting = frame.Greeting(self._token, self.certificate, signature)
+        self._greeting = frame.encode_greeting(greeting)
+        self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
+        self._answers_key = names.answers_key(peer.id.pool_uid, peer.id.slot)
+        self.lost_because = ""
+        self.told = b""
+        self._session = zenoh.open(config)
+        try:
+            self._listener = self._session.info.declare_link_events_listener(
+                handlers.Callback(self._link_event, indirect=False)
+            )
+            self.flow = self._check_peer(peer)
+            self._publishers = {
+                name: self._session.declare_publisher(
+                    key, congestion_control=zenoh.CongestionControl.BLOCK
+                )
+                for name, key in keys.items()
+            }
+        except BaseException:
+            _close_aside(self._session, peer)
+            raise
+        self.attempts = Attempts(
+            self,
+            keys,
+            frame.origin(robot, self._token),
+            ways=ways,
+            turns=turns,
+            recalls=recalls,
+            answered=answered,
+            late=late,
+            room=room,
+            large=large,
+            ended=partial(_close, self._session),
+            name=f"fogft-send-{peer.id.short}",
+        )
+
+    def _check_peer(self, peer: Peer) -> FlowWatch:
+        links = self._session.info.links()
+        found = {link.auth_identifier for link in links}
+        if not found:
+            raise WireError(f"`{peer.endpoint}` was lost as soon as it was reached")
+        for name in found - {peer.certificate_name}:
+            raise WireError(wrong_name(name, peer), "another machine has this address now")
+        return FlowWatch(address(links[0].src), address(links[0].dst))
+
+    def begin(self) -> bool:
+        """Ask for the answers to come, once the replica has let us in; return whether it hears.
+
+        What is published before Zenoh knows that it is heard there would be lost.
+
+        Raises:
+            zenoh.ZError: It could not be asked.
+        """
+        if self._begun:
+            return True
+        for publisher in self._publishers.values():
+            if not publisher.matching_status.matching:  # type: ignore[attr-defined]
+                return False
+        self._session.get(
+            self._answers_key,
+            handlers.Callback(
+                self._heard, lambda: self.lose("the replica ended our answers"), indirect=False
+            ),
+            attachment=frame.encode_greeting(frame.Greeting(self._token)),
+            timeout=_ANSWERS_TIMEOUT_S,
+            target=_ALL,
+            consolidation=_AT_ONCE,
+        )
+        self._begun = True
+        return True
+
+    # -- for its attempts -----------------------------------------------------------------
+
+    def publish(self, service: str, content: bytes, header: bytes) -> None:
+        """Send a message to a service. May block for as long as the peer takes nothing.
+
+        Raises:
+            zenoh.ZError: The session is closed.
+        """
+        self._publishers[service].put(content, attachment=header)
+
+    def recall(self, ids: Sequence[bytes]) -> None:
+        """Tell the replica that these are no longer wanted. May block likewise.
+
+        Raises:
+            zenoh.ZError: The session is closed.
+        """
+        self._session.put(
+            self._cancel_key,
+            frame.encode_cancel(ids),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+
+    def lose(self, because: str) -> None:
+        """It is of no more use. Any thread, perhaps more than once."""
+        self.lost_because = self.lost_because or because
+        self._on_lost()
+
+    # -- Zenoh's threads ------------------------------------------------------------------
+
+    def _heard(self, reply: zenoh.Reply) -> None:
+        threads.note()
+        try:
+            stamp, answers = read_reply(reply)
+        except frame.FrameError as error:
+            self.lose(f"its answers cannot be read: {error}")
+            return
+        self.attempts.heard(stamp, answers)
+
+    def _link_event(self, event: zenoh.LinkEvent) -> None:
+        if event.kind == zenoh.SampleKind.DELETE:
+            self.lose("the connection was lost")
+
+    # -- the keeper -----------------------------------------------------------------------
+
+    def look(self, now: float) -> float:
+        """Look what flows; return for how many of the last seconds something large moved."""
+        return self.flow.look(now, self.attempts.look(now))
+
+    def alive(self) -> bool:
+        """Whether Zenoh still has a link beneath this session."""
+        try:
+            return bool(self._session.info.links())
+        except zenoh.ZError:
+            return False
+
+    def probe(
+        self, key: str, payload: bytes, timeout_s: float, heard: Callable[[bytes], None]
+    ) -> None:
+        """Send a probe ahead of all requests; `heard` gets the answer's bytes, if one comes.
+
+        Raises:
+            zenoh.ZError: It could not be sent.
+        """
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._greeting = bare  # we are known from now on
+                heard(reply.ok.payload.to_bytes())
+            elif reply.err is not None:
+                self._probe_refused(reply.err.payload.to_bytes())
+
+        bare = frame.encode_greeting(frame.Greeting(self._token))
+
+        self._session.get(
+            key,
+            handlers.Callback(on_reply, indirect=False),
+            payload=payload,
+            attachment=self._greeting,
+            timeout=timeout_s,
+            # The keeper must not wait behind what is stuck: a lost probe is an unanswered one.
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+            target=_ALL,
+            consolidation=_AT_ONCE,
+        )
+
+    def _probe_refused(self, content: bytes) -> None:
+        try:
+            _, _, reason = frame.decode_refusal(content)
+        except frame.FrameError:
+            return  # Zenoh's own: it timed out, and the keeper counts the silence
+        words = _REFUSED.get(reason, f"the replica refuses our probes: {reason}")
+        self.lose(words)
+
+    def tell_records(self, key: str, records: bytes) -> None:
+        """Send signed records; `told` is them once the replica has taken them.
+
+        Raises:
+            zenoh.ZError: They could not be sent.
+        """
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self.told = records
+
+        self._session.get(
+            key,
+            handlers.Callback(on_reply, indirect=False),
+            payload=records,
+            attachment=frame.encode_greeting(frame.Greeting(self._token)),
+            timeout=_TELL_RECORDS_TIMEOUT_S,
+            congestion_control=zenoh.CongestionControl.DROP,
+            # Not that of the answers: its end at the replica must not wait for room among them.
+            priority=zenoh.Priority.DATA_LOW,
+            target=_ALL,
+            consolidation=_AT_ONCE,
+        )
+
+    def close(self) -> None:
+        """End it: what is open is lost. Returns at once; the sender thread closes the session."""
+        self.attempts.close()
+        # A large send that goes on is for nobody any more, and may block for minutes.
+        threading.Thread(target=self._end_flow, name="fogft-end-link", daemon=True).start()
+
+    def _end_flow(self) -> None:
+        attempts = self.attempts
+        try:
+            self.flow.end_when_safe(
+                lambda: attempts.sending, lambda: attempts.awaits_answers, _END_WITHIN_S
+            )
+        finally:
+            attempts.end()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
+        self.attempts.join(timeout_s)
+
+
+def _close(session: Any) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:  # the peer is frozen with data in flight; Zenoh waits 10 s
+        log.debug("session_closed_late reason=%r", str(error))
+
+
+def _close_aside(session: Any, peer: Peer) -> None:
+    closer = threading.Thread(
+        target=_close, args=(session,), name=f"fogft-close-{peer.id.short}", daemon=True
+    )
+    closer.start()
+    see_off(closer)

@@ -1,0 +1,130 @@
+"""Makes links over Zenoh, and holds what all of a robot's links share.
+
+Owns: the robot's credentials in use, what its replicas are to be told. Not here: a link's
+life (`zenoh_link`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+from fogft.errors import CredentialError, WireError
+from fogft.link.large_send_gate import Turns
+from fogft.link.port import LinkEvents, Peer
+from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.link.zenoh.robot.link import ZenohLink
+from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.records import frames
+from fogft.records.record import SignedRecord
+from fogft.records.signing import Signer
+
+_CLOSE_WAIT_S = 3.0
+
+
+class ZenohDialer:
+    """Makes links over Zenoh; see `port.Dialer`.
+
+    Args:
+        credentials: The robot's certificate and key, and the pool's CA.
+        robot: The robot's name.
+        pool_uid: The pool; peers of another are refused.
+        suspect_after_s: Probes unanswered for so long make a link suspect.
+        manager_age: Seconds since the pool's manager gave a sign, None if never; told to
+            replicas with each probe.
+        settings: Zenoh's times.
+        tell_losers: Whether replicas are told which requests are no longer wanted.
+    """
+
+    def __init__(
+        self,
+        credentials: CredentialPaths,
+        *,
+        robot: str,
+        pool_uid: str,
+        suspect_after_s: float = 2.0,
+        manager_age: Callable[[], float | None] = lambda: None,
+        settings: LinkSettings | None = None,
+        tell_losers: bool = True,
+    ) -> None:
+        self.tell_losers = tell_losers
+        self.credentials = credentials
+        self.robot = robot
+        self.suspect_after_s = suspect_after_s
+        self.manager_age = manager_age
+        self.settings = settings or LinkSettings()
+        self.turns = Turns()
+        self.ways = PLAIN_WAYS
+        self._signer: Signer | None = None
+        self.records = b""
+        self._pool_uid = pool_uid
+        self._lock = threading.Lock()
+        self._links: list[ZenohLink] = []
+
+    def adopt(self, ways: Ways) -> None:
+        """Set what services want of their links, from the next connection on."""
+        self.ways = ways
+
+    def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
+        """Start a link; return at once, in state CONNECTING.
+
+        Raises:
+            WireError: The peer belongs to another pool.
+        """
+        if peer.id.pool_uid != self._pool_uid:
+            raise WireError(f"replica `{peer.id}` belongs to another pool than this robot")
+        link = ZenohLink(self, peer, services, events)
+        with self._lock:
+            self._links.append(link)
+        return link
+
+    def sign(self, message: bytes) -> tuple[bytes, bytes]:
+        """Sign with the robot's key; return its certificate and the signature (DER).
+
+        Raises:
+            CredentialError: They cannot be used.
+        """
+        return self._own_signer()(message)
+
+    def _own_signer(self) -> Signer:
+        if self._signer is None:
+            self._signer = Signer(self.credentials.certificate, self.credentials.key)
+        return self._signer
+
+    def renew(self) -> None:
+        """Take the credentials that now stand in their files into use, link by link."""
+        with self._lock:
+            links = list(self._links)
+        for link in links:
+            link.renew()
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Tell every replica these records, with the next probe of each link."""
+        self.records = frames.pack(records) if records else b""
+
+    def certificate(self) -> str:
+        """Return the common name of the certificate that every open link uses, or nothing."""
+        with self._lock:
+            used = {link.certificate for link in self._links} - {b""}
+        try:
+            signer = self._own_signer()
+        except CredentialError:
+            return ""
+        return signer.common_name if used <= {signer.certificate} else ""
+
+    def closed(self, link: ZenohLink) -> None:
+        """Forget a link that was closed."""
+        with self._lock:
+            if link in self._links:
+                self._links.remove(link)
+
+    def close(self) -> None:
+        """Close every link, and wait a little for their threads."""
+        with self._lock:
+            links, self._links = self._links, []
+        for link in links:
+            link.close()
+        end = time.monotonic() + _CLOSE_WAIT_S
+        for link in links:
+            link.join(max(0.0, end - time.monotonic()))

@@ -1,0 +1,456 @@
+"""Links over Zenoh: keep a connection to each replica, probe it, and doubt it in time.
+
+A keeper thread for each link opens the connection, sends probes, and replaces the
+connection when it is lost or when probes go unanswered: never because a service is slow.
+`offer` only puts the attempt into the connection's queue.
+
+Owns: the state of a link. Not here: sessions (`zenoh_connection`), attempts (`attempts`), what a
+replica's silence means for the pool (`fogft.core`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import zenoh
+
+from fogft.errors import CredentialError, WireError
+from fogft.link.cancellations import Recalls
+from fogft.link.compression import ZLIB, ZLIB_ANSWERS
+from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.link.zenoh import settings
+from fogft.link.zenoh.join_at_exit import see_off
+from fogft.link.zenoh.robot.connection import Connection
+from fogft.link.zenoh.robot.opening import Opening
+from fogft.link.zenoh.robot.probing import Probing
+from fogft.model import names
+from fogft.model.replica import LinkState
+
+if TYPE_CHECKING:
+    from fogft.link.zenoh.robot.dialer import ZenohDialer
+
+log = logging.getLogger(__name__)
+
+_PROBE_EVERY_S = 1.0
+_FIRST_PROBES_EVERY_S = 0.1
+_UNREADY_PROBES_EVERY_S = 0.25  # a replica that is there gets requests soon after it is ready
+_BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
+_RENEW_AGAIN_S = 5.0
+_LOOK_EVERY_S = 0.1  # while something large is sent
+
+
+class ZenohLink:
+    """A link to one replica; see `port.Link`. Made by `ZenohDialer`."""
+
+    def __init__(
+        self, dialer: ZenohDialer, peer: Peer, services: Mapping[str, str], events: LinkEvents
+    ) -> None:
+        self._dialer = dialer
+        self._peer = peer
+        self._services = dict(services)
+        self._events = events
+        self._suspect_after_s = dialer.suspect_after_s
+        self._probe_every_s = min(_PROBE_EVERY_S, dialer.suspect_after_s / 2)
+        self._config = settings.robot_settings(peer, dialer.credentials, dialer.settings)
+        self._wake = threading.Event()
+        self._woke_at = 0.0
+        self._closed = False
+        self._probing = Probing(peer, self._wake.set)
+        # Written by the keeper only; `_live` is set exactly while the state is UP.
+        self._live: Connection | None = None
+        self._state = LinkState.CONNECTING
+        self._ready: frozenset[str] = frozenset()
+        self._detail = "not reached yet"
+        self._opening = Opening(peer, dialer.settings)
+        self._opened = 0
+        self._renew = threading.Event()
+        self._renew_at: float | None = None
+        self._retiring: list[Connection] = []  # succeeded, with requests under way
+        self._thread = threading.Thread(
+            target=self._keep, name=f"fogft-keep-{peer.id.short}", daemon=True
+        )
+        self._thread.start()
+
+    # -- port.Link ------------------------------------------------------------------------
+
+    @property
+    def peer(self) -> Peer:
+        """Whom it talks to."""
+        return self._peer
+
+    @property
+    def usable(self) -> bool:
+        """Whether requests may be offered."""
+        return self._live is not None
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that the last probe answer called ready; empty unless UP."""
+        return self._ready
+
+    @property
+    def draining(self) -> bool:
+        """Whether the replica asked to be left alone."""
+        answer = self._probing.answer
+        return answer is not None and answer.draining
+
+    @property
+    def certificate(self) -> bytes:
+        """The certificate (DER) that its open connection uses; empty unless UP."""
+        live = self._live
+        return b"" if live is None else live.certificate
+
+    def offer(
+        self,
+        service: str,
+        request_id: bytes,
+        payload: bytes,
+        remaining_s: float,
+        *,
+        more: bool = False,
+    ) -> bool:
+        """Take one attempt, or return False. Never blocks. With `more`, `send` must follow."""
+        live = self._live
+        return live is not None and live.attempts.offer(
+            service, request_id, payload, remaining_s, more=more
+        )
+
+    def send(self) -> None:
+        """Send what was offered with `more`. Never blocks."""
+        live = self._live
+        if live is not None:
+            live.attempts.send()
+        for retiring in tuple(self._retiring):  # a moment ago it was the live one
+            retiring.attempts.send()
+
+    def forget(self, request_id: bytes) -> None:
+        """Free the window of a request whose answer is no longer wanted."""
+        live = self._live
+        if live is not None:
+            live.attempts.forget(request_id)
+        for retiring in tuple(self._retiring):
+            retiring.attempts.forget(request_id)
+
+    def flush(self) -> None:
+        """Tell the replica of all that was forgotten and not answered."""
+        self.send()
+        live = self._live
+        if live is not None:
+            live.attempts.flush()
+
+    def status(self) -> LinkStatus:
+        """Return a snapshot."""
+        now = time.monotonic()
+        live, heard_at = self._live, self._probing.heard_at
+        return LinkStatus(
+            state=self._state,
+            probe_answer=self._probing.answer,
+            heard_age_s=None if heard_at is None else now - heard_at,
+            silent_for_s=self._probing.silent_s(now),
+            rtt_s=self._probing.rtt_s,
+            in_flight=len(live.attempts.window) if live else 0,
+            in_flight_bytes=live.attempts.window.held_bytes if live else 0,
+            reopened=max(self._opened - 1, 0),
+            detail=self._detail,
+        )
+
+    def close(self) -> None:
+        """End the link; its keeper lets go of the rest within moments."""
+        self._closed = True
+        see_off(self._thread)
+        self._wake.set()
+        live, self._live = self._live, None
+        self._ready = frozenset()
+        if live is not None:
+            live.close()
+        self._dialer.closed(self)
+
+    def renew(self) -> None:
+        """Take new credentials into use: open a connection beside this one, then close this one.
+
+        Returns at once; no request is lost by it.
+        """
+        self._renew.set()
+        self._wake.set()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the keeper thread of a closed link."""
+        self._thread.join(timeout_s)
+
+    # -- the keeper thread ----------------------------------------------------------------
+
+    def _keep(self) -> None:
+        failures = 0
+        while not self._closed:
+            self._probing.nobody_to_ask(time.monotonic())
+            failures = 0 if self._hold() else failures + 1
+            self._woke_at = time.monotonic()  # opening took time, and that is silence
+            self._let_go()
+            if not self._closed:
+                self._pause(_BACKOFF_S[min(failures, len(_BACKOFF_S) - 1)])
+        self._let_go()
+
+    def _hold(self) -> bool:
+        """Open a connection and attend to it until it is lost; return whether it was up."""
+        was_up = False
+        connection = None
+        try:
+            connection = self._open()
+            while connection is not None:
+                was_up = self._attend(connection) or was_up
+                if not self._is_good(connection):
+                    break
+                connection = self._succeed(connection)  # it makes way for one with new credentials
+        except Exception as error:  # a mistake of ours must not end the link for good
+            log.exception("link_failed replica=%s", self._peer.id.short)
+            if connection is not None:
+                connection.lost_because = f"{type(error).__name__}: {error}"
+        if connection is not None:
+            self._part(connection)
+        return was_up
+
+    def _is_good(self, connection: Connection) -> bool:
+        return connection is self._live and not self._closed and not connection.lost_because
+
+    def _succeed(self, old: Connection) -> Connection:
+        """Open a connection beside one that is up, and return it once it is up too.
+
+        Whatever goes wrong with the new one, the old one stays, and it is tried again. Requests
+        go to the new one from the moment that it is up; what is under way on the old one ends
+        there.
+        """
+        self._renew.clear()
+        new = self._open()
+        if new is not None and self._attend(new, until_up=True) and new is self._live:
+            self._retiring.append(old)
+            log.info("link_renewed replica=%s", self._peer.id.short)
+            return new
+        if new is not None:
+            self._say(new.lost_because)
+            new.close()
+        self._renew_at = time.monotonic() + _RENEW_AGAIN_S
+        self._probing.another_connection()
+        return old
+
+    def _let_go(self) -> None:
+        """Close connections that were succeeded, once nothing is under way on them."""
+        for connection in list(self._retiring):
+            connection.attempts.sweep()
+            if not len(connection.attempts.window) or connection.lost_because or self._closed:
+                self._retiring.remove(connection)
+                connection.close()
+
+    def _open(self) -> Connection | None:
+        began = time.monotonic()
+        try:
+            connection = Connection(
+                settings.to_zenoh(
+                    {**self._config, **settings.open_within(self._opening.timeout_s)}
+                ),
+                self._peer,
+                self._dialer.robot,
+                self._services,
+                sign=self._dialer.sign,
+                ways=self._dialer.ways,
+                turns=self._dialer.turns,
+                recalls=Recalls() if self._dialer.tell_losers else None,
+                answered=self._answered,
+                late=self._late,
+                lost=self._wake.set,
+                room=self._changed,
+                large=self._wake.set,
+            )
+        except (WireError, CredentialError) as error:
+            self._say(error.message)
+            return None
+        except zenoh.ZError as error:
+            if not self._closed:
+                now = time.monotonic()
+                why = self._opening.failed(now - began, now, self._dialer.credentials)
+                self._say(why or self._detail or str(error))
+            return None
+        self._opened += 1
+        self._opening.done()
+        return connection
+
+    def _attend(self, connection: Connection, *, until_up: bool = False) -> bool:
+        """Probe a connection until it is lost, suspect or not wanted; return whether it was up.
+
+        Also ends where another connection shall succeed it, or at once when it is up where
+        that is all that is asked.
+        """
+        up = False
+        self._woke_at = next_probe = time.monotonic()
+        self._probing.another_connection()
+        while not self._closed and not connection.lost_because and not (up and until_up):
+            now = time.monotonic()
+            if self._renewal_due(now) and connection is self._live:
+                break
+            self._let_go()
+            if not self._flows(connection, now):
+                break
+            if now >= next_probe:
+                connection.attempts.sweep()
+                self._probe(connection, now)
+                if up:
+                    self._tell_records(connection)
+                next_probe = now + self._next_probe_in_s(up=up)
+            left_s = self._suspect_after_s - self._probing.unheard_s(now)
+            if left_s <= 0:
+                connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
+                break
+            often = _LOOK_EVERY_S if connection.attempts.watched else left_s
+            doubt_s = self._doubt(now)
+            self._pause(min(next_probe - now, left_s, often, doubt_s))
+            try:
+                up = self._listen(connection) or up
+            except WireError as error:
+                connection.lost_because = error.message
+            except zenoh.ZError as error:
+                connection.lost_because = f"sending failed: {error}"
+        return up
+
+    def _flows(self, connection: Connection, now: float) -> bool:
+        """See whether what is large moves: then nobody is silent. False where it stands still."""
+        moved_s = connection.look(now)
+        self._probing.excuse(moved_s, now)
+        longest_s, shortest_s = self._suspect_after_s, self._dialer.settings.stall_after_s
+        if connection.flow.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
+            connection.lost_because = "it takes nothing more of what is sent"
+        return not connection.lost_because
+
+    def _doubt(self, now: float) -> float:
+        """Tell the owner, once a silence, that a probe's answer is late; it stays UP.
+
+        Returns:
+            In how many seconds to look again.
+        """
+        late, left_s = self._probing.late(now)
+        if late and self._live is not None:
+            silent_s = self._probing.silent_s(now)
+            log.info("link_doubted replica=%s silent_s=%.2f", self._peer.id.short, silent_s)
+            self._changed()
+        return left_s
+
+    def _next_probe_in_s(self, *, up: bool) -> float:
+        if not up:
+            return _FIRST_PROBES_EVERY_S
+        if self._services.keys() <= self._ready:
+            return self._probe_every_s
+        return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
+
+    def _tell_records(self, connection: Connection) -> None:
+        """Send what the replica has not taken yet; with each probe until it has."""
+        records = self._dialer.records
+        if records == connection.told:
+            return
+        id = self._peer.id
+        try:
+            connection.tell_records(names.records_key(id.pool_uid, id.slot), records)
+        except zenoh.ZError as error:
+            connection.lost_because = f"sending failed: {error}"
+
+    def _renewal_due(self, now: float) -> bool:
+        if self._renew_at is not None and now >= self._renew_at:
+            self._renew_at = None
+            self._renew.set()
+        return self._renew.is_set()
+
+    def _probe(self, connection: Connection, now: float) -> None:
+        known = self._probing.answer
+        # Its types are asked for once a connection: it may be another process at each.
+        describe = self._live is not connection or known is None or not known.types
+        probe = Probe(self._dialer.robot, self._dialer.manager_age(), describe)
+        try:
+            self._probing.ask(connection, probe, now)
+        except zenoh.ZError as error:
+            connection.lost_because = f"sending failed: {error}"
+            return
+        if not connection.alive():
+            connection.lost_because = "the connection was lost"
+
+    def _listen(self, connection: Connection) -> bool:
+        """Take what was heard; return whether the link is up by it.
+
+        Raises:
+            WireError: Another replica answers here, or nothing that can be read.
+        """
+        up = False
+        for heard in self._probing.heard(connection):
+            if connection.begin():
+                known = self._probing.answer
+                self._answers(connection, known, self._probing.take(heard))
+                up = True
+        return up
+
+    def _answers(
+        self, connection: Connection, known: ProbeAnswer | None, answer: ProbeAnswer
+    ) -> None:
+        """A connection's replica has answered: from now on it is the live one."""
+        news = self._live is not connection or answer != known
+        self._ready = answer.ready
+        connection.attempts.packs = ZLIB in answer.accepts
+        connection.attempts.packs_answers = ZLIB_ANSWERS in answer.accepts
+        if self._live is not connection:
+            self._state = LinkState.UP
+            self._detail = ""
+            self._live = connection
+            log.info("link_up replica=%s rtt_s=%.4f", self._peer.id.short, self._probing.rtt_s)
+        if self._closed:  # by another thread, just now
+            self._live, self._ready = None, frozenset()
+        elif news:
+            self._changed()
+
+    def _part(self, connection: Connection) -> None:
+        """Let go of a connection: nothing more is offered to it, what is open there is lost."""
+        was_up = self._live is not None
+        self._live = None
+        self._ready = frozenset()
+        self._renew.clear()  # the next one begins with what there is now
+        if was_up:
+            self._state = LinkState.SUSPECT
+            log.warning("link_lost replica=%s reason=%r", self._peer.id.short,
+                        connection.lost_because)  # fmt: skip
+        if not self._closed:
+            self._probing.nobody_to_ask(time.monotonic())
+            self._say(connection.lost_because)
+        connection.close()
+        if was_up:
+            self._changed()
+
+    def _pause(self, wanted_s: float) -> None:
+        """Wait, or until something happens. Time in which we did not run is not silence."""
+        wanted_s = max(wanted_s, 0.0)
+        self._wake.wait(wanted_s)
+        self._wake.clear()
+        now = time.monotonic()
+        self._probing.excuse(now - self._woke_at - wanted_s, now)
+        self._woke_at = now
+
+    def _say(self, detail: str) -> None:
+        if detail != self._detail:
+            self._detail = detail
+            log.info("link_detail replica=%s detail=%r", self._peer.id.short, detail)
+            self._changed()
+
+    # -- to the owner (any thread) --------------------------------------------------------
+
+    def _answered(self, answer: Answer) -> None:
+        try:
+            self._events.answered(self, answer)
+        except Exception:  # in Zenoh's thread nobody else would tell of it
+            log.exception("answer_not_taken request=%s", answer.request_id.hex())
+
+    def _late(self, service: str, request_id: bytes) -> None:
+        if not self._closed:
+            self._events.late(self, service, request_id)
+
+    def _changed(self) -> None:
+        try:
+            self._events.changed(self)
+        except Exception:
+            log.exception("change_not_taken replica=%s", self._peer.id.short)

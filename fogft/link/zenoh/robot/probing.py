@@ -1,0 +1,151 @@
+"""The probes of a link: what its replica says to them, and for how long it has said nothing.
+
+Owns: two silences, that of the replica over all connections, which people see, and that of the
+present connection, by which it is given up. Not here: when to probe, and what becomes of the link
+(`zenoh_link`); how a probe travels (`zenoh_connection`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING
+
+from fogft.errors import WireError
+from fogft.link import probe_frames
+from fogft.link.frame import FrameError
+from fogft.link.port import Peer, Probe, ProbeAnswer
+from fogft.link.silence import Silence
+from fogft.model import names
+from fogft.model.replica import doubted_after_s
+
+if TYPE_CHECKING:
+    from fogft.link.zenoh.robot.connection import Connection
+
+_TIMEOUT_S = 60.0  # on a thin uplink a probe waits behind what is large
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A probe's answer as it came, and when (monotonic seconds)."""
+
+    connection: Connection
+    content: bytes
+    sent_at: float
+    at: float
+
+
+class Probing:
+    """Probes to one replica. For one thread, the link's keeper; any may read the attributes.
+
+    Args:
+        peer: Who must answer.
+        came: Called, from any thread, when an answer came.
+
+    Attributes:
+        answer: The last answer; None before the first.
+        heard_at: When that came, monotonic seconds.
+        rtt_s: What the last probe's round trip took, in seconds.
+    """
+
+    def __init__(self, peer: Peer, came: Callable[[], None]) -> None:
+        self._peer = peer
+        self._came = came
+        self._key = names.probe_key(peer.id.pool_uid, peer.id.slot)
+        self._queue: SimpleQueue[Heard] = SimpleQueue()
+        self._of_replica = Silence()
+        self._of_connection = Silence()
+        self._doubted = False
+        self.answer: ProbeAnswer | None = None
+        self.heard_at: float | None = None
+        self.rtt_s: float | None = None
+
+    # -- asking and hearing ---------------------------------------------------------------
+
+    def ask(self, connection: Connection, probe: Probe, now: float) -> None:
+        """Send a probe.
+
+        Raises:
+            zenoh.ZError: It could not be sent.
+        """
+        self._of_connection.began(now)
+        self._of_replica.began(now)
+
+        def heard(content: bytes) -> None:
+            self._queue.put(Heard(connection, content, now, time.monotonic()))
+            self._came()
+
+        connection.probe(self._key, probe_frames.encode_probe(probe), _TIMEOUT_S, heard)
+
+    def heard(self, connection: Connection) -> Iterator[Heard]:
+        """Return what came over a connection since the last call; that of others is dropped."""
+        while True:
+            try:
+                heard = self._queue.get_nowait()
+            except Empty:
+                return
+            if heard.connection is connection:
+                yield heard
+
+    def take(self, heard: Heard) -> ProbeAnswer:
+        """Take an answer, which ends the silence, and return it.
+
+        Raises:
+            WireError: Another replica answers here, or nothing that can be read.
+        """
+        answer = self._read(heard.content)
+        self._of_connection.ended()
+        self._of_replica.ended()
+        self.heard_at = heard.at
+        self.rtt_s = heard.at - heard.sent_at
+        self.answer = answer
+        return answer
+
+    def _read(self, content: bytes) -> ProbeAnswer:
+        id, at = self._peer.id, self._peer.endpoint
+        try:
+            answer = probe_frames.decode_probe_answer(content)
+        except FrameError as error:
+            raise WireError(f"`{at}` answers probes with {error}") from error
+        if (answer.slot, answer.generation) != (id.slot, id.generation):
+            raise WireError(
+                f"`{at}` says that it is {answer.slot}.{answer.generation}, not {id.short}"
+            )
+        known = self.answer
+        if not answer.types and known is not None and known.incarnation == answer.incarnation:
+            return replace(answer, types=known.types)
+        return answer
+
+    # -- silence --------------------------------------------------------------------------
+
+    def nobody_to_ask(self, now: float) -> None:
+        """The replica is not reached: from now on it is silent, unless it was before."""
+        self._of_replica.began(now)
+
+    def another_connection(self) -> None:
+        """What is asked from now on goes over another connection."""
+        self._of_connection = Silence()
+
+    def excuse(self, seconds: float, now: float) -> None:
+        """Leave out time up to `now` in which nobody could be heard."""
+        for silence in (self._of_replica, self._of_connection):
+            silence.excuse(seconds, now)
+
+    def silent_s(self, now: float) -> float:
+        """Return for how long the replica has been silent, in seconds."""
+        return self._of_replica.for_s(now)
+
+    def unheard_s(self, now: float) -> float:
+        """Return for how long the present connection has brought no answer, in seconds."""
+        return self._of_connection.for_s(now)
+
+    def late(self, now: float) -> tuple[bool, float]:
+        """Return whether an answer is late, true once a silence; and how long it has still.
+
+        The second is infinite once it is late.
+        """
+        left_s = doubted_after_s(self.rtt_s) - self.silent_s(now)
+        was, self._doubted = self._doubted, left_s <= 0
+        return self._doubted and not was, left_s if left_s > 0 else float("inf")

@@ -1,0 +1,67 @@
+"""What waits for a connection's sender: in order, but the newest first where that is wanted.
+
+On a thin uplink requests wait here for seconds. Of a service that wants the latest, the newest
+takes the turn of the oldest; the others keep waiting, and are sent while their time lasts.
+Between services the order is that of arrival.
+
+Owns: the order of sending. Not here: bounds (`link_window`), sending (`attempts`).
+"""
+
+from __future__ import annotations
+
+import heapq
+import threading
+from collections.abc import Collection
+from itertools import count
+from queue import SimpleQueue
+
+from fogft.link.zenoh.robot.attempt import OpenAttempt
+
+Waiting = list[tuple[float, int, OpenAttempt]]
+
+
+class SendQueue:
+    """Attempts, and None for the end. Safe to use from several threads.
+
+    Args:
+        latest: Services of which the newest is preferred.
+    """
+
+    def __init__(self, latest: Collection[str] = ()) -> None:
+        self._turns: SimpleQueue[OpenAttempt | str | None] = SimpleQueue()
+        self._lock = threading.Lock()
+        self._order = count()
+        self._waiting: dict[str, Waiting] = {service: [] for service in latest}
+
+    def qsize(self) -> int:
+        """How many wait."""
+        return self._turns.qsize()
+
+    def overtakes(self, service: str) -> bool:
+        """Whether what comes last of a service goes first."""
+        return service in self._waiting
+
+    def put(self, attempt: OpenAttempt | None) -> None:
+        """Let an attempt wait; None ends the sender when all before it was taken."""
+        waiting = self._waiting.get(attempt.service) if attempt is not None else None
+        if attempt is None or waiting is None:
+            self._turns.put(attempt)
+            return
+        with self._lock:
+            heapq.heappush(waiting, (-attempt.deadline, next(self._order), attempt))
+        self._turns.put(attempt.service)
+
+    def get(self) -> OpenAttempt | None:
+        """Wait for the next one."""
+        turn = self._turns.get()
+        if not isinstance(turn, str):
+            return turn
+        with self._lock:
+            return heapq.heappop(self._waiting[turn])[2]
+
+    def stalest(self, than: OpenAttempt) -> OpenAttempt | None:
+        """Return what may give way to a newer attempt of its service: the oldest that waits."""
+        with self._lock:
+            waiting = [entry for entry in self._waiting.get(than.service, ()) if entry[2].payload]
+        oldest = max(waiting, default=None)
+        return oldest[2] if oldest is not None and oldest[2].deadline < than.deadline else None

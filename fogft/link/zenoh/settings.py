@@ -1,0 +1,201 @@
+"""Zenoh's configuration for both ends of a link: what is set, and why.
+
+Owns: every Zenoh setting of fogft. Not here: sessions, and the certificates' contents
+(`fogft.pool.credentials.authority`).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fogft.link.port import Peer
+from fogft.model import names
+from fogft.model.replica import ReplicaId
+
+if TYPE_CHECKING:
+    import zenoh
+
+MESSAGE_BYTES_LIMIT = 256 << 20
+_SESSIONS_LIMIT = 128  # robots, and gateways, at one replica
+_HANDSHAKES_LIMIT = 32
+_SIGN_OF_LIFE_EVERY_S = 2.0
+
+
+@dataclass(frozen=True)
+class CredentialPaths:
+    """Where a process finds its certificate, its key and the pool's CA."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """Times of a link, in seconds.
+
+    Zenoh's own two are long, because it cannot tell a thin uplink from a dead one; both ends see
+    to the connection themselves (`flow_watch`, `doorkeeper`).
+
+    Attributes:
+        lease_s: Zenoh ends a session whose peer sent nothing for so long. Must be longer
+            than `wait_before_close_s`, or healthy links stall for seconds.
+        wait_before_close_s: How long the sending of one message may take before Zenoh gives
+            the session up.
+        open_timeout_s: The most that opening a session takes; see `long_open_timeout_s`.
+        long_open_timeout_s: The same for every third try in a row that takes so long: through a
+            full uplink, or on a busy machine, a handshake needs more.
+        stall_after_s: A robot gives up a connection in which a queue stands still for so long,
+            or for four round trips where that is longer.
+        stuck_after_s: A replica gives up a connection that delivers nothing for so long.
+    """
+
+    lease_s: float = 150.0
+    wait_before_close_s: float = 120.0
+    open_timeout_s: float = 1.5
+    long_open_timeout_s: float = 4.0
+    stall_after_s: float = 1.0
+    stuck_after_s: float = 15.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.wait_before_close_s < self.lease_s:
+            raise ValueError("wait_before_close_s must be shorter than lease_s")
+
+
+_DECLARED = ("declare_queryable", "declare_subscriber")
+
+
+def robot_settings(
+    peer: Peer, credentials: CredentialPaths, settings: LinkSettings
+) -> dict[str, Any]:
+    """Return the settings of a robot's session towards one replica."""
+    keys = f"{names.slot_prefix(peer.id.pool_uid, peer.id.slot)}/**"
+    return {
+        **_common(settings),
+        "mode": "client",
+        "connect/endpoints": [
+            f"tls/{peer.endpoint}" + (f"#iface={peer.interface}" if peer.interface else "")
+        ],
+        # One try: the keeper tries again, and knows when and why.
+        "connect/timeout_ms": 0,
+        "connect/exit_on_failure": True,
+        "listen/endpoints": [],
+        "transport/link/tls": {
+            "root_ca_certificate": str(credentials.ca),
+            "connect_certificate": str(credentials.certificate),
+            "connect_private_key": str(credentials.key),
+            "enable_mtls": True,
+            # Replicas have no names in the DNS: their common name is checked instead, by the
+            # connection after opening and by the list below whenever Zenoh reconnects by itself.
+            "verify_name_on_connect": False,
+            "close_link_on_expiration": True,
+        },
+        # To any other common name nothing at all goes out. Kept true by
+        # tests/link/zenoh/test_trust.py::test_nothing_is_sent_to_an_impostor_after_a_reconnect.
+        "access_control": _access(
+            [
+                ("ask", "egress", ["query", "put"], keys),
+                ("hear", "ingress", ["reply", *_DECLARED], keys),
+            ],
+            {"cert_common_names": [peer.certificate_name]},
+        ),
+    }
+
+
+def replica_settings(
+    listen: str, id: ReplicaId, credentials: CredentialPaths, settings: LinkSettings
+) -> dict[str, Any]:
+    """Return the settings of a replica's session, which listens at ``host:port``."""
+    keys = f"{names.slot_prefix(id.pool_uid, id.slot)}/**"
+    return {
+        **_common(settings),
+        # Not `router`: that would carry robots' messages to each other.
+        "mode": "peer",
+        "connect/endpoints": [],
+        "listen/endpoints": [f"tls/{listen}"],
+        "listen/exit_on_failure": True,
+        "transport/unicast/max_sessions": _SESSIONS_LIMIT,
+        "transport/unicast/accept_pending": _HANDSHAKES_LIMIT,
+        "transport/link/tls": {
+            "root_ca_certificate": str(credentials.ca),
+            "listen_certificate": str(credentials.certificate),
+            "listen_private_key": str(credentials.key),
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+        },
+        # Any name: the handshake has proved that the CA made its holder a robot.
+        "access_control": _access(
+            [
+                ("hear", "ingress", ["query", "put"], keys),
+                ("answer", "egress", ["reply", *_DECLARED], keys),
+            ],
+            {},
+        ),
+    }
+
+
+def open_within(timeout_s: float) -> dict[str, Any]:
+    """Return the settings of a session that is given so long to open."""
+    return {"transport/unicast/open_timeout": round(timeout_s * 1e3)}
+
+
+def to_zenoh(settings: dict[str, Any]) -> zenoh.Config:
+    """Return settings as Zenoh takes them; call it before the process's first session."""
+    import zenoh
+
+    from fogft.link.zenoh import runtime
+
+    runtime.prepare()
+    config: zenoh.Config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _common(settings: LinkSettings) -> dict[str, Any]:
+    return {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "adminspace/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "transport/link/protocols": ["tls"],
+        "transport/link/tx/lease": round(settings.lease_s * 1e3),
+        # So many in a lease: a peer that is out of reach leaves something unacknowledged.
+        "transport/link/tx/keep_alive": max(4, round(settings.lease_s / _SIGN_OF_LIFE_EVERY_S)),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
+            settings.wait_before_close_s * 1e6
+        ),
+        "transport/link/rx/max_message_size": MESSAGE_BYTES_LIMIT,
+        "transport/unicast/open_timeout": round(settings.open_timeout_s * 1e3),
+        "transport/unicast/accept_timeout": round(settings.long_open_timeout_s * 1e3),
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 500,
+            "period_increase_factor": 2,
+        },
+    }
+
+
+def _access(
+    rules: list[tuple[str, str, list[str], str]], subject: dict[str, list[str]]
+) -> dict[str, Any]:
+    """Return an access control list of rules (id, flow, messages, keys); the rest is denied."""
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [
+            {
+                "id": id,
+                "permission": "allow",
+                "flows": [flow],
+                "messages": messages,
+                "key_exprs": [keys],
+            }
+            for id, flow, messages, keys in rules
+        ],
+        "subjects": [{"id": "peer", **subject}],
+        "policies": [{"rules": [rule[0] for rule in rules], "subjects": ["peer"]}],
+    }

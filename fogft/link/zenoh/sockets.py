@@ -1,0 +1,230 @@
+"""This process's own TCP connections, seen beside Zenoh: whose they are, what flows, their end.
+
+Zenoh opens the sockets and tells nothing of them. The kernel does: it lists the descriptors of
+this process and counts each connection's bytes. Where it does not (no Linux), nothing is found.
+
+Owns: finding and reading sockets. Not here: what follows from it (`doorkeeper`, `drain`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import select
+import socket
+import struct
+import termios
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from fogft.link.socket_progress import Flow
+
+Address = tuple[str, int]
+
+_DESCRIPTORS = Path("/proc/self/fd")
+# struct tcp_info of linux/tcp.h: eight bytes of state, then 32 and 64 bit counts.
+_INFO_BYTES, _WITH_UNSENT_BYTES = 136, 148
+_RTT, _RTT_VARIATION = (struct.Struct("@I"), 68), (struct.Struct("@I"), 72)
+_ACKNOWLEDGED, _RECEIVED = (struct.Struct("@Q"), 120), (struct.Struct("@Q"), 128)
+_UNSENT = struct.Struct("@I"), 144
+_COUNT = struct.Struct("@i")
+_TCP_NOTSENT_LOWAT = 25
+_UNSENT_BYTES = 16 << 10
+_AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing waits for nothing, and resets
+_NOWHERE = bytes(16)  # struct sockaddr of AF_UNSPEC: to connect there resets a connection
+_libc = ctypes.CDLL(None)
+_LOOK_AGAIN_S = 0.01
+
+
+def address(endpoint: str) -> Address:
+    """Return host and port of a Zenoh endpoint such as ``tls/[::1]:7447``.
+
+    Raises:
+        ValueError: It is none.
+    """
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    return _plain(host.strip("[]")), int(port.partition("?")[0].partition("#")[0])
+
+
+def _plain(host: str) -> str:
+    return host.removeprefix("::ffff:") if "." in host else host
+
+
+def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
+    """Yield the connections whose own end is at a port: the peer, and a socket of ours to it."""
+    for number in _numbers():
+        connection = _duplicate(number)
+        if connection is None:
+            continue
+        ends = _ends(connection)
+        if ends is None or ends[0][1] != port:
+            connection.close()
+        else:
+            yield ends[1], connection
+
+
+class OwnSocket:
+    """One connection of this process. It is looked up anew each time and held by nobody here.
+
+    Args:
+        own: The address of its own end.
+        peer: The address of the other end.
+    """
+
+    def __init__(self, own: Address, peer: Address) -> None:
+        self._own = own
+        self._peer = peer
+        self._number = -1
+
+    def borrow(self) -> socket.socket | None:
+        """Return a socket to it, to be closed at once by the caller; None where there is none.
+
+        Kept open, it would keep the connection from ending.
+        """
+        for number in (self._number, *_numbers()):
+            connection = _duplicate(number)
+            if connection is None:
+                continue
+            if _ends(connection) == (self._own, self._peer):
+                self._number = number
+                return connection
+            connection.close()
+        return None
+
+
+def _numbers() -> list[int]:
+    try:
+        return [int(entry.name) for entry in _DESCRIPTORS.iterdir()]
+    except OSError:
+        return []  # no Linux: nothing can be seen to
+
+
+def _duplicate(number: int) -> socket.socket | None:
+    """Return a socket of ours to a TCP connection, None where a descriptor is no such."""
+    try:
+        if number < 0 or not os.readlink(_DESCRIPTORS / str(number)).startswith("socket:"):
+            return None
+        connection = socket.socket(fileno=os.dup(number))
+    except OSError:
+        return None  # closed in between
+    if (
+        connection.family in (socket.AF_INET, socket.AF_INET6)
+        and connection.type == socket.SOCK_STREAM
+    ):
+        return connection
+    connection.close()
+    return None
+
+
+def _ends(connection: socket.socket) -> tuple[Address, Address] | None:
+    try:
+        own, peer = connection.getsockname(), connection.getpeername()
+    except OSError:
+        return None  # it listens, or is no longer connected
+    return (_plain(own[0]), own[1]), (_plain(peer[0]), peer[1])
+
+
+def flow(connection: socket.socket) -> Flow | None:
+    """Return what the kernel counted on a connection; None where it does not tell."""
+    try:
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _WITH_UNSENT_BYTES)
+        waiting = fcntl.ioctl(connection, termios.TIOCOUTQ, bytes(_COUNT.size))
+    except OSError:
+        return None
+    if len(info) < _INFO_BYTES:
+        return None  # a kernel before 4.1
+    rtt_us, variation_us, acknowledged, received = (
+        form.unpack_from(info, at)[0]
+        for form, at in (_RTT, _RTT_VARIATION, _ACKNOWLEDGED, _RECEIVED)
+    )
+    form, at = _UNSENT
+    tells_unsent = len(info) >= _WITH_UNSENT_BYTES  # since Linux 4.6
+    return Flow(
+        acknowledged=acknowledged,
+        received=received,
+        outstanding=max(0, _COUNT.unpack(waiting)[0]),
+        round_trip_s=(rtt_us + 4 * variation_us) / 1e6,
+        unsent=form.unpack_from(info, at)[0] if tells_unsent else 0,
+    )
+
+
+def takes_more(connection: socket.socket) -> bool:
+    """Whether the kernel would take more of what is sent now."""
+    waiting = select.poll()
+    waiting.register(connection, select.POLLOUT)
+    return bool(waiting.poll(0))
+
+
+def keep_short(connection: socket.socket) -> None:
+    """Let little wait in the kernel, so that probes overtake what is large."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
+
+
+def end_sending(connection: socket.socket) -> None:
+    """Send nothing more on a connection, whatever Zenoh is doing with it.
+
+    What its peer has not taken is dropped when the socket is closed: that is done by a thread of
+    Zenoh's, which would wait for that peer up to 10 s (Zenoh's own SO_LINGER).
+
+    Not both directions: where Zenoh hears of an end before it fails to send, its thread waits for
+    whoever waits for room to send more, and he for that thread (`docs/design/links.md`).
+    """
+    _drop_when_closed(connection)
+    with contextlib.suppress(OSError):  # it ended by itself
+        connection.shutdown(socket.SHUT_WR)
+
+
+def abort(connection: socket.socket) -> None:
+    """End a connection without a farewell: nothing more is taken, and its peer fails to send.
+
+    Not where something is sent: see `end_sending`.
+    """
+    _drop_when_closed(connection)
+    _libc.connect(connection.fileno(), _NOWHERE, len(_NOWHERE))
+
+
+def _drop_when_closed(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it ended by itself
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+
+
+def abort_all(port: int, within_s: float) -> None:
+    """Abort the connections whose own end is at a port, as soon as nothing flows there.
+
+    Args:
+        port: The port.
+        within_s: Wait no longer for that.
+    """
+    deadline = time.monotonic() + within_s
+    seen: list[Flow | None] = []
+    while time.monotonic() < deadline:
+        before, seen = seen, [flow(connection) for connection in _at(port)]
+        idle = [one is None or one.outstanding == 0 for one in seen]
+        if all(idle) and _received(seen) == _received(before):
+            break
+        time.sleep(_LOOK_AGAIN_S)
+    for connection in _at(port):
+        counted = flow(connection)
+        busy = counted is not None and counted.outstanding > 0
+        (end_sending if busy else abort)(connection)
+
+
+def _at(port: int) -> Iterator[socket.socket]:
+    for _, connection in connections(port):
+        with connection:
+            yield connection
+
+
+def _received(flows: list[Flow | None]) -> list[int]:
+    return [one.received for one in flows if one is not None]
+
+
+def end(connection: socket.socket) -> None:
+    """End a connection at both of its ends at once. Where much flows, see `end_sending`."""
+    end_sending(connection)
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RD)

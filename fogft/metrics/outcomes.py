@@ -1,0 +1,154 @@
+"""What became of one service's requests: counters, latencies, and who won.
+
+All methods are called under the dispatcher's lock, but `late`, which has its own.
+
+Owns: the numbers. Not here: what they are counted for (`dispatcher`), showing them.
+"""
+
+from __future__ import annotations
+
+import bisect
+import threading
+from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from fogft.link.port import Refusal
+from fogft.model.replica import ReplicaId
+
+_LATENCIES_KEPT = 2000
+# Upper bounds of the histogram's buckets, seconds: from a local call to a planner that thinks.
+BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
+_COUNTED = (
+    *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
+    *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
+    *("request_bytes", "response_bytes"),
+)
+
+# Refusals that speak against the service; not those about load, links, who was faster, or a
+# start that takes its time.
+_FAILURES = frozenset({Refusal.CRASHED, Refusal.MALFORMED})
+
+
+class Outcomes:
+    """Counts since the start.
+
+    Attributes:
+        count: ``received`` requests and ``sent`` copies of them; how they ended
+            (``answered``, ``fallback``, ``silent``, ``empty``, ``turned_away``); calls of the
+            fallback that came to nothing (``fallback_failed``); answers that came too late
+            to be used (``late``); responses that were not ok (``rejected``); responses that
+            ROS did not take (``undelivered``); requests that a gateway's caller took back
+            (``cancelled``). ``request_bytes`` are those of all received requests together,
+            ``response_bytes`` those of the first answers of replicas.
+        refused: Refusals by reason.
+        trace: How each request ended, until somebody takes it; None where it is not wanted.
+    """
+
+    def __init__(self) -> None:
+        self.count = dict.fromkeys(_COUNTED, 0)
+        self.refused: dict[str, int] = {}
+        self._won: dict[ReplicaId, int] = {}
+        self._well: dict[ReplicaId, int] = {}
+        self._ill: dict[ReplicaId, int] = {}
+        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._buckets = [0] * (len(BUCKETS_S) + 1)
+        self._took_s = 0.0
+        self._late_lock = threading.Lock()
+        self.trace: deque[dict[str, Any]] | None = None
+
+    def received(self, size_bytes: int) -> None:
+        """Count a request that came."""
+        self.count["received"] += 1
+        self.count["request_bytes"] += size_bytes
+
+    def won(self, replica: ReplicaId, took_s: float, size_bytes: int) -> None:
+        """Count a request that a replica has answered first, and the size of its response."""
+        self.count["answered"] += 1
+        self.count["response_bytes"] += size_bytes
+        self._won[replica] = self._won.get(replica, 0) + 1
+        self._latencies.append(took_s)
+        self._buckets[bisect.bisect_left(BUCKETS_S, took_s)] += 1
+        self._took_s += took_s
+
+    def note(
+        self,
+        request: bytes,
+        outcome: str,
+        *,
+        took_s: float,
+        asked: Mapping[int, float] = MappingProxyType({}),
+        refused: Mapping[int, str] = MappingProxyType({}),
+        replica: str = "",
+    ) -> None:
+        """Trace how a request ended.
+
+        Args:
+            request: Its id.
+            outcome: One of `count`'s.
+            took_s: Since it arrived, in seconds.
+            asked: Who was asked for it, and when after its arrival.
+            refused: Who refused it, and why the last time.
+            replica: Who answered it.
+        """
+        if self.trace is not None:
+            self.trace.append(
+                {
+                    "request": request.hex(),
+                    "outcome": outcome,
+                    "replica": replica,
+                    "took_s": round(took_s, 6),
+                    "asked": {_short(key): round(after_s, 6) for key, after_s in asked.items()},
+                    "refused": {_short(key): reason for key, reason in refused.items()},
+                }
+            )
+
+    def won_by(self, replica: ReplicaId) -> int:
+        """Return how many requests a replica has answered first."""
+        return self._won.get(replica, 0)
+
+    def refusal(self, reason: str, replica: ReplicaId | None = None) -> None:
+        """Count a refusal, and hold it against the replica if it was of a request."""
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+        if replica is not None and reason in _FAILURES:
+            self.failed(replica)
+
+    def served(self, replica: ReplicaId) -> None:
+        """Count a request that a replica has answered well, first or not."""
+        self._well[replica] = self._well.get(replica, 0) + 1
+
+    def failed(self, replica: ReplicaId) -> None:
+        """Count a request that came to nothing at a replica, by the fault of its service."""
+        self._ill[replica] = self._ill.get(replica, 0) + 1
+
+    def by(self, replica: ReplicaId) -> tuple[int, int]:
+        """Return how many requests a replica has answered well, and how many failed there."""
+        return self._well.get(replica, 0), self._ill.get(replica, 0)
+
+    def late(self) -> None:
+        """Count an answer that came too late to be used. Any thread, no other lock."""
+        with self._late_lock:
+            self.count["late"] += 1
+
+    def report(self) -> dict[str, Any]:
+        """Return counters and latencies (seconds; quantiles None before the first answer).
+
+        ``buckets`` counts answers by latency, between the bounds of `BUCKETS_S`; ``took_s`` is
+        the sum of those latencies.
+        """
+        ordered = sorted(self._latencies)
+        return {
+            **self.count,
+            "refused": dict(self.refused),
+            "won": {replica.short: count for replica, count in self._won.items()},
+            "p50_s": ordered[len(ordered) // 2] if ordered else None,
+            "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,
+            "buckets": list(self._buckets),
+            "took_s": self._took_s,
+        }
+
+
+def _short(key: int) -> str:
+    """Return a replica's ``slot.generation`` from the dispatcher's number for it."""
+    return f"{key >> 32}.{key & 0xFFFFFFFF}"

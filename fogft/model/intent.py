@@ -1,0 +1,201 @@
+"""What the user wants besides the pool file: scaled, drained, excluded, stopping. Pure.
+
+Each command is one operation that returns a new intent, so that it works whether or not
+a manager lives: the command line writes the result, the manager reads it.
+
+Owns: the operations and their JSON form.
+Not here: how the pool gets there (`planner`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from fogft.errors import FogftError, StateError
+from fogft.model.spec import MAX_REPLICAS, PoolSpec
+
+LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
+
+
+@dataclass(frozen=True)
+class Intent:
+    """The user's wishes.
+
+    Attributes:
+        target: Replicas wanted by `scale`; None when the pool file decides.
+        scaled_from: The file's `replicas` when `target` was set. Once the file says
+            another number, the file decides again.
+        drained: Slot -> the highest generation there that is to be replaced.
+        excluded: Locations (``cloud``, ``cloud/region`` or all three) to keep out of.
+        stopping: `down` was asked for: end everything.
+        began_at: When the hours of `max_hours` began anew, in seconds since the epoch; 0 as
+            long as they count from the pool's creation.
+    """
+
+    target: int | None = None
+    scaled_from: int | None = None
+    drained: Mapping[int, int] = field(default_factory=dict)
+    excluded: frozenset[str] = frozenset()
+    stopping: bool = False
+    began_at: float = 0.0
+
+    def wanted(self, spec: PoolSpec) -> int:
+        """Return how many replicas the user or the file names; see `sizing` for what follows."""
+        if self.stopping:
+            return 0
+        if self.target is not None and self.is_scaled(spec):
+            return self.target
+        return spec.replicas
+
+    def is_scaled(self, spec: PoolSpec) -> bool:
+        """Whether the user's own number holds, and not the file's."""
+        return self.target is not None and self.scaled_from == spec.replicas
+
+    def is_drained(self, slot: int, generation: int) -> bool:
+        """Whether the user asked to replace this launch."""
+        return generation <= self.drained.get(slot, 0)
+
+    def is_excluded(self, location: str) -> bool:
+        """Whether a ``cloud/region/zone`` lies in an excluded location."""
+        return any((location + "/").startswith(place + "/") for place in self.excluded)
+
+
+def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
+    """Want `change` more replicas (fewer when negative).
+
+    Raises:
+        FogftError: Fewer than one, or more than 16, would be wanted, or fewer than a quorum,
+            or the number follows from an availability target.
+    """
+    if spec.availability is not None:
+        raise FogftError(
+            f"`{spec.name}` has as many replicas as `availability` needs: it cannot be scaled",
+            "change `fogft.availability` or `fogft.replicas` in the pool file, and `fogft up` it",
+        )
+    wanted = intent.wanted(spec) + change
+    if wanted < 1:
+        raise FogftError(
+            f"cannot scale `{spec.name}` to {wanted} replicas: at least 1 must stay",
+            "`fogft down` ends a pool",
+        )
+    if wanted > MAX_REPLICAS:
+        raise FogftError(
+            f"cannot scale `{spec.name}` to {wanted} replicas: at most {MAX_REPLICAS} can be had"
+        )
+    for service in spec.services:
+        if service.quorum > max(wanted, service.replicas):
+            raise FogftError(
+                f"cannot scale `{spec.name}` to {wanted} replicas: `{service.name}` has a quorum "
+                f"of {service.quorum}, and no answer could win",
+                "change `quorum` in the pool file, and `fogft up` it",
+            )
+    if wanted == spec.replicas:
+        return replace(intent, target=None, scaled_from=None)
+    return replace(intent, target=wanted, scaled_from=spec.replicas)
+
+
+def drain(intent: Intent, slot: int, generation: int) -> Intent:
+    """Replace what runs in a slot, up to this generation. Repeating it changes nothing."""
+    drained = dict(intent.drained)
+    drained[slot] = max(generation, drained.get(slot, 0))
+    return replace(intent, drained=drained)
+
+
+def exclude(intent: Intent, location: str) -> Intent:
+    """Keep out of a location. Repeatable.
+
+    Raises:
+        FogftError: That is not a location.
+    """
+    return replace(intent, excluded=intent.excluded | {checked_location(location)})
+
+
+def include(intent: Intent, location: str) -> Intent:
+    """Allow a location again. Repeatable.
+
+    Raises:
+        FogftError: It is not excluded (the message says what is).
+    """
+    place = checked_location(location)
+    if place not in intent.excluded:
+        listed = ", ".join(f"`{p}`" for p in sorted(intent.excluded)) or "nothing"
+        raise FogftError(f"`{place}` is not excluded", f"excluded now: {listed}")
+    return replace(intent, excluded=intent.excluded - {place})
+
+
+def file_changed(intent: Intent, before: PoolSpec, after: PoolSpec) -> Intent:
+    """Take a new pool file into account: its own `replicas`, when changed, ends a `scale`."""
+    stopping = replace(intent, stopping=False)
+    if before.replicas != after.replicas:
+        return replace(stopping, target=None, scaled_from=None)
+    return stopping
+
+
+def checked_location(text: str) -> str:
+    """Return a location without surrounding slashes.
+
+    Raises:
+        FogftError: It is none.
+    """
+    place = text.strip().strip("/")
+    if not LOCATION.fullmatch(place):
+        raise FogftError(
+            f"`{text}` is not a location", "write `cloud`, `cloud/region` or `cloud/region/zone`"
+        )
+    return place
+
+
+def to_json(intent: Intent) -> dict[str, Any]:
+    """Return the intent as a JSON object."""
+    return {
+        "target": intent.target,
+        "scaled_from": intent.scaled_from,
+        "drained": {str(slot): generation for slot, generation in intent.drained.items()},
+        "excluded": sorted(intent.excluded),
+        "stopping": intent.stopping,
+        "began_at": intent.began_at,
+    }
+
+
+def from_json(value: Any) -> Intent:
+    """Read an intent back.
+
+    Raises:
+        StateError: It is not one; nothing was changed.
+    """
+    try:
+        return Intent(
+            target=_number(value["target"]),
+            scaled_from=_number(value["scaled_from"]),
+            drained={int(k): int(v) for k, v in dict(value["drained"]).items()},
+            excluded=frozenset(_texts(value["excluded"])),
+            stopping=bool(value["stopping"]),
+            began_at=_moment(value.get("began_at", 0.0)),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise StateError(f"not an intent: {error!r}") from error
+
+
+def _number(value: Any) -> int | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"not a count: {value!r}")
+    return value
+
+
+def _moment(value: Any) -> float:
+    moment = float(value)
+    if not 0 <= moment < float("inf"):  # false for NaN too
+        raise ValueError(f"not a time: {value!r}")
+    return moment
+
+
+def _texts(values: Iterable[Any]) -> list[str]:
+    texts = list(values)
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError("not texts")
+    return texts

@@ -1,0 +1,110 @@
+"""Identifiers that both ends derive by themselves: keys, certificate names, request ids.
+
+A connection is known by pool, slot, service and type, never by an address, so a replica
+that is launched again elsewhere resumes the same connection. The identifier is the
+SHA-256 of those parts with their lengths, so that no two lists of parts collide.
+
+Source: FogROS2-SGC's construction of identifiers, extended to connections by FogROS2-FT.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fogft.model.replica import Member, ReplicaId
+
+REQUEST_ID_BYTES = 16
+GATEWAY_SLOTS = 1 << 32  # from here on, slots are gateways
+POOL_UID_PATTERN = re.compile(r"[0-9a-f]{16}")
+POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
+
+
+def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str:
+    """Return the 32 hexadecimal digits that name a connection for good."""
+    digest = hashlib.sha256()
+    for part in (pool_uid, str(slot), service, type_name):
+        encoded = part.encode()
+        digest.update(len(encoded).to_bytes(4, "big"))
+        digest.update(encoded)
+    return digest.hexdigest()[:32]
+
+
+def slot_prefix(pool_uid: str, slot: int) -> str:
+    """Return the key prefix that a slot owns: it may serve these keys and no others."""
+    return f"fogft/{pool_uid}/{slot}"
+
+
+def service_key(pool_uid: str, slot: int, service: str, type_name: str) -> str:
+    """Return the Zenoh key at which a slot hears requests of a service."""
+    return f"{slot_prefix(pool_uid, slot)}/s/{connection_id(pool_uid, slot, service, type_name)}"
+
+
+def services_key(pool_uid: str, slot: int) -> str:
+    """Return the key expression of all of a slot's services."""
+    return f"{slot_prefix(pool_uid, slot)}/s/*"
+
+
+def answers_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot is asked for a connection's answers to come."""
+    return f"{slot_prefix(pool_uid, slot)}/answers"
+
+
+def probe_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot answers probes."""
+    return f"{slot_prefix(pool_uid, slot)}/probe"
+
+
+def records_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot takes signed records, revocations above all."""
+    return f"{slot_prefix(pool_uid, slot)}/records"
+
+
+def cancel_key(pool_uid: str, slot: int) -> str:
+    """Return the Zenoh key at which a slot hears which requests are no longer wanted."""
+    return f"{slot_prefix(pool_uid, slot)}/cancel"
+
+
+def replica_certificate_name(id: ReplicaId) -> str:
+    """Return the common name of a replica's certificate: pool, slot and generation."""
+    return f"replica.{id.slot}.{id.generation}.{id.pool_uid}"
+
+
+def member_certificate_name(member: Member) -> str:
+    """Return the common name that a member of the membership must show."""
+    id = member.id
+    if member.gateway:
+        return gateway_certificate_name(id.pool_uid, member.gateway, id.generation)
+    return replica_certificate_name(id)
+
+
+def robot_certificate_name(pool_uid: str, robot: str, generation: int = 1) -> str:
+    """Return the common name of a robot's certificate; each rotation has its generation."""
+    return f"robot.{robot}.{generation}.{pool_uid}"
+
+
+def gateway_certificate_name(pool_uid: str, gateway: str, generation: int = 1) -> str:
+    """Return the common name of a gateway's certificate."""
+    return f"gateway.{gateway}.{generation}.{pool_uid}"
+
+
+def gateway_slot(gateway: str) -> int:
+    """Return the slot of a gateway, which is like a replica to those who talk to it.
+
+    Such slots lie above all others. They hold 32 bits of a hash of the name, so that no list of
+    names and numbers has to be kept; the pool file's reader refuses two names that share one.
+    """
+    digest = hashlib.sha256(f"gateway {gateway}".encode()).digest()
+    return GATEWAY_SLOTS + int.from_bytes(digest[:4], "big")
+
+
+def rendezvous_certificate_name(pool_uid: str, rendezvous: str, generation: int = 1) -> str:
+    """Return the common name of a rendezvous's certificate."""
+    return f"rendezvous.{rendezvous}.{generation}.{pool_uid}"
+
+
+def manager_certificate_name(pool_uid: str) -> str:
+    """Return the common name of the certificate whose key signs the pool's membership."""
+    return f"manager.manager.1.{pool_uid}"

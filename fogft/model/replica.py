@@ -1,0 +1,276 @@
+"""The values that every part speaks of: replica, placement, machine, link report.
+
+Pure data, immutable, compared by value. The words are those of docs/glossary.md.
+
+Owns: what a replica is and what was observed of it.
+Not here: decisions (`planner`, `placement`) and the pool file (`spec`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cached_property
+
+from fogft.model.topology import Topology
+
+
+@dataclass(frozen=True, order=True)
+class ReplicaId:
+    """One launch of one slot of one pool. Never used twice.
+
+    Attributes:
+        pool_uid: 16 lower-case hexadecimal digits, random, made at the pool's first `up`.
+        slot: The place in the pool, 0 and up. Outlives the machines that fill it.
+        generation: Counts the launches of a slot from 1. A higher one fences off the lower.
+    """
+
+    pool_uid: str
+    slot: int
+    generation: int
+
+    @property
+    def short(self) -> str:
+        """Slot and generation, as people see it: ``2.1``."""
+        return f"{self.slot}.{self.generation}"
+
+    def __str__(self) -> str:
+        return f"{self.pool_uid}-{self.slot}.{self.generation}"
+
+    def __hash__(self) -> int:
+        return self.slot << 32 ^ self.generation  # nearly all are of one pool
+
+
+@dataclass(frozen=True, order=True)
+class Placement:
+    """Where and what: the thing that an offer sells and a launch asks for."""
+
+    cloud: str
+    region: str
+    zone: str
+    instance: str
+    spot: bool = True
+
+    @cached_property
+    def location(self) -> str:
+        """``cloud/region/zone``: what can be excluded, full or quarantined."""
+        return f"{self.cloud}/{self.region}/{self.zone}"
+
+    @cached_property
+    def supply(self) -> str:
+        """What can run short by itself: a location's spot machines, or those on demand."""
+        return supply(self.location, on_demand=not self.spot)
+
+    @cached_property
+    def domains(self) -> tuple[str, str, str]:
+        """The failure domains that it lies in, the widest first: cloud, region, location."""
+        return self.cloud, f"{self.cloud}/{self.region}", self.location
+
+    def within(self, location: str) -> bool:
+        """Whether this lies in a location given as ``cloud``, ``cloud/region`` or all three."""
+        return (self.location + "/").startswith(location.rstrip("/") + "/")
+
+
+def supply(location: str, *, on_demand: bool) -> str:
+    """Return `Placement.supply` of a location: the location itself for spot machines."""
+    return f"{location} on demand" if on_demand else location
+
+
+@dataclass(frozen=True)
+class Offer:
+    """A placement with its price in US dollars per hour.
+
+    Attributes:
+        source: Where the price comes from: ``live``, ``catalogue``; empty where it is made up.
+        as_of: When it was true, in seconds since the epoch; 0 when that is not known.
+        group: The group of the pool file that it suits; empty where there are none.
+    """
+
+    placement: Placement
+    usd_per_hour: float
+    source: str = ""
+    as_of: float = 0.0
+    group: str = ""
+
+
+class Phase(str, Enum):
+    """Where a replica stands in its life. It only ever moves forward."""
+
+    PROVISIONING = "provisioning"  # asked of the cloud, not yet running
+    STARTING = "starting"  # the machine runs; the service does not answer yet
+    READY = "ready"  # the service answers
+    DRAINING = "draining"  # answers, but is to go: nothing new is sent while others can
+    GONE = "gone"
+
+
+class MachinePhase(str, Enum):
+    """What a cloud says of a machine. Absence from its list means gone."""
+
+    PROVISIONING = "provisioning"
+    RUNNING = "running"
+    FAILED = "failed"  # a launch that will never run; stays listed until terminated
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One of our machines in a cloud's own list.
+
+    Attributes:
+        endpoint: ``host:port`` where the server proxy listens, once known.
+        notice: A preemption notice was given: the machine ends soon.
+        spec_hash: `PoolSpec.replica_hash` at its launch; another one means outdated.
+        launched_at: Seconds since the epoch.
+        failure: Why the phase is FAILED: ``capacity``, ``quota``, ``credentials``,
+            ``setup``, ``timeout`` or ``error``, then ``: `` and the cloud's words (a log's
+            last lines after a line break); empty otherwise.
+        progress: What the cloud says is being done there until it serves, for people.
+    """
+
+    id: ReplicaId
+    placement: Placement
+    phase: MachinePhase
+    launched_at: float
+    endpoint: str | None = None
+    notice: bool = False
+    usd_per_hour: float = 0.0
+    spec_hash: str = ""
+    failure: str = ""
+    progress: str = ""
+
+
+def by_id(machine: Machine) -> tuple[str, int, int]:
+    """Return what machines are sorted by. Plain values compare faster than ids do."""
+    id = machine.id
+    return id.pool_uid, id.slot, id.generation
+
+
+class LinkState(str, Enum):
+    """What the client proxy knows of its link to a replica."""
+
+    CONNECTING = "connecting"  # never answered a probe yet
+    UP = "up"  # the last probe was answered in time
+    SUSPECT = "suspect"  # was up; the server proxy no longer answers probes
+
+
+DOUBTED_AFTER_S = 0.6
+"""A probe unanswered for so long is a reason to look, and to look only."""
+_DOUBTED_AFTER_ROUND_TRIPS = 3
+
+
+def doubted_after_s(rtt_s: float | None) -> float:
+    """Return when a silent replica is doubted: seconds after the first unanswered probe.
+
+    Args:
+        rtt_s: Round trip of the last probe that was answered; a long way takes its time.
+    """
+    return max(DOUBTED_AFTER_S, _DOUBTED_AFTER_ROUND_TRIPS * (rtt_s or 0.0))
+
+
+@dataclass(frozen=True)
+class LinkReport:
+    """What the client proxy reports of one replica. Ages and durations in seconds.
+
+    Attributes:
+        ready: Names of the services that this replica says it can answer now.
+        draining: The replica asked to be left alone (a preemption notice, a drain).
+        at_risk: Its cloud recommends to move it; it serves on meanwhile.
+        disagrees: Its answers have differed from those of a quorum, repeatedly.
+        heard_age_s: Since the server proxy last answered a probe; None if never.
+        silent_for_s: How long probes have gone unanswered; 0 while they are answered.
+        rtt_s: Round trip of the last probe.
+        restarts: How often the server proxy restarted the user's `run` command.
+        answered: How many requests it has answered well, first or not.
+        failed: How many came to a crash, a refusal or a response that was not ok.
+        detail: Last error in words (connection refused, wrong certificate, ...).
+        differs: A service's type is not the same there as on the robot, or cannot be loaded.
+        offered: Name and type of each service that `run` offers, where that is found out.
+    """
+
+    id: ReplicaId
+    state: LinkState
+    ready: frozenset[str] = frozenset()
+    draining: bool = False
+    at_risk: bool = False
+    disagrees: bool = False
+    heard_age_s: float | None = None
+    silent_for_s: float = 0.0
+    rtt_s: float | None = None
+    in_flight: int = 0
+    won: int = 0
+    restarts: int = 0
+    answered: int = 0
+    failed: int = 0
+    detail: str = ""
+    differs: bool = False
+    offered: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def doubted(self) -> bool:
+        """Whether it was up and is silent for longer than answers take, suspect or not yet.
+
+        Nothing follows from it but a question to the cloud.
+        """
+        if self.state is LinkState.UP:
+            return self.silent_for_s >= doubted_after_s(self.rtt_s)
+        return self.state is LinkState.SUSPECT
+
+
+@dataclass(frozen=True)
+class Observed:
+    """All that a plan depends on besides the spec: the world as seen at `now`.
+
+    Attributes:
+        now: Seconds since the epoch.
+        machines: The cloud's own list; None when the cloud could not tell.
+        links: What the client proxy reports; None when there is no fresh report.
+        offers: What can be bought now, in any order.
+        ending: Machines that were already asked to end, and may still be listed.
+        rtt_s: ``cloud/region`` -> round trip from the robot in seconds, where it is known.
+        doubt_s: By so much the clock was set just now: the time of day goes without it.
+    """
+
+    now: float
+    machines: tuple[Machine, ...] | None
+    links: tuple[LinkReport, ...] | None = None
+    offers: tuple[Offer, ...] = ()
+    ending: frozenset[ReplicaId] = frozenset()
+    rtt_s: Mapping[str, float] = field(default_factory=dict)
+    doubt_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Member:
+    """A replica that the client proxy shall hold a link to.
+
+    Attributes:
+        endpoint: ``host:port``; empty where it is not known yet, or the replica dials out.
+        gateway: The gateway's name, where that stands in place of replicas; empty for a replica.
+        version: What it runs (`Machine.spec_hash`); empty where it is not known.
+    """
+
+    id: ReplicaId
+    endpoint: str
+    draining: bool = False
+    gateway: str = ""
+    version: str = ""
+
+
+@dataclass(frozen=True)
+class Membership:
+    """Who is where: written by the manager, read by proxies, never application data.
+
+    Attributes:
+        epoch: The writing manager's lease; then `version` counts its writes. A lower
+            (epoch, version) never replaces a higher one.
+        revoked: Common names of certificates that are no good any more. Only ever grows.
+        topology: Who talks through whom.
+    """
+
+    pool: str
+    pool_uid: str
+    epoch: int
+    version: int
+    members: tuple[Member, ...] = field(default_factory=tuple)
+    revoked: frozenset[str] = frozenset()
+    topology: Topology = field(default_factory=Topology)

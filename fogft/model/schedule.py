@@ -1,0 +1,112 @@
+"""Replicas and cap by the time of the week. Pure: `now` is an argument.
+
+Windows are told by the clock on the wall, so they follow daylight-saving time: a window of
+08:00 to 18:00 is nine hours long on no day, and begins at 08:00 on all. The rules of time
+zones are the standard library's data.
+
+    now ──► window that holds now ───────────► replicas, cap
+        └─► window that holds now + prelaunch ─► the more replicas, with its cap
+
+Owns: which window holds a moment, and what is to be launched ahead of it.
+Not here: reading it (`spec_plan`) and the pool's own numbers (`sizing`).
+"""
+
+from __future__ import annotations
+
+import datetime
+import zoneinfo
+from typing import NamedTuple
+
+from fogft.model.choices import ScheduleSpec, WindowSpec
+
+DAY_S = 86_400
+
+
+class Wish(NamedTuple):
+    """What is wanted at a moment.
+
+    Attributes:
+        max_usd_per_hour: None for no cap.
+        ahead: Whether it is for a window that has not begun.
+    """
+
+    replicas: int
+    max_usd_per_hour: float | None
+    ahead: bool = False
+
+
+def zone(name: str) -> datetime.tzinfo:
+    """Return a time zone by its name.
+
+    Raises:
+        ValueError: There is no such zone, or this machine has no database of them.
+    """
+    if name == "UTC":
+        return datetime.timezone.utc
+    try:
+        return zoneinfo.ZoneInfo(name)
+    except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise ValueError(f"there is no time zone {name!r}") from error
+
+
+def window_at(schedule: ScheduleSpec, moment: float) -> WindowSpec | None:
+    """Return the first window that holds a moment (seconds since the epoch)."""
+    local = datetime.datetime.fromtimestamp(moment, zone(schedule.time_zone))
+    second = local.hour * 3600 + local.minute * 60 + local.second
+    today = local.weekday()
+    return next((w for w in schedule.windows if _holds(w, today, second)), None)
+
+
+def wish(schedule: ScheduleSpec, now: float, usual: Wish) -> Wish:
+    """Return what is wanted now.
+
+    Within `prelaunch_s` before a window that wants more replicas, its number holds, and
+    the higher of both caps. Every minute of that time is looked at, for a window may be
+    shorter than it.
+
+    Args:
+        schedule: The pool file's.
+        now: Seconds since the epoch.
+        usual: What is wanted outside of windows.
+    """
+    current = best = _within(window_at(schedule, now), usual)
+    ahead_s = 60.0
+    while ahead_s < schedule.prelaunch_s + 60.0:
+        moment = now + min(ahead_s, schedule.prelaunch_s)
+        later = _within(window_at(schedule, moment), usual)
+        if later.replicas > best.replicas:
+            caps = (current.max_usd_per_hour, later.max_usd_per_hour)
+            cap = None if None in caps else max(c for c in caps if c is not None)
+            best = Wish(later.replicas, cap, ahead=True)
+        ahead_s += 60.0
+    return best
+
+
+def _within(window: WindowSpec | None, usual: Wish) -> Wish:
+    if window is None:
+        return usual
+    replicas = usual.replicas if window.replicas is None else window.replicas
+    cap = usual.max_usd_per_hour if window.max_usd_per_hour is None else window.max_usd_per_hour
+    return Wish(replicas, cap)
+
+
+def _holds(window: WindowSpec, today: int, second: int) -> bool:
+    if window.begins_s < window.ends_s:
+        return today in window.days and window.begins_s <= second < window.ends_s
+    yesterday = (today - 1) % 7
+    return (today in window.days and second >= window.begins_s) or (
+        yesterday in window.days and second < window.ends_s
+    )
+
+
+def next_change(schedule: ScheduleSpec, now: float) -> float:
+    """Return when `wish` can next say something else: a window begins, nears or ends.
+
+    Where the clock on the wall is changed before that, it may come early; never late.
+    """
+    local = datetime.datetime.fromtimestamp(now, zone(schedule.time_zone))
+    second = local.hour * 3600 + local.minute * 60 + local.second + local.microsecond / 1e6
+    times = {float(t) for w in schedule.windows for t in (w.begins_s, w.ends_s)}
+    times |= {t - schedule.prelaunch_s for t in times}  # a window may want fewer than its end
+    shifted = {t + shift for t in times for shift in (-3600.0, 0.0, 3600.0)}
+    return now + min((t - second) % DAY_S or DAY_S for t in shifted)

@@ -1,0 +1,194 @@
+"""Who talks through whom: gateways, what they go through themselves, and who uses them. Pure.
+
+Whoever goes through gateways holds links to them and to no replica; all others hold links
+to the replicas. A gateway may go through others, so they form trees; a loop is refused
+wherever a topology is read.
+
+Owns: the topology, its plain form, and whom a holder talks to.
+Not here: the pool file's section (`spec_topology`), links (`fogft.proxy`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from fogft.errors import StateError
+from fogft.model.certificate_holder import NAME_PATTERN, Holder, Role
+
+GATEWAYS_LIMIT = 64
+ROBOTS_LIMIT = 512
+
+
+@dataclass(frozen=True)
+class Gateway:
+    """A gateway as the pool file describes it.
+
+    Attributes:
+        endpoint: ``host:port`` where robots and other gateways reach it.
+        through: Names of the gateways that it goes through itself; none for the replicas.
+        generations: Of its certificates that are good; more than one while they change.
+    """
+
+    name: str
+    endpoint: str
+    through: tuple[str, ...] = ()
+    generations: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Who talks through whom.
+
+    Attributes:
+        gateways: All of them, names distinct.
+        robots: Name of a robot -> the gateways that it goes through; none for the replicas.
+        through: The gateways of every robot that is not among `robots`.
+    """
+
+    gateways: tuple[Gateway, ...] = ()
+    robots: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    through: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether there is any gateway."""
+        return bool(self.gateways)
+
+    def of(self, name: str) -> Gateway | None:
+        """Return a gateway by its name."""
+        return next((g for g in self.gateways if g.name == name), None)
+
+    def of_robot(self, name: str) -> tuple[str, ...]:
+        """Return the gateways that a robot goes through; none for the replicas."""
+        return self.robots.get(name, self.through)
+
+    def neighbours(self, holder: Holder) -> tuple[Gateway, ...]:
+        """Return the gateways that somebody talks to; none for the replicas.
+
+        One without a certificate cannot be talked to.
+        """
+        if holder.role is Role.GATEWAY:
+            own = self.of(holder.name)
+            listed = own.through if own is not None else ()
+        else:
+            listed = self.of_robot(holder.name)
+        return tuple(g for g in self.gateways if g.name in listed and g.generations)
+
+
+def certified(topology: Topology, generations: Mapping[str, Iterable[int]]) -> Topology:
+    """Return a topology with the generations of each gateway's certificates that are good."""
+    gateways = tuple(
+        replace(g, generations=tuple(sorted(generations.get(g.name, ()))))
+        for g in topology.gateways
+    )
+    return replace(topology, gateways=gateways)
+
+
+def trouble(topology: Topology) -> str:
+    """Return what is wrong with a topology, in words; empty when nothing is."""
+    known = {gateway.name for gateway in topology.gateways}
+    if len(known) < len(topology.gateways):
+        return "a gateway stands there twice"
+    lists = [*(g.through for g in topology.gateways), *topology.robots.values(), topology.through]
+    for listed in lists:
+        if len(set(listed)) < len(listed):
+            return "a gateway is listed twice in one `through`"
+        for name in listed:
+            if name not in known:
+                return f"there is no gateway `{name}`"
+    loop = find_loop({gateway.name: gateway.through for gateway in topology.gateways})
+    return f"the gateways form a loop: {' -> '.join(loop)}" if loop else ""
+
+
+def find_loop(through: Mapping[str, Iterable[str]]) -> list[str]:
+    """Return the names along a loop, the first one again at the end; none where there is none."""
+    done: set[str] = set()
+    for start in through:
+        path: list[str] = []
+        stack = [(start, iter(through[start]))]
+        while stack:
+            name, rest = stack[-1]
+            if len(path) < len(stack):
+                path.append(name)
+            following = next((n for n in rest if n not in done), None)
+            if following is None:
+                done.add(name)
+                stack.pop()
+                path.pop()
+            elif following in path:
+                return [*path[path.index(following) :], following]
+            else:
+                stack.append((following, iter(through.get(following, ()))))
+    return []
+
+
+def to_plain(topology: Topology) -> dict[str, Any]:
+    """Return a topology as plain JSON data."""
+    return {
+        "gateways": [
+            {
+                "name": g.name,
+                "endpoint": g.endpoint,
+                "through": list(g.through),
+                "generations": list(g.generations),
+            }
+            for g in topology.gateways
+        ],
+        "robots": {name: list(through) for name, through in topology.robots.items()},
+        "through": list(topology.through),
+    }
+
+
+def from_plain(raw: Any) -> Topology:
+    """Read a topology back.
+
+    Raises:
+        StateError: It is none, or its gateways form a loop.
+    """
+    from fogft.model.membership import is_endpoint
+
+    try:
+        gateways = tuple(
+            Gateway(
+                _name(one["name"]),
+                one["endpoint"],
+                _names(one["through"]),
+                tuple(_generation(g) for g in one["generations"]),
+            )
+            for one in _list(raw["gateways"], GATEWAYS_LIMIT)
+        )
+        if not all(isinstance(g.endpoint, str) and is_endpoint(g.endpoint) for g in gateways):
+            raise ValueError("an endpoint that is not host:port")
+        if len(raw["robots"]) > ROBOTS_LIMIT:
+            raise ValueError("too many robots")
+        robots = {_name(name): _names(through) for name, through in raw["robots"].items()}
+        topology = Topology(gateways, robots, _names(raw["through"]))
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise StateError(f"not a topology: {error}") from error
+    wrong = trouble(topology)
+    if wrong:
+        raise StateError(f"not a topology: {wrong}")
+    return topology
+
+
+def _list(raw: Any, limit: int) -> list[Any]:
+    if not isinstance(raw, list) or len(raw) > limit:
+        raise TypeError(f"not a list of at most {limit}")
+    return raw
+
+
+def _names(raw: Any) -> tuple[str, ...]:
+    return tuple(_name(one) for one in _list(raw, GATEWAYS_LIMIT))
+
+
+def _name(raw: Any) -> str:
+    if not isinstance(raw, str) or not NAME_PATTERN.fullmatch(raw):
+        raise ValueError(f"not a name: {raw!r:.40}")
+    return raw
+
+
+def _generation(raw: Any) -> int:
+    if isinstance(raw, bool) or not isinstance(raw, int) or raw < 1:
+        raise ValueError(f"not a generation: {raw!r:.40}")
+    return raw

@@ -1,0 +1,151 @@
+"""Definitions of service types, and how two of one name differ. Pure.
+
+The robot and a replica load a type by its name, each from its own workspace. Where the two
+definitions are not the same, bytes of one are read as another message: numbers that look
+right and are not. So the definitions are compared before the first request.
+
+A distribution that has type hashes (Iron and later) tells sameness by them. Where either side
+has none (Humble), or to say what differs, fields are compared one by one.
+
+Owns: definitions as values, their plain form for the wire, the comparison.
+Not here: reading a type's definition (`fogft.ros.definition`), who compares
+(`fogft.proxy.robot.client`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+REQUEST, RESPONSE = "request", "response"
+_NESTED = re.compile(r"(?:sequence<)?([A-Za-z]\w*/[A-Za-z]\w*)")
+
+Fields = tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Definition:
+    """What a service type is on one machine.
+
+    Attributes:
+        hash: Of request and response (``RIHS01_...+RIHS01_...``); empty where the distribution
+            has none.
+        fields: `REQUEST`, `RESPONSE` and each nested ``package/Message`` -> its fields, each a
+            name and a type as the generated Python code tells them, in order.
+        trouble: Why the type cannot be loaded there; empty when it can.
+        service_hash: Of the whole service, its event message included, as `rmw_zenoh` writes
+            it into names; empty where it is not known.
+    """
+
+    hash: str = ""
+    fields: Mapping[str, Fields] = field(default_factory=dict)
+    trouble: str = ""
+    service_hash: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether it says anything."""
+        return bool(self.hash or self.fields or self.trouble or self.service_hash)
+
+
+def to_plain(definition: Definition) -> dict[str, Any]:
+    """Return a definition as JSON values."""
+    return {
+        "hash": definition.hash,
+        "trouble": definition.trouble,
+        "service_hash": definition.service_hash,
+        "fields": {name: [list(one) for one in of] for name, of in definition.fields.items()},
+    }
+
+
+def from_plain(raw: Any) -> Definition:
+    """Return a definition from its JSON values.
+
+    Raises:
+        ValueError: It is none.
+    """
+    try:
+        fields = {
+            _text(name): tuple((_text(key), _text(kind)) for key, kind in of)
+            for name, of in raw["fields"].items()
+        }
+        service_hash = _text(raw.get("service_hash", ""))  # an older replica tells none
+        return Definition(_text(raw["hash"]), fields, _text(raw["trouble"]), service_hash)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"not a definition: {error!r}") from error
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"not a text in a definition: {value!r:.40}")
+    value.encode()  # a lone surrogate is a ValueError too
+    return value
+
+
+def nested(kind: str) -> str:
+    """Return the message that a field's type is made of; empty for numbers and texts."""
+    found = _NESTED.match(kind)
+    return found.group(1) if found else ""
+
+
+def difference(type_name: str, here: Definition, there: Definition) -> str:
+    """Return how a type differs between here and a replica, in words; empty if it is the same.
+
+    Args:
+        type_name: ``package/srv/Type``.
+        here: As this machine has it.
+        there: As the replica has it.
+    """
+    for side, definition in (("here", here), ("on the replica", there)):
+        if definition.trouble:
+            return f"`{type_name}` cannot be loaded {side}: {definition.trouble}"
+    if here.hash and here.hash == there.hash:
+        return ""
+    if not (here.fields and there.fields):  # on either side only its hash is known
+        return _of_service_hashes(type_name, here.service_hash, there.service_hash)
+    for part in (REQUEST, RESPONSE):
+        found = _first_difference(part, part, here, there, set())
+        if found:
+            return f"`{type_name}` is not the same: {found}"
+    if here.hash and there.hash and here.hash.partition("_")[0] == there.hash.partition("_")[0]:
+        return f"`{type_name}` is not the same: its hash is {here.hash} here, {there.hash} there"
+    return ""
+
+
+def _of_service_hashes(type_name: str, here: str, there: str) -> str:
+    comparable = here and there and here.partition("_")[0] == there.partition("_")[0]
+    if not comparable or here == there:
+        return ""
+    return f"`{type_name}` is not the same: its hash is {here} here, {there} there"
+
+
+def _first_difference(
+    path: str, of: str, here: Definition, there: Definition, seen: set[str]
+) -> str:
+    if of in seen:
+        return ""
+    seen.add(of)
+    ours, theirs = here.fields.get(of, ()), there.fields.get(of, ())
+    found = _of_fields(path, ours, theirs)
+    for name, kind in ours:
+        found = found or _first_difference(f"{path}.{name}", nested(kind), here, there, seen)
+    return found
+
+
+def _of_fields(path: str, ours: Fields, theirs: Fields) -> str:
+    kinds_here, kinds_there = dict(ours), dict(theirs)
+    for name, kind in ours:
+        other = kinds_there.get(name)
+        if other is None:
+            return f"field `{path}.{name}` (`{kind}`) is missing on the replica"
+        if kind != other:
+            return f"field `{path}.{name}` is `{kind}` here and `{other}` on the replica"
+    for name, kind in theirs:
+        if name not in kinds_here:
+            return f"the replica has a further field `{path}.{name}` (`{kind}`)"
+    for (name, _), (other, _) in zip(ours, theirs, strict=False):
+        if name != other:
+            return f"the order of fields differs: `{path}.{name}` here, `{path}.{other}` there"
+    return ""

@@ -1,0 +1,376 @@
+"""A replica of a stateful service: apply by number, one at a time, and nothing else. Pure.
+
+What happens comes in by methods; what to do comes out as effects, in the order in which
+they are to be done. The service works on one thing at a time: a request, a snapshot or a
+restore. Each gets a serial number; what ends under an older one is of no interest.
+
+Owns: which state the service is in, which term is obeyed, which answers are kept.
+Not here: calling the service and answering (`fogft.proxy.replica.ordered_responder`).
+Protocol: docs/design/state.md.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from fogft.ordering import orders
+from fogft.ordering.orders import FORGOTTEN, MALFORMED, NOT_JOINED, START, Op, Position, Promise
+
+T = TypeVar("T")
+
+NOT_READY, CRASHED = "not-ready", "crashed"
+
+
+@dataclass(frozen=True)
+class Reply(Generic[T]):
+    """Answer whoever gave this order."""
+
+    to: T
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class Refuse(Generic[T]):
+    """Refuse whoever gave this order."""
+
+    to: T
+    reason: str
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Let the service do something; report its end under the same serial.
+
+    Attributes:
+        op: `APPLY`: call the service. `SNAPSHOT`, `RESTORE`: call those of the pool file.
+    """
+
+    op: Op
+    serial: int
+    payload: bytes = b""
+
+
+Effect = Reply[T] | Refuse[T] | Begin
+
+
+@dataclass
+class _Work(Generic[T]):
+    """What the service does now."""
+
+    op: Op
+    serial: int
+    epoch: int
+    index: int
+    waiting: list[T]
+
+
+@dataclass
+class _Queued(Generic[T]):
+    payload: bytes
+    waiting: list[T] = field(default_factory=list)
+
+
+class OrderedReplica(Generic[T]):
+    """One stateful service on one replica.
+
+    Args:
+        queue_limit: Requests that wait for their turn; more are refused.
+        queue_bytes: Their bytes.
+        kept: Answers kept for copies.
+        kept_bytes: Their bytes; the oldest go first.
+    """
+
+    def __init__(
+        self,
+        *,
+        queue_limit: int = 512,
+        queue_bytes: int = 64 << 20,
+        kept: int = 1024,
+        kept_bytes: int = 16 << 20,
+    ) -> None:
+        self.position = START
+        self.sound = True
+        self.joined = False
+        self.serving = False  # whether the service and its two state services are there
+        self.promised = 0
+        self.robot = ""
+        self.goal = 0  # with this number it has caught up with the time when it joined
+        self.applied = 0  # how many requests were applied here
+        self._limits = (queue_limit, queue_bytes, kept, kept_bytes)
+        self._serial = 0
+        self._work: _Work[T] | None = None
+        self._queue: OrderedDict[int, _Queued[T]] = OrderedDict()
+        self._queued_bytes = 0
+        self._claims: list[T] = []
+        self._snapshots: list[T] = []
+        self._restore: tuple[int, bytes, T] | None = None
+        self._kept: OrderedDict[int, bytes | None] = OrderedDict()
+        self._kept_size = 0
+
+    @property
+    def current(self) -> bool:
+        """Whether it has the present state: it joined, and has caught up since."""
+        return self.joined and self.serving and self.position.index >= self.goal
+
+    @property
+    def busy(self) -> bool:
+        """Whether the service works on something."""
+        return self._work is not None
+
+    @property
+    def in_flight(self) -> int:
+        """Requests that are held and not yet answered."""
+        applying = self._work is not None and self._work.op is Op.APPLY
+        return len(self._queue) + applying
+
+    @property
+    def _expected(self) -> int:
+        """The next number that can be taken."""
+        if self._queue:
+            return next(reversed(self._queue)) + 1
+        work = self._work
+        if work is not None and work.op is Op.APPLY:
+            return work.index + 1
+        return self.position.index + 1
+
+    # -- orders ---------------------------------------------------------------------------
+
+    def order(  # noqa: PLR0911 - one line an operation reads better than nesting
+        self, op: Op, epoch: int, index: int, payload: bytes, *, robot: str, to: T
+    ) -> list[Effect[T]]:
+        """Take an order; `to` is who is to be answered."""
+        if op is Op.CLAIM:
+            return self._claim(epoch, robot, to)
+        if epoch != self.promised:
+            return [Refuse(to, orders.fenced(self.promised))]
+        if op is Op.APPLY:
+            return self._apply(index, payload, to)
+        if op is Op.RECALL:
+            known = self._recall(index, to)
+            return [Refuse(to, NOT_JOINED)] if known is None else known
+        if not self.serving:
+            return [Refuse(to, NOT_READY)]
+        if op is Op.JOIN:
+            return self._join(payload, to)
+        if op is Op.RESTORE:
+            return self._take_restore(index, payload, to)
+        self._snapshots.append(to)
+        return self._go_on()
+
+    def _claim(self, epoch: int, robot: str, to: T) -> list[Effect[T]]:
+        if not self.serving:
+            return [Refuse(to, NOT_READY)]
+        if not self._may_obey(robot):
+            return [Refuse(to, orders.held(self.robot))]
+        if epoch < self.promised:
+            return [Refuse(to, orders.fenced(self.promised))]
+        out: list[Effect[T]] = []
+        if epoch > self.promised:
+            out = self._give_up(orders.fenced(epoch))
+            self.promised, self.robot = epoch, robot
+            self.joined = False
+        self._claims.append(to)
+        return [*out, *self._go_on()]
+
+    def _may_obey(self, robot: str) -> bool:
+        return self.robot in ("", robot)
+
+    def _join(self, payload: bytes, to: T) -> list[Effect[T]]:
+        if not self.joined:
+            at, goal = orders.decode_join(payload)
+            if not self.sound or self.busy or at != self.position:
+                return [Refuse(to, NOT_JOINED)]
+            self.joined, self.goal = True, goal
+            if at.epoch != self.promised:
+                self._forget_answers()
+                self.position = Position(self.promised, at.index)
+        return [Reply(to, self._joined())]
+
+    def _is_behind(self, index: int) -> bool:
+        """Whether the state after this number is one that has been left behind."""
+        return self.joined and index < self._expected
+
+    def _joined(self) -> bytes:
+        """Return what a join or a restore is answered with."""
+        return orders.encode_index(self._expected)
+
+    def _take_restore(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
+        if self._is_behind(index):  # a copy, or not needed
+            return [Reply(to, self._joined())]
+        goal, state = orders.decode_snapshot(payload)
+        out: list[Effect[T]] = self._give_up(NOT_JOINED) if self.joined else []
+        self.joined = False
+        if self._restore is not None:
+            out.append(Refuse(self._restore[2], NOT_JOINED))
+        self._restore, self.goal = (index, state, to), goal
+        return [*out, *self._go_on()]
+
+    def _recall(self, index: int, to: T) -> list[Effect[T]] | None:
+        """Answer a number that was taken before, now or when it is done; None for a new one."""
+        if not self.joined:
+            return [Refuse(to, NOT_JOINED)]
+        if index <= self.position.index:
+            if index not in self._kept:
+                return [Refuse(to, FORGOTTEN)]
+            answer = self._kept[index]
+            return [Refuse(to, MALFORMED) if answer is None else Reply(to, answer)]
+        work = self._work
+        if work is not None and work.op is Op.APPLY and work.index == index:
+            work.waiting.append(to)
+            return []
+        if index in self._queue:
+            self._queue[index].waiting.append(to)
+            return []
+        return None
+
+    def _apply(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
+        known = self._recall(index, to)
+        if known is not None:
+            return known
+        if index != self._expected:
+            return [Refuse(to, orders.gap(self._expected))]
+        limit, limit_bytes, _, _ = self._limits
+        full = len(self._queue) >= limit or self._queued_bytes + len(payload) > limit_bytes
+        if full and self._queue:
+            return [Refuse(to, orders.gap(index))]  # send it again, a little later
+        self._queue[index] = _Queued(payload, [to])
+        self._queued_bytes += len(payload)
+        return self._go_on()
+
+    # -- the service ----------------------------------------------------------------------
+
+    def _go_on(self) -> list[Effect[T]]:
+        """Begin the next thing, if nothing is being done."""
+        if self._work is not None:
+            # Within its own term a claim asks only where we stand: that may be told at once.
+            return self._tell() if self.joined else []
+        out = self._tell()
+        if self._restore is not None:
+            index, payload, to = self._restore
+            self._restore = None
+            if self._is_behind(index):
+                out.append(Reply(to, self._joined()))
+            else:
+                # It may have joined by another restore since; what it was sent then is not for
+                # the state that comes now.
+                out += self._give_up(NOT_JOINED)
+                self.joined = self.sound = False
+                self._forget_answers()
+                return [*out, self._begin(Op.RESTORE, index, [to], payload)]
+        if self._snapshots and self.joined:
+            waiting, self._snapshots = self._snapshots, []
+            return [*out, self._begin(Op.SNAPSHOT, self.position.index, waiting)]
+        out += [Refuse(to, NOT_JOINED) for to in self._snapshots]
+        self._snapshots = []
+        while self._queue and self._work is None:
+            index, queued = self._queue.popitem(last=False)
+            self._queued_bytes -= len(queued.payload)
+            out += self._start(index, queued.payload, queued.waiting)
+        return out
+
+    def _start(self, index: int, payload: bytes, waiting: list[T]) -> list[Effect[T]]:
+        """Begin to apply a number."""
+        return [self._begin(Op.APPLY, index, waiting, payload)]
+
+    def _tell(self) -> list[Effect[T]]:
+        claims, self._claims = self._claims, []
+        promise = self._promise()
+        return [Reply(to, promise) for to in claims]
+
+    def _promise(self) -> bytes:
+        """Return what a claim is answered with."""
+        return orders.encode_promise(Promise(self.position, self.sound))
+
+    def _begin(self, op: Op, index: int, waiting: list[T], payload: bytes = b"") -> Begin:
+        self._serial += 1
+        self._work = _Work(op, self._serial, self.promised, index, waiting)
+        return Begin(op, self._serial, payload)
+
+    def done(self, serial: int, answer: bytes | None) -> list[Effect[T]]:
+        """The service has ended what began under this serial; None if it failed.
+
+        A request whose bytes the service could not read has failed: it counts as applied,
+        for it is the same on every replica.
+        """
+        work = self._work
+        if work is None or work.serial != serial:
+            return []
+        self._work = None
+        out: list[Effect[T]]
+        if work.op is Op.APPLY:
+            self.applied += 1
+            out = self._has_applied(Position(work.epoch, work.index), answer, work.waiting)
+        elif work.op is Op.SNAPSHOT:
+            out = [
+                Refuse(to, NOT_READY)
+                if answer is None
+                else Reply(to, orders.encode_snapshot(work.index, self._snapshot_of(answer)))
+                for to in work.waiting
+            ]
+        else:
+            out = self._restored(work, answer is not None)
+        return [*out, *self._go_on()]
+
+    def _has_applied(self, at: Position, answer: bytes | None, waiting: list[T]) -> list[Effect[T]]:
+        self.position = at
+        self._keep(at.index, answer)
+        return [Refuse(to, MALFORMED) if answer is None else Reply(to, answer) for to in waiting]
+
+    def _snapshot_of(self, state: bytes) -> bytes:
+        """Return a snapshot's bytes, given the service's own."""
+        return state
+
+    def _took_state(self, ok: bool) -> None:
+        """A restore has ended; one that failed has left nobody knows what."""
+
+    def _restored(self, work: _Work[T], ok: bool) -> list[Effect[T]]:
+        self._took_state(ok)
+        if not ok:
+            return [Refuse(to, NOT_JOINED) for to in work.waiting]
+        self.sound = True
+        self.position = Position(work.epoch, work.index)
+        if work.epoch != self.promised:  # fenced meanwhile
+            return [Refuse(to, orders.fenced(self.promised)) for to in work.waiting]
+        self.joined = True
+        return [Reply(to, self._joined()) for to in work.waiting]
+
+    def _keep(self, index: int, answer: bytes | None) -> None:
+        _, _, kept, kept_bytes = self._limits
+        self._kept[index] = answer
+        self._kept_size += len(answer or b"")
+        while len(self._kept) > kept or (self._kept_size > kept_bytes and len(self._kept) > 1):
+            _, oldest = self._kept.popitem(last=False)
+            self._kept_size -= len(oldest or b"")
+
+    def _forget_answers(self) -> None:
+        self._kept.clear()
+        self._kept_size = 0
+
+    # -- what goes wrong ------------------------------------------------------------------
+
+    def lost(self) -> list[Effect[T]]:
+        """The service has died, with its state: what starts next starts at the beginning."""
+        out = self._give_up(CRASHED)
+        if self._work is not None:
+            out += [Refuse(to, CRASHED) for to in self._work.waiting]
+        out += [Refuse(to, NOT_READY) for to in self._claims]
+        self._work, self._claims = None, []
+        self.position, self.sound, self.joined, self.serving = START, True, False, False
+        self._forget_answers()
+        return out
+
+    def _give_up(self, reason: str) -> list[Effect[T]]:
+        """Refuse all that has not begun."""
+        out: list[Effect[T]] = [
+            Refuse(to, reason) for queued in self._queue.values() for to in queued.waiting
+        ]
+        out += [Refuse(to, reason) for to in self._snapshots]
+        if self._restore is not None:
+            out.append(Refuse(self._restore[2], reason))
+        out += [Refuse(to, reason) for to in self._claims]
+        self._queue.clear()
+        self._queued_bytes = 0
+        self._snapshots, self._restore, self._claims = [], None, []
+        return out

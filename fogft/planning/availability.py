@@ -1,0 +1,172 @@
+"""How often a whole pool is down, when its replicas differ and fail together. Pure arithmetic.
+
+Replicas in one zone are preempted together, those of one region less often so, those of one
+cloud less still. A number in [0, 1] says how much for each level, and the model is exact
+for any replicas:
+
+    Each domain has a value, spread evenly over [0, 1]. With a probability of its own a
+    domain takes the value of the wider domain that it lies in, else a fresh one; a replica
+    likewise takes its zone's. A replica is down when its value is below its
+    unavailability.
+
+So each replica is down exactly as often as alone, and two equal ones of one zone are down
+together with correlation `Correlation.zone`, two of one region `region`, two of one cloud
+`cloud`. Different clouds are independent.
+
+Owns: the arithmetic for unequal and correlated replicas.
+Not here: one replica's figure and the plain product (`reliability`), how many are
+launched (`sizing`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from fogft.model.replica import Placement
+from fogft.planning.reliability import system_unavailability, unavailability
+
+HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """How much replicas are down together. Each in [0, 1], and none above the one before.
+
+    The defaults for a region and a cloud were measured in public traces of AWS's V100 spot
+    machines: 9 zones, 45 days (over all pairs of zones 0.22). That for a zone is assumed, above
+    them. docs/design/availability.md has the source.
+
+    Attributes:
+        zone: Between two replicas in one zone.
+        region: Between two in different zones of one region.
+        cloud: Between two in different regions of one cloud.
+    """
+
+    zone: float = 0.5
+    region: float = 0.43
+    cloud: float = 0.14
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.cloud <= self.region <= self.zone <= 1:
+            raise ValueError(
+                "correlations must be from 0 to 1, and zone >= region >= cloud, not "
+                f"{self.zone:g}, {self.region:g} and {self.cloud:g}"
+            )
+
+
+INDEPENDENT = Correlation(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """What is taken for granted about machines, for lack of a measurement. Seconds.
+
+    Attributes:
+        spot_uptime_s: From ready to preempted, on average. 15 h is FogROS2-FT's figure.
+        on_demand_uptime_s: From ready to failed. With 20 min of recovery, 12 million
+            seconds are the 99.99 % that clouds promise.
+        recovery_s: From gone to ready elsewhere. 20 min is FogROS2-FT's figure.
+    """
+
+    spot_uptime_s: float = 15 * HOUR_S
+    on_demand_uptime_s: float = 12_000_000.0
+    recovery_s: float = 1200.0
+    correlation: Correlation = field(default_factory=Correlation)
+
+    def unavailability(self, *, spot: bool) -> float:
+        """Return the fraction of time that one replica does not answer."""
+        uptime_s = self.spot_uptime_s if spot else self.on_demand_uptime_s
+        return unavailability(uptime_s, self.recovery_s)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The fraction of time, in [0, 1], that at least one replica answers.
+
+    Attributes:
+        correlated: As `Assumption.correlation` says.
+        independent: If replicas failed independently: the best case, and the paper's.
+    """
+
+    correlated: float
+    independent: float
+
+
+def expected(placements: Sequence[Placement], assumed: Assumption) -> Expected:
+    """Return how available a pool with replicas in these places is. Of none: never."""
+    down = [assumed.unavailability(spot=place.spot) for place in placements]
+    together = joint_unavailability(zip(placements, down, strict=True), assumed.correlation)
+    return Expected(1.0 - together, 1.0 - system_unavailability(down))
+
+
+def joint_unavailability(
+    replicas: Iterable[tuple[Placement, float]], correlation: Correlation
+) -> float:
+    """Return the fraction of time that all replicas are down together.
+
+    Args:
+        replicas: Where each is, and the fraction of time that it is down, in [0, 1].
+        correlation: How much they are down together.
+
+    Raises:
+        ValueError: A fraction is out of range.
+    """
+    tree: dict[str, dict[str, dict[str, list[float]]]] = defaultdict(
+        lambda: defaultdict(lambda: defaultdict(list))
+    )
+    steps = {0.0, 1.0}
+    for place, down in replicas:
+        if not 0 <= down <= 1:
+            raise ValueError(f"an unavailability must be from 0 to 1, not {down}")
+        tree[place.cloud][place.region][place.zone].append(down)
+        steps.add(down)
+    grid = _Grid(sorted(steps))
+    # A replica follows its zone, a zone its region, a region its cloud, with these chances:
+    # two replicas share a value when both paths up to it are followed.
+    by_replica = math.sqrt(correlation.zone)
+    by_zone = math.sqrt(correlation.region / correlation.zone) if correlation.zone else 0.0
+    by_region = math.sqrt(correlation.cloud / correlation.region) if correlation.region else 0.0
+    total = 1.0
+    for regions in tree.values():
+        in_cloud = []
+        for zones in regions.values():
+            in_region = [
+                grid.followed(grid.down(members, by_replica), by_zone) for members in zones.values()
+            ]
+            in_cloud.append(grid.followed(grid.product(in_region), by_region))
+        total *= grid.mean(grid.product(in_cloud))
+    return total
+
+
+class _Grid:
+    """Functions of a domain's value, constant between neighbouring steps."""
+
+    def __init__(self, steps: list[float]) -> None:
+        self._widths = [b - a for a, b in itertools.pairwise(steps)]
+        self._starts = steps[:-1]
+
+    def down(self, members: Sequence[float], follow: float) -> list[float]:
+        """Return how likely all members are down, given their zone's value."""
+
+        def given(start: float) -> float:
+            return math.prod(follow * (start < q) + (1 - follow) * q for q in members)
+
+        return self._of(given)
+
+    def followed(self, inner: list[float], follow: float) -> list[float]:
+        """Return a domain's function, given the value of the domain that it lies in."""
+        alone = (1 - follow) * self.mean(inner)
+        return [follow * value + alone for value in inner]
+
+    def product(self, functions: Sequence[list[float]]) -> list[float]:
+        return [math.prod(values) for values in zip(*functions, strict=True)]
+
+    def mean(self, function: Sequence[float]) -> float:
+        return math.fsum(w * v for w, v in zip(self._widths, function, strict=True))
+
+    def _of(self, function: Callable[[float], float]) -> list[float]:
+        return [function(start) for start in self._starts]

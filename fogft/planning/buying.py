@@ -1,0 +1,236 @@
+"""Turn needs into launches, within surge, budget and what is offered. Pure.
+
+Where a group mixes spot and on-demand, its first `base` replicas are on demand and the rest
+spot; while no spot machine can be had, an on-demand one may stand in for it.
+
+Owns: which market a launch is bought on, and what is said when it cannot be.
+Not here: the order among offers (`placement`) and what is needed (`needs`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+from fogft.model.groups import Group
+from fogft.model.intent import Intent
+from fogft.model.replica import Observed, Offer, Placement
+from fogft.model.scoring import Scale
+from fogft.model.spec import PoolSpec
+from fogft.planning.endings import Census, Standing
+from fogft.planning.listing import Listing, catalogue
+from fogft.planning.needs import Need, home
+from fogft.planning.observed.backoff import (
+    EVERYWHERE,
+    Backoff,
+    avoided,
+    disappointing,
+    rested_longest,
+    resting,
+)
+from fogft.planning.observed.health import Verdict
+from fogft.planning.observed.history import History
+from fogft.planning.placement import Choice, Market
+
+# Reasons that speak neither against the place nor for it: a replacement may go there again.
+_NOT_THE_PLACES_FAULT = ("outdated", "moves", "spot")
+
+
+class PlannedLaunch(NamedTuple):
+    """Order a machine for a slot, under a generation never used before."""
+
+    slot: int
+    generation: int
+    offer: Offer
+    reason: str
+
+
+@dataclass
+class Buyer:
+    """Buys one launch after the other.
+
+    Args:
+        groups: The pool's, as they are sized.
+        cap: On the price of all machines together; None for none.
+    """
+
+    spec: PoolSpec
+    intent: Intent
+    observed: Observed
+    history: History
+    census: Census
+    groups: Sequence[Group]
+    cap: float | None
+    launches: list[PlannedLaunch] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    sacrificed: list[tuple[Standing, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._catalogue = catalogue(self.observed.offers)
+        self._markets: dict[tuple[str, bool | None, bool], Market] = {}
+        self._whole: dict[tuple[str, bool | None], Market] = {}
+        self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
+        wrong = self._catalogue.impossible
+        if wrong:
+            self.notes.append(f"offers with impossible prices are ignored, such as `{wrong}`")
+
+    @cached_property
+    def _spent_before(self) -> float:
+        return sum(self._price(s) for s in self.census.everyone())
+
+    @property
+    def _spent(self) -> float:
+        spent = self._spent_before
+        for launch in self.launches:
+            spent += launch.offer.usd_per_hour
+        return spent
+
+    @property
+    def _resting(self) -> Mapping[str, Backoff]:
+        return resting(self.history, self.observed.now)
+
+    @property
+    def _avoided(self) -> Mapping[str, float]:
+        return avoided(self.history, self.observed.now)
+
+    @property
+    def budget(self) -> float | None:
+        """What one more machine may cost now; None for any price."""
+        return None if self.cap is None else self.cap - self._spent
+
+    def buy(self, need: Need, room: int) -> bool:
+        """Plan one launch; False (and a note) when nothing more can be launched now."""
+        if len(self.launches) >= room:
+            verb = "replace" if need.replaces else "launch"
+            self.notes.append(
+                f"waiting to {verb} slot {need.slot}: `max_surge` allows no more machines now"
+            )
+            return False
+        choice, reason = self._choose(need, self.budget)
+        if choice.offer is None:
+            self.notes.append(f"slot {need.slot} waits: {choice.why_not}")
+            if self.cap is not None:
+                self._make_room(need, self.cap)
+            return False
+        generation = self._next_generation(need.slot)
+        self.launches.append(PlannedLaunch(need.slot, generation, choice.offer, reason))
+        return True
+
+    def market(self, group: Group, spot: bool | None, *, at_leisure: bool = False) -> Market:
+        """Return what is sold to a group: of one kind only unless `spot` is None.
+
+        Args:
+            at_leisure: For one that need not be launched: nothing that refused lately is in it.
+        """
+        key = (group.offers, spot, at_leisure)
+        if key not in self._markets:
+            resting = self._resting
+            if at_leisure:
+                resting = {**disappointing(self.history, self.observed.now), **resting}
+            self._markets[key] = self._market(group, spot, resting)
+        return self._markets[key]
+
+    def _market(self, group: Group, spot: bool | None, resting: Mapping[str, Backoff]) -> Market:
+        return Market(
+            self._listing(group, spot),
+            resting=resting,
+            avoid=(*self._avoided, *(s.location for s in self.census.lost)),
+        )
+
+    def whole_market(self, group: Group, spot: bool | None) -> Market:
+        """Return what is sold to a group where nothing rests and nothing is avoided."""
+        key = (group.offers, spot)
+        if key not in self._whole:
+            self._whole[key] = Market(self._listing(group, spot))
+        return self._whole[key]
+
+    def _listing(self, group: Group, spot: bool | None) -> Listing:
+        return self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale)
+
+    def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
+        """Return the market of what rests longest, where all rests; None to wait for another."""
+        coming = self.launches or any(not s.ever_ready for s in self.census.good)
+        if coming or EVERYWHERE in self._resting:
+            return None
+        supply = rested_longest(self.market(group, spot).resting.items(), self.observed.now)
+        if supply is None:
+            return None
+        return self._market(group, spot, {k: v for k, v in self._resting.items() if k != supply})
+
+    def kind(self, group: Group, without: Standing | None) -> bool | None:
+        """Return whether a group's next machine is spot (True); None where it does not matter.
+
+        Args:
+            group: Whose.
+            without: One that is not counted, since it goes.
+        """
+        if not group.on_demand.base and not group.on_demand.fallback:
+            return None
+        stay = [s for s in (*self.census.good, *self.census.replaced) if s is not without]
+        placed = [
+            s.judged.machine.placement for s in stay if home(self.groups, s.slot) is group
+        ] + [x.offer.placement for x in self.launches if home(self.groups, x.slot) is group]
+        return sum(not place.spot for place in placed) >= group.on_demand.base
+
+    def places(self, without: Standing | None) -> list[Placement]:
+        """Return where our replicas are and will be."""
+        stay = [s for s in (*self.census.good, *self.census.replaced) if s is not without]
+        taken = [s.judged.machine.placement for s in stay]
+        return taken + [launch.offer.placement for launch in self.launches]
+
+    def _price(self, standing: Standing) -> float:
+        """Return what a machine costs: as ordered, or more where its spot price has risen."""
+        placement = standing.judged.machine.placement
+        return max(standing.usd_per_hour, self._catalogue.prices.get(placement, 0.0))
+
+    def _choose(self, need: Need, budget: float | None) -> tuple[Choice, str]:
+        old = need.replaces
+        avoid = set()
+        if old is not None and not old.why.startswith(_NOT_THE_PLACES_FAULT):
+            avoid.add(old.location)
+        taken = self.places(old)
+        spot = self.kind(need.group, old)
+        moves = old is not None and old.why.startswith("moves")
+        market = self.market(need.group, spot, at_leisure=moves)
+        found = market.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
+        if found.offer is None and spot and need.group.on_demand.fallback:
+            stand_in = self.market(need.group, False).choose(
+                taken, avoid=avoid, budget_usd_per_hour=budget
+            )
+            if stand_in.offer is not None:
+                return stand_in, f"{need.reason}; on demand, for no spot: {found.why_not}"
+        last = None if found.offer or moves else self._in_spite(need.group, spot)
+        if last is not None:
+            choice = last.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
+            return choice, f"{need.reason}; all rest, and this location longest"
+        return found, need.reason
+
+    def _make_room(self, need: Need, cap: float) -> None:
+        """Under a cap, a silent machine that blocks its own replacement goes first."""
+        left = cap - self._spent + sum(self._price(s) for s in self.census.ending)
+        if self._choose(need, left)[0].offer is not None:
+            return  # what is being ended already makes room enough
+        for standing in self.census.lost:
+            if standing.verdict is not Verdict.UNRESPONSIVE:
+                continue
+            if self._choose(need, left + self._price(standing))[0].offer is not None:
+                self.sacrificed.append((standing, f"{standing.why}, and the budget has no room"))
+                return
+
+    def fits_beside(self, need: Need) -> bool:
+        """Whether the budget has room for a successor beside the one that it replaces."""
+        return self._choose(need, self.budget)[0].offer is not None
+
+    def fits_instead(self, need: Need, old: Standing) -> bool:
+        """Whether there is room for a successor once the one that it replaces is gone."""
+        if self.cap is None:
+            return True
+        left = self.cap - self._spent + self._price(old)
+        return self._choose(need, left)[0].offer is not None
+
+    def _next_generation(self, slot: int) -> int:
+        listed = [s.id.generation for s in self.census.everyone() if s.slot == slot]
+        known = [self.history.generation(slot), self.intent.drained.get(slot, 0)]
+        return max([*known, *listed]) + 1

@@ -1,0 +1,85 @@
+"""What a pool costs an hour and a month, with what leaves the cloud. Pure arithmetic.
+
+Clouds charge for what leaves them, so for responses: one from each replica that is asked,
+the late ones included. Requests come in for nothing.
+
+Owns: egress prices (dated) and sums.
+Not here: machines' prices (offers carry them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from fogft.model.replica import Offer
+from fogft.model.spec import HedgingMode, ServiceSpec
+
+HOURS_A_MONTH = 730.0
+GB = 1e9
+# To the Internet, US dollars per GB: the list prices of the first paid tier.
+EGRESS_AS_OF = "2024-11"
+EGRESS_USD_PER_GB = {"aws": 0.09, "azure": 0.087, "gcp": 0.12, "local": 0.0}
+UNKNOWN_EGRESS_USD_PER_GB = 0.12
+
+
+@dataclass(frozen=True)
+class Cost:
+    """US dollars per hour.
+
+    Attributes:
+        egress: For what leaves the clouds; 0 where the file says nothing of traffic.
+    """
+
+    machines: float
+    egress: float
+
+    @property
+    def usd_per_hour(self) -> float:
+        """All together."""
+        return self.machines + self.egress
+
+    @property
+    def usd_per_month(self) -> float:
+        """For 730 hours."""
+        return self.usd_per_hour * HOURS_A_MONTH
+
+
+def cost(replicas: Sequence[tuple[Offer, Sequence[ServiceSpec]]]) -> Cost:
+    """Return what replicas cost: each an offer, and the services that it carries."""
+    machines = sum(offer.usd_per_hour for offer, _ in replicas)
+    carriers = {
+        service.name: sum(service in carried for _, carried in replicas)
+        for _, carried in replicas
+        for service in carried
+    }
+    egress = sum(
+        egress_bytes_per_s(carried, carriers) * 3600 / GB * egress_price(offer.placement.cloud)
+        for offer, carried in replicas
+    )
+    return Cost(machines, egress)
+
+
+def egress_bytes_per_s(carried: Iterable[ServiceSpec], carriers: dict[str, int]) -> float:
+    """Return what leaves one replica, of services that so many replicas carry."""
+    return sum(
+        service.traffic.requests_per_s
+        * service.traffic.response_bytes
+        * _share(service, carriers[service.name])
+        for service in carried
+    )
+
+
+def egress_price(cloud: str) -> float:
+    """Return what a cloud charges for a GB that leaves it, in US dollars."""
+    return EGRESS_USD_PER_GB.get(cloud, UNKNOWN_EGRESS_USD_PER_GB)
+
+
+def _share(service: ServiceSpec, carriers: int) -> float:
+    """Return the fraction of requests that one of so many replicas answers."""
+    if service.hedging is HedgingMode.ALL:
+        return 1.0
+    copies = 1.0
+    if service.hedging is HedgingMode.ADAPTIVE:
+        copies += service.hedging_budget
+    return min(1.0, copies / carriers)

@@ -1,0 +1,288 @@
+"""Explain a plan: what was considered, what was chosen, and why everything else was not. Pure.
+
+The pool is planned by the planner itself, from nothing; then each offer that was not chosen
+is held against each that was, and the comparison that it lost last is told: an offer that
+lost by its price came nearer than one that lost by the spread.
+
+Owns: reasons, and the figures beside them.
+Not here: the decisions (`planner`) and how they are shown (`fogft.cli`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from fogft.model.groups import group_at, services_at
+from fogft.model.intent import Intent
+from fogft.model.replica import Observed, Offer, Placement
+from fogft.model.scoring import Scale
+from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.planning.availability import Assumption, Expected, expected
+from fogft.planning.buying import PlannedLaunch
+from fogft.planning.cost import Cost, cost
+from fogft.planning.listing import is_possible
+from fogft.planning.observed.backoff import AVOID_MEMORY_S, EVERYWHERE, avoided, resting
+from fogft.planning.observed.history import History
+from fogft.planning.placement import crowding, domains
+from fogft.planning.planner import plan
+from fogft.planning.sizing import size
+
+NO_POOL = "0" * 16
+
+
+@dataclass(frozen=True)
+class Considered:
+    """An offer, and what became of it.
+
+    Attributes:
+        slots: The replicas that got it; none for not chosen.
+        why_not: Why it was not chosen; empty when it was.
+        rtt_s: Round trip to its region in seconds; None for not known.
+        losses: Replicas of this pool lost there in the last hours.
+    """
+
+    offer: Offer
+    slots: tuple[int, ...]
+    why_not: str
+    rtt_s: float | None
+    losses: int
+
+
+@dataclass(frozen=True)
+class Replica:
+    """One that would be launched.
+
+    Attributes:
+        services: The names of what it carries.
+    """
+
+    slot: int
+    group: str
+    offer: Offer
+    services: tuple[str, ...]
+    rtt_s: float | None
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A plan that people can read.
+
+    Attributes:
+        wanted: Replicas wanted now.
+        cap: US dollars per hour; None for none.
+        assumed: What the availability rests on.
+        expected: Of each service, by the replicas that carry it.
+        cost: Of the planned replicas.
+        single: The cheapest on-demand machine that would do alone, and its cost; None where
+            no price is known.
+        notes: What may surprise.
+    """
+
+    considered: tuple[Considered, ...]
+    replicas: tuple[Replica, ...]
+    wanted: int
+    cap: float | None
+    assumed: Assumption
+    expected: Mapping[str, Expected]
+    target: float | None
+    cost: Cost
+    single: tuple[Offer, Cost] | None
+    notes: tuple[str, ...]
+
+    @property
+    def least_expected(self) -> Expected:
+        """Of the service that is expected to answer least often."""
+        return min(self.expected.values(), key=lambda one: one.correlated)
+
+    @property
+    def round_trips_s(self) -> list[float]:
+        """Round trips to the replicas where known, the shortest first."""
+        return sorted(r.rtt_s for r in self.replicas if r.rtt_s is not None)
+
+
+def explain(
+    spec: PoolSpec,
+    intent: Intent,
+    observed: Observed,
+    history: History,
+    on_demand: Sequence[Offer] = (),
+) -> Explanation:
+    """Plan a pool from nothing, and say why.
+
+    Args:
+        spec: The pool file.
+        intent: The user's wishes; exclusions count.
+        observed: Offers, distances and the time; machines and links are not looked at.
+        history: What happened to the pool before: losses and failures count.
+        on_demand: What one on-demand machine of this kind costs, for comparison.
+    """
+    world = replace(observed, machines=(), links=None, ending=frozenset())
+    intent = replace(intent, stopping=False)
+    planned = plan(NO_POOL, spec, intent, world, history)
+    sized = size(spec, intent, world)
+    scale = Scale(spec.placement.weights, observed.rtt_s)
+    reasons = _Reasons(
+        spec,
+        intent,
+        world,
+        history,
+        launches=planned.launches,
+        scale=scale,
+        cap=sized.max_usd_per_hour,
+    )
+    assumed = spec.availability.assumed if spec.availability else Assumption()
+    carried = [(launch.offer, services_at(spec, launch.slot)) for launch in planned.launches]
+    cheapest = min(
+        (o for o in on_demand if is_possible(o)),
+        key=lambda o: (o.usd_per_hour, o.placement),
+        default=None,
+    )
+    return Explanation(
+        considered=tuple(reasons.of(offer) for offer in observed.offers),
+        replicas=tuple(
+            Replica(
+                launch.slot,
+                launch.offer.group,
+                launch.offer,
+                tuple(service.name for service in services),
+                scale.latency(launch.offer.placement),
+            )
+            for launch, (_, services) in zip(planned.launches, carried, strict=True)
+        ),
+        wanted=planned.wanted,
+        cap=sized.max_usd_per_hour,
+        assumed=assumed,
+        expected={
+            service.name: expected([o.placement for o, has in carried if service in has], assumed)
+            for service in spec.services
+        },
+        target=spec.availability.target if spec.availability else None,
+        cost=cost(carried),
+        single=None if cheapest is None else (cheapest, _alone(cheapest, spec.services)),
+        notes=planned.notes,
+    )
+
+
+def _alone(offer: Offer, services: Sequence[ServiceSpec]) -> Cost:
+    return cost([(offer, services)])
+
+
+class _Reasons:
+    """Says of each offer why it was not chosen."""
+
+    def __init__(
+        self,
+        spec: PoolSpec,
+        intent: Intent,
+        observed: Observed,
+        history: History,
+        *,
+        launches: Sequence[PlannedLaunch],
+        scale: Scale,
+        cap: float | None,
+    ) -> None:
+        self._now = observed.now
+        self._intent = intent
+        self._losses: Mapping[str, list[float]] = history.losses
+        self._resting = resting(history, observed.now)
+        self._avoided = avoided(history, observed.now)
+        self._scale = scale
+        self._picks: dict[str, list[_Pick]] = {}
+        self._slots: dict[Offer, list[int]] = {}
+        taken: list[Placement] = []
+        spent = 0.0
+        for launch in launches:
+            group = group_at(spec, launch.slot)
+            pick = _Pick(launch, dict(crowding(taken)), None if cap is None else cap - spent)
+            self._picks.setdefault(group.offers, []).append(pick)
+            self._slots.setdefault(launch.offer, []).append(launch.slot)
+            taken.append(launch.offer.placement)
+            spent += launch.offer.usd_per_hour
+
+    def of(self, offer: Offer) -> Considered:
+        """Return an offer with what became of it."""
+        slots = tuple(self._slots.get(offer, ()))
+        location = offer.placement.location
+        recent = [t for t in self._losses.get(location, ()) if 0 <= self._now - t < AVOID_MEMORY_S]
+        why = "" if slots else self._why_not(offer)
+        rtt_s = self._scale.latency(offer.placement)
+        return Considered(offer, slots, why, rtt_s, len(recent))
+
+    def _why_not(self, offer: Offer) -> str:
+        location = offer.placement.location
+        if not is_possible(offer):
+            return f"its price, {offer.usd_per_hour:g}, cannot be"
+        if self._intent.is_excluded(location):
+            return "excluded by `fogft exclude`"
+        rest = self._resting.get(offer.placement.supply) or self._resting.get(EVERYWHERE)
+        if rest is not None:
+            return f"rests {rest.until - self._now:.0f} s more after {rest.failures} x {rest.cause}"
+        picks = self._picks.get(offer.group, [])
+        if not picks:
+            return "nothing of its kind is launched"
+        return max((self._lost_to(offer, pick) for pick in picks), key=lambda told: told[0])[1]
+
+    def _lost_to(self, offer: Offer, pick: _Pick) -> tuple[int, str]:
+        """Return how near an offer came to a chosen one (higher is nearer), and why it lost."""
+        chosen = pick.launch.offer
+        who = f"slot {pick.launch.slot}"
+        if offer.placement.spot != chosen.placement.spot:
+            mine, other = _kind(offer), _kind(chosen)
+            return 0, f"{mine}, where {who} is {other}"
+        if pick.budget is not None and offer.usd_per_hour > pick.budget + 1e-9:
+            return 1, f"over the cap: it leaves ${max(0.0, pick.budget):.3f}/h for {who}"
+        ours, theirs = self._rank(offer, pick), self._rank(chosen, pick)
+        if ours[0] > theirs[0]:
+            left_s = self._avoided[offer.placement.location] - self._now
+            return 2, f"avoided for {left_s / 60:.0f} min more: a replica was lost there"
+        for level, domain in enumerate(domains(offer.placement), 1):
+            if ours[level] > theirs[level]:
+                count = pick.count[domain]
+                return 2 + level, f"spread: `{domain}` has {count} already when {who} is placed"
+        return 6, f"{self._compared(offer, chosen)} ({who})"
+
+    def _rank(self, offer: Offer, pick: _Pick) -> tuple[int, ...]:
+        place = offer.placement
+        return (
+            int(place.location in self._avoided),
+            *(pick.count.get(domain, 0) for domain in domains(place)),
+        )
+
+    def _compared(self, offer: Offer, chosen: Offer) -> str:
+        ours, theirs = self._scale.latency(offer.placement), self._scale.latency(chosen.placement)
+        told = []
+        if offer.usd_per_hour != chosen.usd_per_hour:
+            word = "dearer" if offer.usd_per_hour > chosen.usd_per_hour else "cheaper"
+            told.append(f"{word}: ${offer.usd_per_hour:.3f}/h, not ${chosen.usd_per_hour:.3f}/h")
+        if ours != theirs:
+            word = "farther" if _far(ours) > _far(theirs) else "nearer"
+            told.append(f"{word}: {_ms(ours)}, not {_ms(theirs)}")
+        if not told:
+            return f"as good as `{chosen.placement.location}`, and later by name"
+        mixed = {one.split(":")[0] for one in told} & _BETTER
+        return (" but " if mixed else ", ").join(told)
+
+
+_BETTER = {"cheaper", "nearer"}
+
+
+@dataclass(frozen=True)
+class _Pick:
+    """A launch, and what stood when it was chosen."""
+
+    launch: PlannedLaunch
+    count: Mapping[str, int]
+    budget: float | None
+
+
+def _kind(offer: Offer) -> str:
+    return "spot" if offer.placement.spot else "on demand"
+
+
+def _far(rtt_s: float | None) -> float:
+    return float("inf") if rtt_s is None else rtt_s
+
+
+def _ms(rtt_s: float | None) -> str:
+    return "unknown" if rtt_s is None else f"{rtt_s * 1000:.0f} ms"

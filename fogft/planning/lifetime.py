@@ -1,0 +1,53 @@
+"""When a pool ends by itself, because its file says for how long it may run. Pure.
+
+Nothing is written when the time has come: every tick finds it out anew, so no manager can
+forget it, and a file with a larger `max_hours` gives more time to one that still runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fogft.model.intent import Intent
+from fogft.model.spec import PoolSpec
+from fogft.planning.observed.history import History
+
+HOUR_S = 3600.0
+SOON_S = 600.0
+
+
+def begun_at(intent: Intent, created_at: float, history: History) -> float:
+    """Return when a pool's hours began, as the clock that may have been set since tells it.
+
+    Args:
+        intent: Says whether its hours began anew after its creation.
+        created_at: When it was created.
+        history: Knows when the clock was set.
+    """
+    return history.by_clock(intent.began_at or created_at)
+
+
+def ends_at(spec: PoolSpec, begun_at: float) -> float | None:
+    """Return when a pool ends by itself, in seconds since the epoch; None for never."""
+    return None if spec.max_hours is None else begun_at + spec.max_hours * HOUR_S
+
+
+def is_over(spec: PoolSpec, begun_at: float, now: float) -> bool:
+    """Whether a pool's hours are used up."""
+    end = ends_at(spec, begun_at)
+    return end is not None and now >= end
+
+
+def revived(spec: PoolSpec, intent: Intent, begun_at: float, now: float) -> Intent:
+    """Return the intent with which an `up` goes on: hours that are used up begin anew."""
+    return replace(intent, began_at=now) if is_over(spec, begun_at, now) else intent
+
+
+def notes(spec: PoolSpec, begun_at: float, now: float) -> list[str]:
+    """Return what to say about the end: nothing, that it is near, or that it has come."""
+    end = ends_at(spec, begun_at)
+    if end is None or now < end - SOON_S:
+        return []
+    if now < end:
+        return [f"the pool ends by itself in {(end - now) / 60:.0f} min (`max_hours`)"]
+    return [f"its {spec.max_hours:g} hours (`max_hours`) are over: the pool ends by itself"]

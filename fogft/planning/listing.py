@@ -1,0 +1,168 @@
+"""Offers in the order in which they are preferred, worked out once for many plans. Pure.
+
+Thousands of offers take longer to sort than a whole plan takes, and they change with the prices,
+not with the plans. So the last tuple of offers keeps what was worked out of it, by question. The
+results are those of working it out each time; a test compares them.
+
+Owns: which offers can be bought at all, and their order.
+Not here: choosing among them (`placement`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from operator import itemgetter
+from typing import NamedTuple
+
+from fogft.model.replica import Offer, Placement, supply
+from fogft.model.scoring import Scale
+
+_WITHOUT_OFFER = itemgetter(slice(0, 7))
+
+
+class Row(NamedTuple):
+    """An offer with what its rank is made of, in the order that decides between equals.
+
+    Attributes:
+        supply: See `Placement.supply`.
+    """
+
+    score: float
+    usd_per_hour: float
+    cloud: str
+    region: str
+    location: str
+    instance: str
+    spot: bool
+    offer: Offer
+    supply: str
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Offers of one kind, the best score first.
+
+    Attributes:
+        trouble: Why there is no row; empty where there is one.
+    """
+
+    rows: tuple[Row, ...]
+    trouble: str = ""
+
+    @cached_property
+    def supplies(self) -> frozenset[str]:
+        """Of all rows."""
+        return frozenset(row.supply for row in self.rows)
+
+    @cached_property
+    def clouds(self) -> frozenset[str]:
+        """Of all rows."""
+        return frozenset(row.cloud for row in self.rows)
+
+
+class Catalogue:
+    """What one tuple of offers says, by question."""
+
+    def __init__(self, offers: Sequence[Offer]) -> None:
+        self.offers = offers
+        self._listings: dict[object, Listing] = {}
+
+    @cached_property
+    def prices(self) -> Mapping[Placement, float]:
+        """Placement -> US dollars per hour."""
+        return {offer.placement: offer.usd_per_hour for offer in self.offers}
+
+    @cached_property
+    def cheapest(self) -> Mapping[Placement, float]:
+        """Placement -> the least that is asked for it, of whichever group."""
+        out: dict[Placement, float] = {}
+        for offer in self.offers:
+            out[offer.placement] = min(offer.usd_per_hour, out.get(offer.placement, math.inf))
+        return out
+
+    @cached_property
+    def impossible(self) -> str:
+        """The location of an offer whose price cannot be; empty for none."""
+        wrong = (o.placement.location for o in self.offers if not is_possible(o))
+        return next(wrong, "")
+
+    def listing(
+        self, group: str | None, spot: bool | None, excluded: Collection[str], scale: Scale
+    ) -> Listing:
+        """Return the offers for a group, in order.
+
+        Args:
+            group: Its name; None for all offers.
+            spot: Of one kind only unless None.
+            excluded: Locations that the user ruled out.
+            scale: How price and distance are weighed.
+        """
+        far = tuple(sorted(scale.rtt_s.items()))
+        key = group, spot, frozenset(excluded), scale.weights, far
+        if key not in self._listings:
+            mine = [
+                o
+                for o in self.offers
+                if (group is None or o.group == group) and spot in (None, o.placement.spot)
+            ]
+            self._listings[key] = _listing(mine, excluded, scale)
+        return self._listings[key]
+
+
+_latest = Catalogue(())
+
+
+def catalogue(offers: Sequence[Offer]) -> Catalogue:
+    """Return the catalogue of some offers: the one made last where it is of this very tuple."""
+    global _latest  # noqa: PLW0603 - a memory of one pure result; see the module's header
+    if _latest.offers is not offers or not isinstance(offers, tuple):
+        _latest = Catalogue(offers)
+    return _latest
+
+
+def is_possible(offer: Offer) -> bool:
+    """Whether an offer's price can be true: a finite number, not below zero."""
+    return math.isfinite(offer.usd_per_hour) and offer.usd_per_hour >= 0
+
+
+def _listing(offers: Sequence[Offer], excluded: Collection[str], scale: Scale) -> Listing:
+    if not offers:
+        return Listing((), "nothing is offered for these resources now")
+    possible = [o for o in offers if is_possible(o)]
+    if not possible:
+        return Listing((), "every offer has an impossible price")
+    allowed = possible
+    if excluded:
+        allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
+    if not allowed:
+        return Listing((), "every offered location is excluded")
+    return Listing(tuple(sorted(_rows(allowed, scale), key=_WITHOUT_OFFER)))
+
+
+def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:
+    """Yield the rows of offers. There may be thousands: what is equal is worked out once."""
+    regions: dict[tuple[str, str], tuple[str, float]] = {}
+    for offer in offers:
+        place = offer.placement
+        key = (place.cloud, place.region)
+        if key not in regions:
+            regions[key] = (
+                f"{place.cloud}/{place.region}",
+                scale.of_distance(scale.latency(place)),
+            )
+        region, far = regions[key]
+        location = f"{region}/{place.zone}"
+        yield Row(
+            scale.of_price(offer.usd_per_hour) + far,
+            offer.usd_per_hour,
+            place.cloud,
+            region,
+            location,
+            place.instance,
+            place.spot,
+            offer,
+            location if place.spot else supply(location, on_demand=True),
+        )

@@ -1,0 +1,268 @@
+"""How long a location is left alone after it disappointed. Pure.
+
+A location sells spot machines and on-demand ones. Either supply may run short while the other
+does not, so each rests by itself. Failures are refused launches (no capacity, no quota),
+launches that failed, and replicas that died young. After n failures in a row a location rests for
+
+    min(BASE_S * 2 ** (n - 1), LIMIT_S)
+
+seconds from the last one. A replica that becomes ready there, or FORGIVE_S without a
+failure, wipes the slate clean. A failed `setup` is the pool file's fault, not the
+location's: it is counted against `EVERYWHERE`, so a broken file does not tour the world
+at the user's expense.
+
+A location where a replica was lost unasked is not at rest, but it is avoided: used only when
+no other is left, for
+
+    min(AVOID_S * 2 ** (n - 1), AVOID_LIMIT_S)
+
+seconds after the last of n losses within AVOID_MEMORY_S.
+
+When every location rests, waiting helps nobody: then the one that was left alone for longest is
+tried, one try in EAGER_S. And a replica that could move, but need not, asks no location that
+refused within FORGIVE_S and has not proved itself since. Events from the future, which a clock
+that jumped back leaves behind, count for nothing.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
+from typing import NamedTuple
+
+from fogft.planning.observed.expiring import Lasting
+from fogft.planning.observed.history import Failure, History
+
+BASE_S = 5.0
+LIMIT_S = 600.0
+FORGIVE_S = 3600.0
+EVERYWHERE = "*"
+NEVER = float("inf")
+EAGER_S = 60.0
+AVOID_S = 300.0
+AVOID_LIMIT_S = 3600.0
+AVOID_MEMORY_S = 4 * 3600.0
+_AT = itemgetter(0)
+
+
+class Backoff(NamedTuple):
+    """A location at rest.
+
+    Attributes:
+        since: Of the last failure, in seconds since the epoch.
+        until: From then on it may be tried again.
+        failures: How many in a row.
+        cause: Of the last one: ``capacity``, ``quota``, ``setup``, ...
+    """
+
+    until: float
+    failures: int
+    cause: str
+    since: float = 0.0
+
+
+class _Outlook(NamedTuple):
+    """What a supply's failures and proofs say of it.
+
+    Attributes:
+        rest: Whatever was the pool file's fault is left out.
+        rest_changes: When it ends or gets shorter; infinity where there is none.
+        setup: The failures that are the pool file's fault, those of late among them.
+        disappointment: It has failed of late, and not proved itself since.
+    """
+
+    rest: Backoff | None
+    rest_changes: float
+    setup: Sequence[Failure]
+    disappointment: Backoff | None
+
+
+class _Supplies(NamedTuple):
+    """The outlooks of all supplies together."""
+
+    resting: Mapping[str, Backoff]
+    rests_change: float
+    setup: Sequence[Failure]
+    disappointing: Mapping[str, Backoff]
+
+
+def resting(history: History, now: float) -> Mapping[str, Backoff]:
+    """Return the supplies (`Placement.supply`) that must not be tried now, with the reason.
+
+    The key `EVERYWHERE` means that nothing may be launched at all.
+    """
+    supplies = history.of_supplies(_outlook, _summed_up, now)
+    everywhere = _everywhere(history, supplies.setup, now) if supplies.setup else None
+    return supplies.resting if everywhere is None else {**supplies.resting, EVERYWHERE: everywhere}
+
+
+def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
+    """Return the supplies that failed within FORGIVE_S and have not proved themselves since.
+
+    Only the last failure is told.
+    """
+    return history.of_supplies(_outlook, _summed_up, now).disappointing
+
+
+def _outlook(history: History, supply: str, now: float) -> Lasting[_Outlook | None]:
+    lately, until = _lately(history.failures[supply], now)
+    if not lately:
+        return Lasting(None, until)
+    proven_at = history.proven_at(supply)
+    bad = lately if lately[0].at > proven_at else [f for f in lately if f.at > proven_at]
+    setup = [f for f in lately if f.cause == "setup"]
+    rest = _backoff([f for f in bad if f.cause != "setup"] if setup else bad, now)
+    rest_changes = NEVER if rest is None else min([rest.until, *_shortened(lately, rest)])
+    disappointment = None
+    if bad:
+        last = bad[-1]
+        disappointment = Backoff(last.at + FORGIVE_S, 1, last.cause, since=last.at)
+    if history.failures[supply][-1].at <= now:  # to forgive the others changes a rest at most
+        until = lately[-1].at + FORGIVE_S
+    until = min(until, rest_changes)
+    return Lasting(_Outlook(rest, rest_changes, setup, disappointment), until)
+
+
+def _summed_up(outlooks: Mapping[str, _Outlook]) -> _Supplies:
+    resting, disappointing = {}, {}
+    setup: list[Failure] = []
+    change = NEVER
+    for supply, one in outlooks.items():
+        if one.rest is not None:
+            resting[supply] = one.rest
+            change = min(change, one.rest_changes)
+        if one.disappointment is not None:
+            disappointing[supply] = one.disappointment
+        setup += one.setup
+    return _Supplies(resting, change, setup, disappointing)
+
+
+def _everywhere(history: History, setup: Sequence[Failure], now: float) -> Backoff | None:
+    proven_at = max(history.proven_at(place) for place in history.failures)
+    return backoff([f for f in setup if f.at > proven_at], now)
+
+
+def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | None:
+    """Return the supply to try although it rests, as all do; None to wait.
+
+    Only what had no room is tried: a full account or a launch that fails does not get better by it.
+    """
+    known = list(resting)
+    if any(now - rest.since < EAGER_S for _, rest in known):
+        return None
+    full = [(rest.since, supply) for supply, rest in known if rest.cause == "capacity"]
+    return min(full, default=(0.0, None))[1]
+
+
+def _lately(failures: Sequence[Failure], now: float) -> tuple[Sequence[Failure], float]:
+    """Return those that still count, of failures in order of time, and until when it is those."""
+    if not failures or failures[-1].at <= now - FORGIVE_S:
+        return (), NEVER
+    first = end = len(failures)
+    until = NEVER
+    while end and failures[end - 1].at > now:
+        end -= 1
+        until = failures[end].at
+    while first and failures[first - 1].at > now - FORGIVE_S:
+        first -= 1
+    if first < end:
+        until = min(until, failures[first].at + FORGIVE_S)
+    return failures[first:end], until
+
+
+def backoff(failures: list[Failure], now: float) -> Backoff | None:
+    """Return the rest that a run of failures earns, or None when it is over."""
+    return _backoff(sorted([f for f in failures if 0 <= now - f.at < FORGIVE_S], key=_AT), now)
+
+
+def _backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
+    """Return the rest that failures earn, of which none is forgiven, in order of time."""
+    if not recent:
+        return None
+    last = recent[-1]
+    # Waiting a little does not help where the account is full.
+    until = last.at + (LIMIT_S if last.cause == "quota" else rest_s(len(recent)))
+    return None if now >= until else Backoff(until, len(recent), last.cause, since=last.at)
+
+
+def rest_s(failures: int) -> float:
+    """Return how long so many failures in a row make a location rest, in seconds."""
+    return min(BASE_S * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
+
+
+class _Avoidance(NamedTuple):
+    """Until when a location is avoided, and when that may change, at the latest then."""
+
+    until: float
+    changes: float
+
+
+class _Avoided(NamedTuple):
+    """All locations that are avoided."""
+
+    until: Mapping[str, float]
+    change: float
+
+
+def avoided(history: History, now: float) -> Mapping[str, float]:
+    """Return the locations to use only when no other is left, and until when."""
+    return history.of_losses(_avoidance, _all_avoided, now).until
+
+
+def _avoidance(history: History, location: str, now: float) -> Lasting[_Avoidance | None]:
+    losses = history.losses[location]
+    first = bisect_right(losses, now - AVOID_MEMORY_S)
+    end = bisect_right(losses, now, lo=first)
+    holds = losses[end] if end < len(losses) else NEVER
+    if first == end:
+        return Lasting(None, holds)
+    until = losses[end - 1] + min(AVOID_S * 2.0 ** min(end - first - 1, 16), AVOID_LIMIT_S)
+    forgotten = losses[first] + AVOID_MEMORY_S
+    holds = min(holds, forgotten)
+    if until <= now:
+        return Lasting(None, holds)
+    return Lasting(_Avoidance(until, min(until, forgotten)), min(holds, until))
+
+
+def _all_avoided(locations: Mapping[str, _Avoidance]) -> _Avoided:
+    change = min([one.changes for one in locations.values()], default=NEVER)
+    return _Avoided({location: one.until for location, one in locations.items()}, change)
+
+
+def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:
+    """Return when, if nothing happens, another location may be chosen; infinity for never.
+
+    Args:
+        waits: For the end of a rest; see `Plan`.
+        restless: Somebody could be better off elsewhere.
+    """
+    supplies = history.of_supplies(_outlook, _summed_up, now)
+    times: list[float] = []
+    if supplies.setup:
+        times += _everywhere_changes(history, supplies.setup, now)
+    if waits:
+        rests = resting(history, now)
+        last = max([rest.since for rest in rests.values()], default=-NEVER)
+        times += [supplies.rests_change, last + EAGER_S]
+    if restless:
+        times += [rest.until for rest in supplies.disappointing.values()]
+    if waits or restless:  # a stand-in does not return to where one was just lost
+        times.append(history.of_losses(_avoidance, _all_avoided, now).change)
+    return min([at for at in times if at > now], default=NEVER)
+
+
+def _everywhere_changes(history: History, setup: Sequence[Failure], now: float) -> Sequence[float]:
+    rest = _everywhere(history, setup, now)
+    if rest is None:
+        return ()
+    lately = [f for failures in history.failures.values() for f in _lately(failures, now)[0]]
+    return (rest.until, *_shortened(lately, rest))
+
+
+def _shortened(lately: Iterable[Failure], rest: Backoff) -> Sequence[float]:
+    """Return when failures are forgiven by which a rest may end early."""
+    forgiven = [f.at + FORGIVE_S for f in lately if f.at + FORGIVE_S < rest.until]
+    if rest_s(rest.failures - len(forgiven)) < rest.until - rest.since:
+        return forgiven
+    return ()

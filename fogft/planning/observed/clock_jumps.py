@@ -1,0 +1,91 @@
+"""Tell when the clock on the wall was set, and when the machine slept. Pure: readings come in.
+
+All that is remembered bears the time of the clock on the wall, for that outlives a process and a
+reboot. When somebody sets it, a launch under way would look late, a rest over, a stay long
+enough. So two steady clocks are read beside it: one that stands still while the machine sleeps,
+and one that does not. What the wall clock gained on the first is no time in which anybody looked:
+all that is remembered moves along with it (`history`), so that durations stay what they were.
+
+Owns: how far the clock was moved, and for how long the time of day is in doubt.
+Not here: reading clocks (`fogft.pool.manager.clocks`), moving what is remembered (`history`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+# Less is not worth a word: what a clock that is slewed gains between two looks, and a slow reading.
+LEAST_S = 5.0
+# A clock that was set is often set again at once. Until it has stood so long, nothing is launched
+# or ended because of the time of day.
+DOUBT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Three clocks at one moment, in seconds.
+
+    Attributes:
+        wall_s: Since the epoch; may be set.
+        awake_s: Steady, and stands still while the machine sleeps.
+        steady_s: Steady, and goes on meanwhile.
+    """
+
+    wall_s: float
+    awake_s: float
+    steady_s: float
+
+
+@dataclass(frozen=True)
+class Jump:
+    """What the clock on the wall gained between two looks, beyond the time that passed.
+
+    Attributes:
+        set_s: By so much it was set: forward above 0, back below.
+        slept_s: The machine slept for so long.
+    """
+
+    set_s: float = 0.0
+    slept_s: float = 0.0
+
+    @property
+    def told(self) -> str:
+        """What happened, in words."""
+        parts = []
+        if self.set_s:
+            where = "forward" if self.set_s > 0 else "back"
+            parts.append(f"the clock was set {where} by {abs(self.set_s):.0f} s")
+        if self.slept_s:
+            parts.append(f"this machine slept for {self.slept_s:.0f} s")
+        return " and ".join(parts)
+
+
+class Watch:
+    """Compares the readings of one process. Call `look` at every tick."""
+
+    def __init__(self) -> None:
+        self._last: Reading | None = None
+        self._set: deque[tuple[float, float]] = deque()  # when, and by how much
+
+    def look(self, reading: Reading) -> Jump | None:
+        """Return the jump since the last look, if there was one."""
+        last, self._last = self._last, reading
+        if last is None:
+            return None
+        awake_s = reading.awake_s - last.awake_s
+        slept_s = max(reading.steady_s - last.steady_s - awake_s, 0.0)
+        set_s = reading.wall_s - last.wall_s - awake_s - slept_s
+        jump = Jump(set_s if abs(set_s) >= LEAST_S else 0.0, slept_s if slept_s >= LEAST_S else 0.0)
+        if jump.set_s:
+            self._set.append((reading.awake_s, jump.set_s))
+        return jump if jump.set_s or jump.slept_s else None
+
+    @property
+    def doubt_s(self) -> float:
+        """By how much the clock was set within the last minute: schedules go without it so long."""
+        while self._last is not None and self._set:
+            if self._last.awake_s - self._set[0][0] < DOUBT_S:
+                break
+            self._set.popleft()
+        return sum([set_s for _, set_s in self._set], 0.0) if self._set else 0.0

@@ -1,0 +1,244 @@
+"""Judge every replica from what the cloud and the links say. Pure.
+
+The cloud says whether a machine exists; the links say whether it answers. Neither alone
+replaces anything: a machine that the cloud lists and that is silent may be behind a dead
+uplink, so silence counts only while another replica answers.
+
+Owns: each replica's phase and verdict, and the suspicion against the robot's own uplink.
+Not here: what to do about it (`planner`).
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+from fogft.model.groups import ready_at, replica_hash
+from fogft.model.replica import (
+    LinkReport,
+    LinkState,
+    Machine,
+    MachinePhase,
+    Observed,
+    Phase,
+    ReplicaId,
+    by_id,
+)
+from fogft.model.spec import HealthSpec, PoolSpec
+from fogft.planning.observed.history import History, Record
+
+# A single replica's silence looks like a dead uplink. When the cloud still answers after this
+# many times `replace_after_s`, the uplink is fine and the replica is not.
+LONE_SILENCE_FACTOR = 4.0
+# A cloud may recommend to move what has just been moved. A hint costs one launch in this time.
+HINT_PAUSE_S = 600.0
+
+
+class Verdict(str, Enum):
+    """What a replica is good for."""
+
+    GOOD = "good"  # serves, will serve, or nothing can be said against it
+    FAILED = "failed"  # its launch has failed, or took longer than `start_limit_s`
+    LEAVING = "leaving"  # a preemption notice was given, or it asked to be left alone
+    UNRESPONSIVE = "unresponsive"  # silent past `replace_after_s` while another answers
+    AT_RISK = "at risk"  # serves, and its cloud recommends to move it
+    DISAGREES = "disagrees"  # its answers differ from those of a quorum, repeatedly
+    STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
+
+
+# Looking up a member of an Enum takes as long as all else that is asked of a healthy replica.
+_UP, _CONNECTING = LinkState.UP, LinkState.CONNECTING
+_RUNNING, _READY, _GOOD = MachinePhase.RUNNING, Phase.READY, Verdict.GOOD
+
+
+class Judged(NamedTuple):
+    """One of our machines with all that is known of it.
+
+    Attributes:
+        record: What is remembered of it; None for nothing.
+        serving: Its link is up and its services are ready: ending it would be felt.
+        may_serve: It served once and nothing proves that it does not serve now.
+        why: The verdict's reason in words; empty when good.
+    """
+
+    machine: Machine
+    link: LinkReport | None
+    record: Record | None
+    phase: Phase
+    verdict: Verdict
+    serving: bool
+    may_serve: bool
+    why: str = ""
+
+    @property
+    def id(self) -> ReplicaId:
+        """The replica."""
+        return self.machine.id
+
+
+class Health(NamedTuple):
+    """The whole pool, judged; ordered by replica.
+
+    Attributes:
+        uplink_suspected: All links that once answered are silent together.
+        links_known: There is a fresh report; without one nobody is doubted.
+    """
+
+    replicas: tuple[Judged, ...]
+    uplink_suspected: bool
+    links_known: bool
+
+    @property
+    def running(self) -> int:
+        """How many have not failed."""
+        return sum(judged.verdict is not Verdict.FAILED for judged in self.replicas)
+
+
+def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
+    """Judge what is observed. Machines of other pools are left out."""
+    links = {report.id: report for report in observed.links or ()}
+    ours, heard = [], []
+    for machine in sorted(observed.machines or (), key=by_id):
+        id = machine.id
+        if id.pool_uid != pool_uid:
+            continue
+        link, record = links.get(id), history.record(id.slot, id.generation)
+        serving = link is not None and is_ready(spec, machine, link)
+        ours.append((machine, link, record, serving))
+        if link is None or machine.phase is not _RUNNING or id in observed.ending:
+            continue
+        if was_heard(link, record):
+            heard.append(link)
+    answering = _UP in [link.state for link in heard]
+    alone = len(heard) == 1
+    patience_s = spec.health.replace_after_s * (LONE_SILENCE_FACTOR if alone else 1.0)
+    uplink_suspected = bool(heard) and not answering
+    if alone and heard[0].silent_for_s > patience_s:
+        uplink_suspected = False
+    may_doubt = observed.links is not None and not uplink_suspected
+    ready_somewhere = any(serving and not machine.notice for machine, _, _, serving in ours)
+    context = _Context(spec.health, observed.now, patience_s, may_doubt, ready_somewhere)
+    replicas = tuple([_judge_one(context, *one) for one in ours])
+    return Health(replicas, uplink_suspected, links_known=observed.links is not None)
+
+
+def was_heard(link: LinkReport, record: Record | None) -> bool:
+    """Whether this replica ever answered: by its link, or by an earlier proxy's report."""
+    if link.state is not _CONNECTING:
+        return True
+    ever_ready = record is not None and record.first_ready_at is not None
+    return ever_ready and link.silent_for_s > 0
+
+
+def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
+    """Whether a replica answers all that it was launched for.
+
+    An outdated one was launched for other services, so answering any counts.
+    """
+    if link is None or link.state is not _UP or machine.phase is not _RUNNING:
+        return False
+    if machine.spec_hash != replica_hash(spec, machine.id.slot):
+        return bool(link.ready)
+    wanted = ready_at(spec, machine.id.slot)
+    return bool(wanted) and wanted <= link.ready
+
+
+class _Context(NamedTuple):
+    rules: HealthSpec
+    now: float
+    patience_s: float
+    may_doubt: bool
+    ready_somewhere: bool
+
+
+def _judge_one(
+    context: _Context,
+    machine: Machine,
+    link: LinkReport | None,
+    record: Record | None,
+    serving: bool,
+) -> Judged:
+    if serving and _is_well(machine, link):  # as nearly all are
+        return Judged(machine, link, record, _READY, _GOOD, True, True)
+    verdict, why = _verdict(context, machine, link, record, serving)
+    may_serve = serving
+    if not serving and record is not None and record.first_ready_at is not None:
+        answers = link is not None and link.state is _UP
+        may_serve = not answers and verdict not in (Verdict.UNRESPONSIVE, Verdict.FAILED)
+    phase = _phase(machine, verdict, serving)
+    return Judged(machine, link, record, phase, verdict, serving, may_serve, why)
+
+
+def _is_well(machine: Machine, link: LinkReport | None) -> bool:
+    """Whether nobody says a word against one that serves."""
+    if machine.notice or link is None:
+        return False
+    return not (link.draining or link.disagrees or link.at_risk)
+
+
+def _phase(machine: Machine, verdict: Verdict, serving: bool) -> Phase:
+    if verdict is Verdict.FAILED:
+        return Phase.GONE
+    if machine.phase is MachinePhase.PROVISIONING:
+        return Phase.PROVISIONING
+    if verdict is Verdict.LEAVING:
+        return Phase.DRAINING
+    return Phase.READY if serving else Phase.STARTING
+
+
+def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than nesting
+    context: _Context,
+    machine: Machine,
+    link: LinkReport | None,
+    record: Record | None,
+    serving: bool,
+) -> tuple[Verdict, str]:
+    health, now = context.rules, context.now
+    if machine.phase is MachinePhase.FAILED:
+        return Verdict.FAILED, machine.failure or "error"
+    if machine.notice:
+        return Verdict.LEAVING, "preemption notice"
+    if machine.phase is MachinePhase.PROVISIONING:
+        if now - _accepted_at(machine, record, now) > health.start_limit_s:
+            return Verdict.FAILED, f"timeout: not running after {health.start_limit_s:.0f} s"
+        return Verdict.GOOD, ""
+    # A mark of our own comes back in the report: it is not the replica's wish.
+    if link is not None and link.draining and not (record and record.draining_since):
+        return Verdict.LEAVING, "it asked to be left alone"
+    silent = link is not None and was_heard(link, record) and link.state is not LinkState.UP
+    if link is not None and silent and context.may_doubt and link.silent_for_s > context.patience_s:
+        return Verdict.UNRESPONSIVE, f"silent for {link.silent_for_s:.0f} s"
+    if link is not None and link.disagrees and context.may_doubt:
+        return Verdict.DISAGREES, "its answers differ from those of the others"
+    if serving and link is not None and link.at_risk and _has_settled(record, now):
+        return Verdict.AT_RISK, "the cloud recommends to move it (rebalance)"
+    if serving or not context.may_doubt:
+        return Verdict.GOOD, ""
+    if silent:
+        return Verdict.GOOD, ""
+    if record is None or record.first_ready_at is None:
+        since = machine.launched_at if record is None else record.launched_at
+        if now - since > health.start_limit_s:
+            return Verdict.FAILED, f"timeout: not ready after {health.start_limit_s:.0f} s"
+        return Verdict.GOOD, ""
+    away_s = now - record.unready_since if record.unready_since is not None else 0.0
+    if away_s > health.start_limit_s and context.ready_somewhere:
+        return Verdict.STUCK, f"its service has been away for {away_s:.0f} s"
+    return Verdict.GOOD, ""
+
+
+def _accepted_at(machine: Machine, record: Record | None, now: float) -> float:
+    """Return since when a launch is under way.
+
+    The cloud's word does not move along when our clock is set, and what is remembered does.
+    """
+    if record is None:
+        return machine.launched_at
+    if machine.launched_at > now:
+        return record.launched_at
+    return max(machine.launched_at, record.launched_at)
+
+
+def _has_settled(record: Record | None, now: float) -> bool:
+    ready_at = record.first_ready_at if record is not None else None
+    return ready_at is not None and now - ready_at >= HINT_PAUSE_S

@@ -1,0 +1,410 @@
+"""What happened to each replica, as a list of events, and what follows from it.
+
+The cloud's list says what is; history says what was: which generations are used up,
+who was ever ready, which locations failed, and since when a replica drains. It is
+the only memory that must outlive a crash of the manager. Pure: events in, facts out.
+
+Owns: the events and the facts derived from them.
+Not here: the file they are stored in (`fogft.pool.folder.store`) and what to make of failures
+(`quarantine`).
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+from operator import itemgetter
+from typing import Any, NamedTuple, TypeVar
+
+from fogft.errors import StateError
+from fogft.model.replica import supply
+from fogft.planning.observed.expiring import Digest, Lasting, outdate
+
+T = TypeVar("T")
+S = TypeVar("S")
+_AT = itemgetter(0)
+
+
+class EventKind(str, Enum):
+    """What can happen to a replica."""
+
+    LAUNCH = "launch"  # written before the cloud is asked: the generation is used from here on
+    REFUSED = "refused"  # the cloud said no: capacity, quota or an error
+    READY = "ready"  # its services answer
+    UNREADY = "unready"  # they no longer do
+    DRAINING = "draining"  # marked to go
+    UNDRAINED = "undrained"  # the mark was taken back
+    FAILED = "failed"  # its launch has failed
+    ENDING = "ending"  # written before the cloud is asked to end it
+    ENDED = "ended"  # gone, as asked
+    GONE = "gone"  # gone, unasked: preempted, crashed or ended by someone else
+    CLOCK = "clock"  # of no replica: the clock on the wall was set
+    SLEPT = "slept"  # of no replica: the manager's machine slept
+
+
+MOVING = frozenset({EventKind.CLOCK, EventKind.SLEPT})
+CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
+_ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
+
+
+class Event(NamedTuple):
+    """One thing that happened.
+
+    Attributes:
+        at: Seconds since the epoch.
+        location: Where (``cloud/region/zone``); empty in events after the launch.
+        on_demand: Of a launch: not bought on the spot market.
+        detail: Why, in words. For REFUSED and FAILED the first word is the cause:
+            ``capacity``, ``quota``, ``setup``, ``timeout`` or ``error``.
+        by_s: Of CLOCK and SLEPT: so much later is all that was remembered before.
+    """
+
+    at: float
+    kind: EventKind
+    slot: int
+    generation: int
+    location: str = ""
+    detail: str = ""
+    on_demand: bool = False
+    by_s: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the event as a JSON object."""
+        out: dict[str, Any] = {
+            "at": self.at,
+            "event": self.kind.value,
+            "slot": self.slot,
+            "generation": self.generation,
+        }
+        if self.location:
+            out["location"] = self.location
+        if self.detail:
+            out["detail"] = self.detail
+        if self.on_demand:
+            out["on_demand"] = True
+        if self.by_s:
+            out["by_s"] = self.by_s
+        return out
+
+    @classmethod
+    def from_json(cls, value: Any) -> Event:
+        """Read one event back.
+
+        Raises:
+            StateError: It is not an event.
+        """
+        try:
+            return cls(
+                at=float(value["at"]),
+                kind=EventKind(value["event"]),
+                slot=int(value["slot"]),
+                generation=int(value["generation"]),
+                location=str(value.get("location", "")),
+                detail=str(value.get("detail", "")),
+                on_demand=bool(value.get("on_demand", False)),
+                by_s=float(value.get("by_s", 0.0)),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise StateError(f"not an event: `{value!r:.120}`") from error
+
+
+@dataclass
+class Record:
+    """What the events say of one launch. Times in seconds since the epoch; None for never."""
+
+    slot: int
+    generation: int
+    launched_at: float
+    location: str = ""
+    first_ready_at: float | None = None
+    unready_since: float | None = None
+    draining_since: float | None = None
+    failed: bool = False
+    ending: bool = False
+    closed: EventKind | None = None
+    closed_at: float = 0.0
+    on_demand: bool = False
+
+    def move(self, by_s: float) -> None:
+        """Let all of it be later."""
+        self.launched_at += by_s
+        self.closed_at += by_s
+        if self.first_ready_at is not None:
+            self.first_ready_at += by_s
+        if self.unready_since is not None:
+            self.unready_since += by_s
+        if self.draining_since is not None:
+            self.draining_since += by_s
+
+    @property
+    def supply(self) -> str:
+        """What it was bought from; see `Placement.supply`."""
+        return supply(self.location, on_demand=self.on_demand)
+
+
+class Failure(NamedTuple):
+    """A location disappointed: it refused, a launch failed there, or a replica died young."""
+
+    at: float
+    cause: str
+
+
+class History:
+    """Events folded into facts. `add` is the only change; planner and placement only read."""
+
+    def __init__(self, events: Iterable[Event] = ()) -> None:
+        self._records: dict[tuple[int, int], Record] = {}
+        self._open: dict[tuple[int, int], Record] = {}
+        self._generations: dict[int, int] = {}
+        self._served: dict[int, int] = {}  # slot -> the highest generation that was ever ready
+        self._failures: dict[str, list[Failure]] = {}
+        self._proven_at: dict[str, float] = {}
+        self._losses: dict[str, list[float]] = {}
+        self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
+        self.version = 0  # of all facts: counts events
+        # What follows from failures and proofs of each supply, and from losses at each location.
+        self._of_supplies: dict[Callable[..., Any], Digest[Any, Any]] = {}
+        self._of_losses: dict[Callable[..., Any], Digest[Any, Any]] = {}
+        for event in events:
+            self.add(event)
+
+    def add(self, event: Event) -> None:
+        """Take one more event into account. Events come in the order they happened."""
+        self.version += 1
+        if event.kind in MOVING:
+            self._move(event)
+            return
+        key = (event.slot, event.generation)
+        if event.generation > self._generations.get(event.slot, -1):
+            self._generations[event.slot] = event.generation
+        record = self._records.get(key)
+        if record is None:
+            record = Record(event.slot, event.generation, event.at, event.location)
+            record.on_demand = event.on_demand
+            self._records[key] = record
+        if event.kind is EventKind.LAUNCH:  # a second one: it was thought gone, and is listed
+            record.closed, record.ending = None, False
+        else:
+            self._update(record, event)
+        if record.closed is None:
+            self._open[key] = record
+        else:
+            self._open.pop(key, None)
+
+    def _move(self, event: Event) -> None:
+        """Let all that is remembered be later, so that durations stay what they were."""
+        by_s = event.by_s
+        if event.kind is EventKind.CLOCK:
+            self._set.append((event.at - by_s, by_s))
+        for record in self._records.values():
+            record.move(by_s)
+        self._failures = {
+            supply: [Failure(f.at + by_s, f.cause) for f in failures]
+            for supply, failures in self._failures.items()
+        }
+        self._losses = {p: [at + by_s for at in losses] for p, losses in self._losses.items()}
+        self._proven_at = {supply: at + by_s for supply, at in self._proven_at.items()}
+        self._of_supplies, self._of_losses = {}, {}
+
+    def by_clock(self, instant: float) -> float:
+        """Return a time that was written down as the clock tells it now, if it was set since."""
+        for old, by_s in self._set:
+            instant += by_s if instant <= old else 0.0
+        return instant
+
+    def followed_by(self, events: Iterable[Event]) -> History:
+        """Return this history with launches and marks added; it stays as it is itself."""
+        later = History()
+        later._records, later._open = dict(self._records), dict(self._open)
+        later._generations = dict(self._generations)
+        # Launches and marks change none of these.
+        later._failures, later._proven_at = self._failures, self._proven_at
+        later._losses, later._served = self._losses, self._served
+        later._of_supplies, later._of_losses = self._of_supplies, self._of_losses
+        for event in events:
+            if event.kind not in _ORDERS:
+                raise ValueError(f"`{event.kind.value}` is none of our own orders")
+            key = (event.slot, event.generation)
+            if key in later._records:
+                later._records[key] = replace(later._records[key])
+            later.add(event)
+        return later
+
+    def _update(self, record: Record, event: Event) -> None:
+        kind = event.kind
+        if kind in CLOSING:
+            self._close(record, event)
+        elif kind is EventKind.READY:
+            if record.first_ready_at is None:
+                record.first_ready_at = event.at
+            record.unready_since = None
+            if record.generation > self._served.get(record.slot, 0):
+                self._served[record.slot] = record.generation
+            self._proven_at[record.supply] = event.at
+            if self._failures and record.supply in self._failures:
+                outdate(self._of_supplies, record.supply)
+        elif kind is EventKind.UNREADY:
+            record.unready_since = event.at
+        elif kind is EventKind.DRAINING:
+            record.draining_since = event.at
+        elif kind is EventKind.UNDRAINED:
+            record.draining_since = None
+        elif kind is EventKind.ENDING:
+            record.ending = True
+        elif kind is EventKind.FAILED:
+            record.failed = True
+            self._fail(record, event)
+
+    def _close(self, record: Record, event: Event) -> None:
+        kind = event.kind
+        if kind is EventKind.REFUSED:
+            self._fail(record, event)
+        elif kind is EventKind.GONE:
+            if died_young(record, event):
+                self._fail(record, event)
+            insort(self._losses.setdefault(record.location, []), event.at)
+            outdate(self._of_losses, record.location)
+        record.closed = kind
+        record.closed_at = event.at
+
+    def _fail(self, record: Record, event: Event) -> None:
+        supply = record.supply
+        outdate(self._of_supplies, supply)
+        cause = event.detail.split(":")[0].split(" ")[0] or "error"
+        insort(self._failures.setdefault(supply, []), Failure(event.at, cause), key=_AT)
+
+    def record(self, slot: int, generation: int) -> Record | None:
+        """Return what is known of a launch."""
+        return self._records.get((slot, generation))
+
+    def open(self) -> list[Record]:
+        """Return the launches that have not ended, as far as was seen."""
+        return list(self._open.values())
+
+    @property
+    def locations(self) -> frozenset[str]:
+        """Every location that anything was launched in."""
+        return frozenset(record.location for record in self._records.values())
+
+    def generation(self, slot: int) -> int:
+        """Return the highest generation ever used in a slot; 0 for none."""
+        return self._generations.get(slot, 0)
+
+    def served(self, slot: int) -> int:
+        """Return the highest generation of a slot that was ever ready; 0 for none."""
+        return self._served.get(slot, 0)
+
+    @property
+    def generations(self) -> Mapping[int, int]:
+        """Slot -> highest generation ever used."""
+        return self._generations
+
+    @property
+    def failures(self) -> Mapping[str, list[Failure]]:
+        """Supply -> its failures, oldest first."""
+        return self._failures
+
+    def proven_at(self, supply: str) -> float:
+        """Return when a replica from there last became ready; minus infinity for never."""
+        return self._proven_at.get(supply, float("-inf"))
+
+    def of_supplies(
+        self,
+        work_out: Callable[[History, str, float], Lasting[T | None]],
+        sum_up: Callable[[Mapping[str, T]], S],
+        now: float,
+    ) -> S:
+        """Return what follows from the failures and proofs of each supply, summed up.
+
+        Args:
+            work_out: Pure, and looks at nothing else of a history. It is asked again only when
+                it may say something else. None says nothing.
+            sum_up: Pure; always the same for one `work_out`.
+            now: Seconds since the epoch.
+        """
+        return self._follows(self._of_supplies, self._failures, work_out, sum_up, now)
+
+    def of_losses(
+        self,
+        work_out: Callable[[History, str, float], Lasting[T | None]],
+        sum_up: Callable[[Mapping[str, T]], S],
+        now: float,
+    ) -> S:
+        """Return what follows from the losses at each location; likewise."""
+        return self._follows(self._of_losses, self._losses, work_out, sum_up, now)
+
+    def _follows(
+        self,
+        digests: dict[Callable[..., Any], Digest[Any, Any]],
+        places: Iterable[str],
+        work_out: Callable[[History, str, float], Lasting[T | None]],
+        sum_up: Callable[[Mapping[str, T]], S],
+        now: float,
+    ) -> S:
+        digest = digests.get(work_out)
+        if digest is None:
+            digest = digests[work_out] = Digest(set(places), sum_up)
+        whole: S = digest.at(now, lambda place: work_out(self, place, now))
+        return whole
+
+    @property
+    def losses(self) -> Mapping[str, list[float]]:
+        """Location -> when replicas were lost there unasked, oldest first."""
+        return self._losses
+
+
+YOUNG_S = 60.0
+
+
+def died_young(record: Record, event: Event) -> bool:
+    """Whether a loss speaks against the location: never ready, or ready for under a minute."""
+    return record.first_ready_at is None or event.at - record.first_ready_at < YOUNG_S
+
+
+def compacted(
+    events: Iterable[Event],
+    now: float,
+    keep_s: float = 86_400.0,
+    *,
+    history: History | None = None,
+) -> list[Event]:
+    """Drop what no decision needs any more.
+
+    Kept whole: launches that are open, or to which something happened within `keep_s`.
+    Kept in part: the latest launch of each slot, so that generations stay used. Of a
+    kept launch's comings and goings of readiness the first READY and the last two stay. That the
+    clock was set is never forgotten, that the machine slept only with all that was before.
+
+    Args:
+        history: What follows from these very events, where that is known already.
+    """
+    events = list(events)
+    history = history or History(events)
+    kept = {(r.slot, r.generation) for r in history.open()}
+    later_s = 0.0
+    for event in reversed(events):
+        if event.kind in MOVING:
+            later_s += event.by_s
+        elif now - (event.at + later_s) < keep_s:
+            kept.add((event.slot, event.generation))
+    flapping: dict[tuple[int, int], list[int]] = {}
+    for index, event in enumerate(events):
+        if event.kind in (EventKind.READY, EventKind.UNREADY):
+            flapping.setdefault((event.slot, event.generation), []).append(index)
+    dropped: set[int] = set()
+    for indices in flapping.values():
+        first_ready = [i for i in indices if events[i].kind is EventKind.READY][:1]
+        dropped |= set(indices) - {*first_ready, *indices[-2:]}
+    out: list[Event] = []
+    for index, e in enumerate(events):
+        is_last = e.generation == history.generation(e.slot)
+        if (
+            e.kind is EventKind.CLOCK
+            or (e.kind is EventKind.SLEPT and out)
+            or (e.kind not in MOVING and index not in dropped and (e.slot, e.generation) in kept)
+            or (is_last and (e.kind is EventKind.LAUNCH or e.kind in CLOSING))
+        ):
+            out.append(e)
+    return out

@@ -1,0 +1,158 @@
+"""Choose where the next replica goes. Pure and deterministic.
+
+Spread first, price and distance second: replicas in one zone are preempted together, and a
+cloud or a region fails as a whole. So the offer whose cloud, then region, then zone holds
+the fewest of our replicas wins; among those the one with the lowest score; among those
+the cheaper one; among those the first by name.
+
+Owns: the rank of an offer and the reason when none is left.
+Not here: the order within a rank (`listing`, `score`), how long a location rests or is avoided
+(`quarantine`) and how many are needed (`planner`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from fogft.model.replica import Offer, Placement
+from fogft.model.scoring import Scale
+from fogft.planning.listing import Listing, Row, catalogue
+from fogft.planning.observed.backoff import EVERYWHERE, Backoff
+
+EPSILON_USD = 1e-9
+
+Rank = tuple[bool, int, int, int]
+
+
+class Choice(NamedTuple):
+    """An offer, or none and why not, in words.
+
+    Attributes:
+        rank: Of the offer: whether its location is avoided, then how many of our other
+            replicas its cloud, region and zone hold.
+    """
+
+    offer: Offer | None
+    why_not: str = ""
+    rank: Rank = (False, 0, 0, 0)
+
+
+def domains(placement: Placement) -> tuple[str, str, str]:
+    """Return the failure domains that a placement lies in, the widest first."""
+    return placement.domains
+
+
+class Crowd(dict[str, int]):
+    """How many replicas each failure domain holds: none where it is not named."""
+
+    def __missing__(self, domain: str) -> int:
+        return 0
+
+
+def crowding(taken: Iterable[Placement]) -> Crowd:
+    """Count replicas in each failure domain."""
+    crowd = Crowd()
+    count = crowd.get
+    for placement in taken:
+        for domain in placement.domains:
+            crowd[domain] = count(domain, 0) + 1
+    return crowd
+
+
+class Market:
+    """What can be bought now, among which many choices are quick.
+
+    Args:
+        listing: What is sold, in order.
+        resting: Supplies in backoff, see `Placement.supply`.
+        avoid: Locations to use only when no other is left: one was lost there lately.
+
+    Attributes:
+        resting: The supplies that it would have, where all that it sells rests; else empty.
+    """
+
+    def __init__(
+        self,
+        listing: Listing,
+        *,
+        resting: Mapping[str, Backoff] | None = None,
+        avoid: Collection[str] = (),
+    ) -> None:
+        rests = resting or {}
+        self._avoid = frozenset(avoid)
+        self._nothing = listing.trouble
+        self.resting: Mapping[str, Backoff] = {}
+        self.rows, self._clouds = listing.rows, listing.clouds
+        asleep = listing.supplies.intersection(rests) if rests else frozenset()
+        if asleep:
+            self.rows = tuple([row for row in self.rows if row.supply not in asleep])
+            self._clouds = frozenset([row.cloud for row in self.rows])
+        if EVERYWHERE in rests:
+            rest = rests[EVERYWHERE]
+            self._nothing = f"waiting after {rest.failures} failed launches ({rest.cause})"
+        elif asleep and not self.rows:
+            self.resting = {place: rests[place] for place in sorted(asleep)}
+            causes = ", ".join(f"`{place}`: {rest.cause}" for place, rest in self.resting.items())
+            self._nothing = f"every location rests after failures ({causes})"
+
+    def choose(
+        self,
+        taken: Iterable[Placement] | Crowd,
+        *,
+        avoid: Collection[str] = (),
+        budget_usd_per_hour: float | None = None,
+    ) -> Choice:
+        """Choose an offer, given where our other replicas are.
+
+        Args:
+            taken: Where the replicas that stay are, or how many are where.
+            avoid: More locations to avoid.
+            budget_usd_per_hour: The most that the new machine may cost; None for no limit.
+        """
+        if self._nothing:
+            return Choice(None, self._nothing)
+        count = (taken if isinstance(taken, Crowd) else crowding(taken)).get
+        avoided = self._avoid.union(avoid)
+        limit = math.inf if budget_usd_per_hour is None else budget_usd_per_hour + EPSILON_USD
+        ideal = (False, min([count(cloud, 0) for cloud in self._clouds]), 0, 0)
+        best: Row | None = None
+        best_rank: Rank | None = None
+        for row in self.rows:  # by score, so the first of a rank is the best of it
+            if row.usd_per_hour > limit:
+                continue
+            rank = (
+                row.location in avoided,
+                count(row.cloud, 0),
+                count(row.region, 0),
+                count(row.location, 0),
+            )
+            if best_rank is None or rank < best_rank:
+                best, best_rank = row, rank
+                if rank == ideal:
+                    break
+        if best is None or best_rank is None:
+            cheapest = min(row.usd_per_hour for row in self.rows)
+            return Choice(
+                None,
+                f"the cheapest offer is ${cheapest:.3f}/h and `max_usd_per_hour` "
+                f"leaves ${max(budget_usd_per_hour or 0.0, 0.0):.3f}/h",
+            )
+        return Choice(best.offer, rank=best_rank)
+
+
+def choose(
+    offers: Sequence[Offer],
+    *,
+    taken: Collection[Placement],
+    excluded: Collection[str] = (),
+    resting: Mapping[str, Backoff] | None = None,
+    avoid: Collection[str] = (),
+    budget_usd_per_hour: float | None = None,
+    scale: Scale | None = None,
+) -> Choice:
+    """Choose among offers once; see `Market`."""
+    listing = catalogue(offers).listing(None, None, excluded, scale or Scale())
+    market = Market(listing, resting=resting, avoid=avoid)
+    return market.choose(taken, budget_usd_per_hour=budget_usd_per_hour)

@@ -1,0 +1,257 @@
+"""Decide how a pool should change. Pure: no clock, no cloud, no randomness.
+
+The reconciler observes, calls `plan` and applies the result. All that the decision
+depends on is an argument, so a bug report that quotes the arguments is a failing test,
+and planning again after a crash is always safe. docs/design/planner.md has the flow.
+
+Owns: the order of the steps, and what holds the pool within its cap.
+Not here: the steps: how many (`sizing`), who is ill (`health`), who is what (`census`), what
+is missing (`needs`), where it goes (`buying`, `placement`), who moves (`migration`), who ends
+(`endings`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from fogft.model.intent import Intent
+from fogft.model.replica import Observed, ReplicaId
+from fogft.model.spec import PoolSpec
+from fogft.planning import migration, rollout
+from fogft.planning.buying import Buyer, PlannedLaunch
+from fogft.planning.classification import take_census
+from fogft.planning.endings import Census, Endings, Standing, choose_endings
+from fogft.planning.needs import Need, home, needed_launches, part
+from fogft.planning.observed.health import Health, judge
+from fogft.planning.observed.history import History
+from fogft.planning.placement import EPSILON_USD
+from fogft.planning.projected_state import under_way
+from fogft.planning.sizing import Size, size
+
+__all__ = ["Plan", "PlannedEnd", "PlannedLaunch", "plan"]
+
+DRAIN_LIMIT_S = 10.0
+# A plan is planned on again so often; two passes are what nearly every world needs.
+MOST_PASSES = 8
+
+
+class PlannedEnd(NamedTuple):
+    """End a machine."""
+
+    id: ReplicaId
+    reason: str
+
+
+class Plan(NamedTuple):
+    """What to do now, and what is worth knowing.
+
+    Attributes:
+        draining: Replicas to mark as draining in the membership; they end a little later.
+        notes: Why the pool is not yet as wanted, in sentences.
+        wanted: How many replicas should be ready.
+        health: What the plan was based on; None when the cloud could not tell.
+        closed: It is known without trying that planning again while it is under way adds nothing.
+        waits: For a location's rest to end: a launch that is needed, or a stand-in's return.
+        restless: Who would move if they had stayed long enough and no location rested.
+    """
+
+    wanted: int
+    launches: tuple[PlannedLaunch, ...] = ()
+    terminations: tuple[PlannedEnd, ...] = ()
+    draining: tuple[ReplicaId, ...] = ()
+    notes: tuple[str, ...] = ()
+    health: Health | None = None
+    closed: bool = False
+    waits: bool = False
+    restless: frozenset[ReplicaId] = frozenset()
+
+
+def plan(
+    pool_uid: str,
+    spec: PoolSpec,
+    intent: Intent,
+    observed: Observed,
+    history: History,
+    *,
+    drain_limit_s: float = DRAIN_LIMIT_S,
+    health: Health | None = None,
+) -> Plan:
+    """Return what brings the pool closer to what is wanted, within the safety laws.
+
+    It is planned again on the world as it is once a plan is under way, until nothing is added: a
+    launch makes a replica superfluous, an ending leaves another one the last of its region.
+
+    Args:
+        pool_uid: Machines of other pools are ignored.
+        spec: The pool file.
+        intent: What the user wants besides.
+        observed: The world now, `observed.now` included.
+        history: What happened before.
+        drain_limit_s: The longest that a replica to be ended is waited for.
+        health: What `judge` makes of these very arguments, where that is known already.
+    """
+    health = health or judge(pool_uid, spec, observed, history)
+    decided = latest = _plan_once(
+        spec, intent, observed, history, health=health, drain_limit_s=drain_limit_s
+    )
+    if observed.machines is None:
+        return decided
+    for _ in range(MOST_PASSES):
+        if latest.closed or not _changes(latest, history):
+            break
+        world, memory = under_way(
+            pool_uid,
+            spec,
+            observed,
+            history,
+            launches=decided.launches,
+            ends={end.id for end in decided.terminations},
+            draining=decided.draining,
+        )
+        health = judge(pool_uid, spec, world, memory)
+        latest = _plan_once(spec, intent, world, memory, health=health, drain_limit_s=drain_limit_s)
+        is_done = not latest.launches and not latest.terminations
+        is_done = is_done and set(latest.draining) == set(decided.draining)
+        decided = decided._replace(
+            launches=decided.launches + latest.launches,
+            terminations=decided.terminations + latest.terminations,
+            draining=latest.draining,
+            notes=tuple(dict.fromkeys(decided.notes + latest.notes)),
+            waits=decided.waits or latest.waits,
+            restless=decided.restless | latest.restless,
+        )
+        if is_done:
+            break
+    return decided
+
+
+def _changes(decided: Plan, history: History) -> bool:
+    """Whether a plan makes any difference to what the next one is based on."""
+    if decided.launches or decided.terminations:
+        return True
+    if not decided.draining:
+        return False
+    marked = {(r.slot, r.generation) for r in history.open() if r.draining_since is not None}
+    return not marked.issuperset((id.slot, id.generation) for id in decided.draining)
+
+
+def _plan_once(
+    spec: PoolSpec,
+    intent: Intent,
+    observed: Observed,
+    history: History,
+    *,
+    health: Health,
+    drain_limit_s: float,
+) -> Plan:
+    if observed.machines is None:
+        known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
+        return Plan(known, notes=("the cloud cannot be reached: nothing is changed",))
+    if intent.stopping:
+        ends = [PlannedEnd(j.id, "down") for j in health.replicas if j.id not in observed.ending]
+        return Plan(0, terminations=tuple(ends), notes=("stopping",), health=health)
+
+    sized = size(spec, intent, observed, health.running if spec.availability else 0)
+    census = take_census(spec, intent, observed, health=health, size=sized)
+    counts, excess = _within_cap(sized, census)
+    wanted = sum(counts)
+    buyer = Buyer(spec, intent, observed, history, census, sized.groups, sized.max_usd_per_hour)
+    settling = bool(census.replaced) and rollout.is_settling(census, observed.now)
+    needs = needed_launches(sized.groups, counts, census, history, settling=settling)
+    may_move = not needs and len(census.good) == wanted and spec.max_surge > 0
+    may_move = may_move and migration.is_quiet(census, health)
+    waits = may_move and migration.has_stand_ins(buyer)
+    restless = migration.restless(buyer) if may_move else frozenset()
+    moves = False
+    if waits or restless:
+        found = migration.mover(buyer, observed.now, restless)
+        moves = found is not None
+        if found is not None:
+            census.good.remove(found.standing)
+            census.replaced.append(replace(found.standing, reason=found.why))
+            needs = needed_launches(sized.groups, counts, census, history)
+    room = wanted + spec.max_surge - census.live
+    first: Standing | None = None
+    for need in needs:
+        if not buyer.buy(need, room=room):
+            first = _first_to_go(need, buyer, wanted, spec.max_surge)
+            waits = True
+            break
+    held: Sequence[ReplicaId] = ()
+    if settling:
+        held = [s.id for s in census.replaced if rollout.is_outdated(s) and not s.draining_since]
+    endings = Endings()
+    for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
+        makes_room = first is not None and home(sized.groups, first.slot) is group
+        endings.add(
+            choose_endings(
+                count,
+                part(census, sized.groups, group),
+                health,
+                history,
+                now=observed.now,
+                drain_limit_s=drain_limit_s,
+                dear_first=bool(excess),
+                held=held,
+                first=first if makes_room else None,
+            )
+        )
+    ends = [PlannedEnd(s.id, s.why) for s in (*census.failed, *census.aborted)]
+    ends += [PlannedEnd(s.id, why) for s, why in endings.now]
+    ends += [PlannedEnd(s.id, why) for s, why in buyer.sacrificed if s.id not in endings.ids]
+    notes = [*sized.notes, *excess, *buyer.notes, *endings.notes]
+    if health.uplink_suspected:
+        notes.insert(0, "all links are silent together: the robot's uplink is suspected")
+    return Plan(
+        wanted=wanted,
+        launches=tuple(buyer.launches),
+        terminations=tuple(ends),
+        draining=tuple(s.id for s in endings.draining),
+        notes=tuple(dict.fromkeys(notes)),
+        health=health,
+        # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
+        # Who moves is not to go before the one that comes serves: all others do, and are needed.
+        closed=not (ends or endings.draining or census.ending or excess)
+        and (moves or not census.replaced),
+        waits=waits,
+        restless=restless,
+    )
+
+
+def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Standing | None:
+    """Return the outdated one that has to end before its successor can be launched, if it may."""
+    old = need.replaces
+    if old is None or not rollout.is_outdated(old) or old not in buyer.census.replaced:
+        return None
+    fits = buyer.fits_instead(need, old)
+    if not fits or (max_surge and buyer.fits_beside(need)):
+        return None
+    if not rollout.may_go_first(old, buyer.census, wanted):
+        buyer.notes.append(
+            f"slot {need.slot} is not updated: there is no room for both, and no other one that "
+            "answers meanwhile; raise `max_usd_per_hour` or `max_surge`"
+        )
+        return None
+    buyer.notes.append(f"slot {need.slot}: no room for both, so old before new")
+    return old
+
+
+def _within_cap(sized: Size, census: Census) -> tuple[Sequence[int], list[str]]:
+    """Return how many are wanted of each group: one fewer while those at hand exceed the cap.
+
+    No launch exceeds the cap: this is for one that was lowered, by a schedule or in the file.
+    The last group gives first, one at a time, and one replica always stays.
+    """
+    cap, counts, groups = sized.max_usd_per_hour, list(sized.counts), sized.groups
+    if cap is None or len(census.good) < 2:
+        return counts, []
+    cost = sum(s.usd_per_hour for s in census.good)
+    if cost <= cap + EPSILON_USD:
+        return counts, []
+    if census.replaced or census.ending or len(census.good) > sum(counts):
+        return counts, []  # it shrinks already
+    index = max(i for i, group in enumerate(groups) if part(census, groups, group).good)
+    counts[index] = min(counts[index], len(part(census, groups, groups[index]).good) - 1)
+    return counts, [f"${cost:.3f}/h is over the cap of ${cap:g}/h: the dearest go, one by one"]

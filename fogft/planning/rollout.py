@@ -1,0 +1,283 @@
+"""Carry out a changed pool file replica by replica, or give it up. Pure.
+
+A *version* is what a replica runs: `replica_hash` names it. The *good* file is the last one with
+which the pool was wholly ready. While another version takes its place, this judges the new
+version by its own replicas alone; the first proof against it ends the update, for good.
+
+Owns: what speaks against a version, when an update is done, and in what order it goes.
+Not here: launches and endings (`planner`), what is remembered (`fogft.pool.manager.updating`).
+Rules: docs/design/rolling-update.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+from fogft.model.groups import replica_hash
+from fogft.model.replica import LinkState, Machine
+from fogft.model.spec import PoolSpec
+from fogft.planning.endings import Census, Standing
+from fogft.planning.observed.health import Health, Judged, Verdict
+from fogft.planning.observed.history import History
+
+# A new replica has to serve for so long before the next one is replaced, or its version is good.
+SETTLE_S = 5.0
+# So often `run` has ended, some eight seconds after it was first started: it will not stay.
+CRASH_LOOP = 4
+# Launches that failed for a reason that may be the cloud's: so many together are the version's.
+CLOUD_FAILURES = 3
+# Fewer errors than this are chance; and a share of errors counts from this much above the old's.
+ERRORS_MIN = 5
+ERRORS_MARGIN = 0.02
+_SURE = 3.0  # standard deviations: chance alone stops about one update in a thousand
+_OUTDATED = "outdated"
+_THE_VERSIONS = ("setup", "timeout")
+_THE_CLOUDS = ("capacity", "quota", "credentials")
+
+
+class UpdateState(str, Enum):
+    """How far an update has come. Only IN_PROGRESS can end well."""
+
+    IN_PROGRESS = "in progress"
+    STOPPED = "stopped"  # given up; replicas of it are still there, or good ones are missing
+    ROLLED_BACK = "rolled back"  # the pool is wholly ready with the good file
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What is remembered of the file that was applied last.
+
+    Attributes:
+        file: Its digest: what is remembered holds for no other.
+        began_at: When the manager first saw it, in seconds since the epoch.
+        fault: Why it was given up, in words; empty while it is not.
+    """
+
+    file: str = ""
+    began_at: float = 0.0
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class Update:
+    """An update, for people and programs.
+
+    Attributes:
+        done: Replicas of the version that is wanted now which serve.
+        of: How many are wanted.
+        fault: Why it was given up; empty while it was not.
+    """
+
+    state: UpdateState
+    done: int
+    of: int
+    fault: str = ""
+
+    @property
+    def told(self) -> str:
+        """It, as a sentence."""
+        if self.state is UpdateState.IN_PROGRESS:
+            return f"update in progress: {self.done} of {self.of} replicas run the new version"
+        if self.state is UpdateState.STOPPED:
+            return (
+                f"update stopped, {self.fault}: the pool returns to the last good file, "
+                f"{self.done} of {self.of} replicas run it"
+            )
+        return f"update rolled back, {self.fault}: the pool runs the last good file"
+
+
+def differs(spec: PoolSpec, good: PoolSpec, slots: Iterable[int]) -> bool:
+    """Whether two files give another version to any of these slots."""
+    return any(replica_hash(spec, slot) != replica_hash(good, slot) for slot in slots)
+
+
+def is_new(spec: PoolSpec, good: PoolSpec, machine: Machine) -> bool:
+    """Whether a machine runs the new version, and the good file has another one for its slot."""
+    wanted = replica_hash(spec, machine.id.slot)
+    return machine.spec_hash == wanted != replica_hash(good, machine.id.slot)
+
+
+def fault(spec: PoolSpec, good: PoolSpec, health: Health, history: History, began_at: float) -> str:
+    """Return what proves that the new version is no good, in words; empty when nothing does.
+
+    Args:
+        spec: The file that is being applied.
+        good: The last good one.
+        health: The pool, judged by `spec`.
+        history: What happened.
+        began_at: When the update began.
+    """
+    if spec is good:
+        return ""
+    new = [judged for judged in health.replicas if is_new(spec, good, judged.machine)]
+    old = [j for j in health.replicas if j.machine.spec_hash == replica_hash(good, j.id.slot)]
+    for judged in new:
+        if why := _does_not_start(judged):
+            return f"replica {judged.id.short}: {why}"
+    if why := _errors(new, [judged for judged in old if judged not in new]):
+        return why
+    if differs(spec, good, list(history.generations) or [0]):
+        return _launches_fail(history, began_at)
+    return ""
+
+
+def _does_not_start(judged: Judged) -> str:
+    cause = judged.why.split(":")[0].split(" ")[0]
+    if judged.verdict is Verdict.FAILED and cause in _THE_VERSIONS:
+        return judged.why.splitlines()[0]
+    link = judged.link
+    if link is None or link.state is not LinkState.UP or judged.serving:
+        return ""
+    if link.differs:
+        return link.detail or "its types are not the same on both sides"
+    if link.restarts >= CRASH_LOOP:
+        detail = f" ({link.detail.splitlines()[0]})" if link.detail else ""
+        return f"`run` ended {link.restarts} times{detail}"
+    return ""
+
+
+def _errors(new: list[Judged], old: list[Judged]) -> str:
+    """Return how the new version's answers are worse than the old one's, if they surely are."""
+    failed, asked = _counts(new)
+    old_failed, old_asked = _counts(old)
+    usual = old_failed / old_asked if old_asked else 0.0
+    if failed < ERRORS_MIN or at_least(failed, asked) <= usual + ERRORS_MARGIN:
+        return ""
+    return (
+        f"{failed} of {asked} requests to the new version failed, "
+        f"{old_failed} of {old_asked} to the old one"
+    )
+
+
+def _counts(replicas: list[Judged]) -> tuple[int, int]:
+    links = [judged.link for judged in replicas if judged.link is not None]
+    failed = sum(link.failed for link in links)
+    return failed, failed + sum(link.answered for link in links)
+
+
+def at_least(hits: int, of: int) -> float:
+    """Return the lower end of Wilson's interval, at three standard deviations, for a share."""
+    if not hits:  # nothing, whatever rounding would make of it
+        return 0.0
+    share, square = hits / of, _SURE * _SURE
+    spread = _SURE * math.sqrt(share * (1 - share) / of + square / (4 * of * of))
+    return (share + square / (2 * of) - spread) / (1 + square / of)
+
+
+def _launches_fail(history: History, began_at: float) -> str:
+    """Return that launches keep failing since the update began, and none has come to serve."""
+    proven_at = max((history.proven_at(place) for place in history.failures), default=began_at)
+    since = max(began_at, proven_at)
+    causes = [
+        failure.cause
+        for failures in history.failures.values()
+        for failure in failures
+        if failure.at > since and failure.cause not in _THE_CLOUDS
+    ]
+    if len(causes) < CLOUD_FAILURES:
+        return ""
+    return f"{len(causes)} launches failed ({', '.join(sorted(set(causes)))}), and none served"
+
+
+def is_whole(
+    spec: PoolSpec, health: Health, history: History, *, wanted: int, now: float, settle_s: float
+) -> bool:
+    """Whether all replicas that are wanted, and no others, run this file's version and serve.
+
+    Args:
+        settle_s: Each must have come to serve so long ago.
+    """
+    if not health.links_known or health.uplink_suspected:
+        return False
+    stay = [judged for judged in health.replicas if judged.verdict is not Verdict.FAILED]
+    if len(stay) < max(1, wanted):
+        return False
+    return all(
+        judged.serving
+        and judged.verdict is Verdict.GOOD
+        and judged.machine.spec_hash == replica_hash(spec, judged.id.slot)
+        and not _settles(history, judged, now, settle_s)
+        for judged in stay
+    )
+
+
+def _settles(history: History, judged: Judged, now: float, settle_s: float) -> bool:
+    record = history.record(judged.id.slot, judged.id.generation)
+    ready_at = record.first_ready_at if record is not None else None
+    return ready_at is None or 0 <= now - ready_at < settle_s
+
+
+def describe(
+    spec: PoolSpec, good: PoolSpec | None, trial: Trial, health: Health, wanted: int
+) -> Update | None:
+    """Return the update under way, or the one that was given up; None where there is none.
+
+    Args:
+        spec: The file in force: after a rollback the good one.
+        good: The last good one; None before a pool was first ready.
+        trial: What is remembered of the file applied last.
+        health: The pool, judged by `spec`.
+        wanted: How many replicas should serve.
+    """
+    if good is None or (spec is good and not trial.fault):
+        return None
+    current = [
+        judged.machine.spec_hash == replica_hash(spec, judged.id.slot) for judged in health.replicas
+    ]
+    done = sum(
+        judged.serving and is_current
+        for judged, is_current in zip(health.replicas, current, strict=True)
+    )
+    done = min(done, wanted)
+    if trial.fault:
+        back = all(current) and done >= wanted
+        state = UpdateState.ROLLED_BACK if back else UpdateState.STOPPED
+        return Update(state, done, wanted, trial.fault)
+    if not differs(spec, good, [judged.id.slot for judged in health.replicas]):
+        return None
+    return Update(UpdateState.IN_PROGRESS, done, wanted)
+
+
+# -- what the planner asks --------------------------------------------------------------------
+
+
+def is_outdated(standing: Standing) -> bool:
+    """Whether it is replaced for its version alone."""
+    return standing.reason.startswith(_OUTDATED)
+
+
+def is_settling(census: Census, now: float) -> bool:
+    """Whether a newcomer has yet to prove itself before the update goes on."""
+    if not any(is_outdated(s) for s in census.replaced):
+        return False
+    return any(
+        (ready_at := s.record.first_ready_at if s.record else None) is not None
+        and 0 <= now - ready_at < SETTLE_S
+        for s in census.good
+    )
+
+
+def may_go_first(standing: Standing, census: Census, wanted: int) -> bool:
+    """Whether an outdated one may end before its successor exists: all others serve.
+
+    So at least one always answers, and never more than one is missing.
+    """
+    if not standing.judged.may_serve:
+        return True
+    others = [s for s in (*census.good, *census.replaced) if s.id != standing.id]
+    serving = sum(s.judged.serving for s in others)
+    return serving >= max(1, wanted - 1)
+
+
+def has_room(spec: PoolSpec, usd_per_hour: float, cheapest: float) -> bool:
+    """Whether a further replica may exist while one replaces another.
+
+    Args:
+        usd_per_hour: What the pool costs when it is whole.
+        cheapest: What the cheapest further replica costs.
+    """
+    cap = spec.max_usd_per_hour
+    return spec.max_surge > 0 and (cap is None or usd_per_hour + cheapest <= cap + 1e-9)

@@ -1,0 +1,179 @@
+"""Decide how many replicas are wanted now, and up to what price. Pure.
+
+The pool file's number, or the one that its availability target needs; the schedule's within
+a window; the user's own when he has scaled. Each group gets its share, and services that
+ask for more get replicas that carry them alone.
+
+A target's number is that of a pool laid out from nothing over all that is offered: it
+depends on the offers alone, not on what runs, so it does not change with every preemption.
+
+Owns: numbers and the cap.
+Not here: what is missing (`planner`), the arithmetic (`availability`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from fogft.model.groups import Group, critical_group, groups_of, shares
+from fogft.model.intent import Intent
+from fogft.model.replica import Observed, Offer
+from fogft.model.schedule import Wish, wish
+from fogft.model.scoring import Scale
+from fogft.model.spec import MAX_REPLICAS, PoolSpec
+from fogft.planning.availability import Expected, expected
+from fogft.planning.listing import catalogue
+from fogft.planning.placement import Market
+from fogft.planning.reliability import replicas_needed
+
+
+class Size(NamedTuple):
+    """What is wanted.
+
+    Attributes:
+        groups: In the order of their slots; the one of critical services last.
+        counts: How many of each.
+        max_usd_per_hour: The cap that holds now; None for none.
+        notes: What may surprise, in sentences.
+    """
+
+    groups: tuple[Group, ...]
+    counts: tuple[int, ...]
+    max_usd_per_hour: float | None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def total(self) -> int:
+        """How many replicas are wanted together."""
+        return sum(self.counts)
+
+
+def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -> Size:
+    """Return how many replicas are wanted of each group, and the cap.
+
+    Args:
+        spec: The pool file.
+        intent: The user's wishes.
+        observed: The world now: its time, offers and distances.
+        running: How many replicas there are. A target's number does not fall below it
+            while nothing is offered.
+    """
+    groups = groups_of(spec)
+    usual, notes = Wish(spec.replicas, spec.max_usd_per_hour), []
+    clock = observed.now - observed.doubt_s
+    now = usual if spec.schedule is None else wish(spec.schedule, clock, usual)
+    if now.ahead:
+        notes.append("launching ahead of the schedule's next window")
+    total = now.replicas
+    if intent.stopping:
+        total = 0
+    elif intent.is_scaled(spec):
+        total = intent.wanted(spec)
+    elif spec.availability and now.replicas == spec.replicas:
+        found = _for_target(spec, intent, observed, now.max_usd_per_hour, running)
+        total = found.count
+        notes += [found.note] if found.note else []
+    counts = shares(groups, total)
+    extra = critical_group(spec, total)
+    if extra.replicas and total:
+        room = MAX_REPLICAS - total
+        groups, counts = (*groups, extra), (*counts, min(extra.replicas, room))
+    return Size(groups, counts, now.max_usd_per_hour, tuple(notes))
+
+
+def layout(
+    groups: Sequence[Group],
+    counts: Sequence[int],
+    markets: Markets,
+    cap: float | None,
+) -> list[tuple[Group, Offer]]:
+    """Return where a pool's replicas would go if it started from nothing, as far as offers go."""
+    out: list[tuple[Group, Offer]] = []
+    for group, count in zip(groups, counts, strict=True):
+        for mine in range(count):
+            budget = None if cap is None else cap - sum(o.usd_per_hour for _, o in out)
+            on_demand = mine < group.on_demand.base
+            choice = markets.choose(group, out, budget, on_demand=on_demand)
+            if choice is None:
+                break
+            out.append((group, choice))
+    return out
+
+
+class Markets:
+    """The offers of each group, apart by spot and on-demand where the group tells them apart.
+
+    Args:
+        offers: All that can be bought.
+        market: Makes a market of some of them.
+    """
+
+    def __init__(self, offers: Sequence[Offer], scale: Scale, excluded: Iterable[str]) -> None:
+        self._catalogue = catalogue(offers)
+        self._scale = scale
+        self._excluded = frozenset(excluded)
+        self._made: dict[tuple[str, bool | None], Market] = {}
+
+    def choose(
+        self,
+        group: Group,
+        taken: Sequence[tuple[Group, Offer]],
+        budget: float | None,
+        *,
+        on_demand: bool,
+    ) -> Offer | None:
+        """Return the offer that a group's next replica would get; None if there is none."""
+        kinds: tuple[bool | None, ...] = (None,)
+        if group.on_demand.base or group.on_demand.fallback:
+            kinds = (False,) if on_demand else (True, False)
+            kinds = kinds if group.on_demand.fallback else kinds[:1]
+        places = [offer.placement for _, offer in taken]
+        for spot in kinds:
+            found = self._market(group.offers, spot).choose(places, budget_usd_per_hour=budget)
+            if found.offer is not None:
+                return found.offer
+        return None
+
+    def _market(self, name: str, spot: bool | None) -> Market:
+        key = (name, spot)
+        if key not in self._made:
+            found = self._catalogue.listing(name, spot, self._excluded, self._scale)
+            self._made[key] = Market(found)
+        return self._made[key]
+
+
+@dataclass(frozen=True)
+class _Found:
+    count: int
+    note: str = ""
+
+
+def _for_target(
+    spec: PoolSpec, intent: Intent, observed: Observed, cap: float | None, running: int
+) -> _Found:
+    """Return the fewest replicas that reach the target; the most within the cap if none do."""
+    asked, groups = spec.availability, groups_of(spec)
+    if asked is None:
+        return _Found(spec.replicas)
+    if not observed.offers:
+        one = 1.0 - asked.assumed.unavailability(spot=True)
+        needed = replicas_needed(one, asked.target, limit=10_000)
+        return _Found(min(MAX_REPLICAS, max(spec.replicas, running, needed)))
+    scale = Scale(spec.placement.weights, observed.rtt_s)
+    markets = Markets(observed.offers, scale, intent.excluded)
+    laid = [o for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
+    best = Expected(0.0, 0.0)
+    for count in range(max(1, spec.replicas), len(laid) + 1):
+        best = expected([o.placement for o in laid[:count]], asked.assumed)
+        if best.correlated >= asked.target - 1e-12:
+            return _Found(count)
+    # Not below what runs: near the cap, prices that waver would make the number waver.
+    count = max(1, spec.replicas, len(laid), min(running, MAX_REPLICAS))
+    why = "`max_usd_per_hour` allows no more" if len(laid) < MAX_REPLICAS else "16 is the most"
+    return _Found(
+        count,
+        f"`availability: {asked.target:g}` cannot be met: {len(laid)} replicas are expected to "
+        f"reach {best.correlated:.6g}, and {why}",
+    )

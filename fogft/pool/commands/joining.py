@@ -1,0 +1,289 @@
+"""What is in a join bundle, and how it becomes a part of the pool on this machine.
+
+The bundle brings all that a proxy needs: configuration, certificate and key, the CA, and
+the membership as it was. It is used once: the file is destroyed when it has been opened, a
+copy is refused here by its id, and on other machines by what was said at the rendezvous.
+What was there for the same holder is replaced, file by file, with the certificate last: a
+proxy that runs takes it into use by itself.
+
+Owns: the content of bundles, and the folders of joined holders.
+Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`claiming`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from fogft import disk, template_files
+from fogft.errors import CredentialError, FogftError
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model import membership as memberships
+from fogft.model.certificate_holder import Holder, Role
+from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
+from fogft.model.membership import Found
+from fogft.model.replica import ReplicaId
+from fogft.model.spec import PoolSpec
+from fogft.pool.credentials import bundle, claiming
+from fogft.pool.credentials.authority import Credential
+from fogft.pool.credentials.bundle import Label
+from fogft.pool.credentials.ledger import Ledger
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import PoolStore
+from fogft.pool.manager import configuration
+
+FILE_LIMIT = 512 << 10
+_USED_LIMIT = 10_000
+# All others: `proxy`.
+_COMMANDS = {Role.REPLICA: "serve", Role.RENDEZVOUS: "rendezvous", Role.GATEWAY: "gateway"}
+_FLAT = (Role.REPLICA, Role.RENDEZVOUS)  # their credentials lie beside their configuration
+
+
+@dataclass(frozen=True)
+class Joined:
+    """What `join` has set up.
+
+    Attributes:
+        config: The configuration to start with: ``fogft <command> --config <config>``.
+        command: ``proxy``, ``serve``, ``gateway`` or ``rendezvous``.
+        alone: No rendezvous tells it of what changes, nor told whether it is the first to join.
+    """
+
+    pool: str
+    holder: Holder
+    config: Path
+    command: str
+    alone: bool = False
+
+
+@dataclass(frozen=True)
+class Issued:
+    """A bundle.
+
+    Attributes:
+        data: Its bytes.
+        alone: See `Joined`.
+    """
+
+    holder: Holder
+    data: bytes
+    alone: bool
+
+
+def issue(
+    store: PoolStore, role: Role, name: str, passphrase: str, now: float, *, open_for_s: float
+) -> Issued:
+    """Certify the next generation of a holder, and return its sealed bundle.
+
+    Raises:
+        CredentialError: The name or the passphrase will not do, the CA cannot be used, or
+            whoever joined would find nobody.
+        FogftError: There is no such pool.
+    """
+    identity, spec = store.identity(), store.spec()
+    if role is Role.REPLICA and not _is_by_hand(name):
+        raise CredentialError(
+            f"`{name}` is no slot for a replica that is started by hand",
+            f"use {FIRST_BY_HAND} to {LAST_BY_HAND}: the manager launches those below, and "
+            "certifies them itself",
+        )
+    _check_found(spec, role, name)
+    bundle.check_passphrase(passphrase)  # before a generation is used up
+    holder, credential = Ledger(store.paths.credentials).issue_next(
+        role, name, identity.uid, days=configuration.certificate_days(spec)
+    )
+    label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, now + open_for_s)
+    content = {"files": _files(store, holder, credential), "rendezvous": list(spec.rendezvous)}
+    alone = not spec.rendezvous and role is not Role.RENDEZVOUS
+    return Issued(holder, bundle.seal(label, content, passphrase), alone)
+
+
+def _is_by_hand(name: str) -> bool:
+    number = name.isascii() and name.isdecimal() and str(int(name[:9])) == name
+    return number and FIRST_BY_HAND <= int(name) <= LAST_BY_HAND
+
+
+def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
+    """See that whoever joins can find the others, or be found by them."""
+    if spec.rendezvous:
+        return
+    add = "add `fogft.rendezvous` to the pool file, and `fogft up` it"
+    if role is Role.REPLICA and Found.of(spec) is Found.BY_CLOUD:
+        raise CredentialError(
+            f"nobody would find replica `{name}`: no rendezvous could tell where it is",
+            f"{add}, or `fogft.dial_in`, where it dials the robot",
+        )
+    if role in (Role.ROBOT, Role.GATEWAY) and Found.of(spec) is Found.BY_DOOR:
+        raise CredentialError(
+            f"{role.value} `{name}` would find no replica: they dial this machine's robot, and "
+            "only a rendezvous could tell them of others",
+            add,
+        )
+
+
+def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str, str]:
+    identity, spec = store.identity(), store.spec()
+    stem = holder.role.value
+    folder = "" if holder.role in _FLAT else "credentials/"
+    files = {
+        f"{folder}ca.crt": credential.authority_pem.decode(),
+        f"{folder}{stem}.key": credential.key_pem.decode(),
+    }
+    if holder.role is Role.REPLICA:
+        id = ReplicaId(identity.uid, int(holder.name), holder.generation)
+        files["replica.yaml"] = configuration.replica_config(identity, spec, id)
+    elif holder.role is Role.RENDEZVOUS:
+        files["rendezvous.yaml"] = template_files.render(
+            "rendezvous.yaml", {"pool_uid": identity.uid}
+        )
+    else:
+        file = f"{_COMMANDS.get(holder.role, 'proxy')}.yaml"
+        files[file] = configuration.proxy_config(
+            PoolPaths(Path()), identity, spec, robot=holder.name, stem=stem, file=file
+        )
+        membership = store.membership()
+        if membership is not None:
+            files["membership.json"] = disk.to_json(memberships.to_dict(membership))
+    # Last: once it stands, all else does too.
+    return {**files, f"{folder}{stem}.crt": credential.certificate_pem.decode()}
+
+
+def join(
+    file: Path,
+    passphrase: str,
+    root: Path,
+    now: float,
+    *,
+    claim: Callable[[Holder, str, list[str], CredentialPaths], None] = claiming.claim,
+) -> Joined:
+    """Set this machine up from a bundle, and destroy the bundle.
+
+    Args:
+        file: The bundle.
+        passphrase: What it was sealed with.
+        root: The folder of all of fogft's state.
+        now: Seconds since the epoch.
+        claim: Sees that no other machine has joined with it.
+
+    Raises:
+        CredentialError: It is no bundle, was used, is too old, or the passphrase is wrong; or
+            no rendezvous tells whether it was used. Then it is as good as before.
+        StateError: Something cannot be written; the bundle is still there.
+    """
+    data = read(file)
+    label, content = bundle.open_sealed(data, passphrase, now)
+    files, endpoints = checked_files(content), _rendezvous(content)
+    holder = label.holder
+    disk.make_folder(root / "joined")
+    used = root / "joined" / "used.json"
+    with disk.locked(root / "joined" / "used.lock"):
+        ids = list(disk.read_json(used) or ())
+        if label.id in ids:
+            raise CredentialError(
+                f"this bundle for `{holder.short}` was used here before",
+                "each is good for one time: have a new one issued",
+            )
+        if endpoints:
+            token = claiming.own_token(root / "joined" / "claims.json", label.id, now)
+            with _on_disk(root / "joined", files, holder) as credentials:
+                claim(holder, token, endpoints, credentials)
+        folder = root / "joined" / _folder_name(label.pool, holder)
+        for name, text in files.items():
+            place = folder / name
+            disk.make_folder(place.parent)
+            disk.write_whole(place, text)
+        disk.write_json(used, [*ids, label.id][-_USED_LIMIT:])
+    _destroy(file, len(data))
+    config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
+    alone = not endpoints and holder.role is not Role.RENDEZVOUS
+    return Joined(label.pool, holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
+
+
+@contextlib.contextmanager
+def _on_disk(folder: Path, files: dict[str, str], holder: Holder) -> Iterator[CredentialPaths]:
+    """Have credentials in files of their own before they are put where a proxy sees them."""
+    stem, named = (
+        holder.role.value,
+        {PurePosixPath(name).name: text for name, text in files.items()},
+    )
+    with tempfile.TemporaryDirectory(dir=folder) as made:
+        place = CredentialPaths(*(Path(made) / n for n in ("ca.crt", f"{stem}.crt", f"{stem}.key")))
+        for path in (place.ca, place.certificate, place.key):
+            disk.write_whole(path, named.get(path.name, ""))
+        yield place
+
+
+def _rendezvous(content: dict[str, Any]) -> list[str]:
+    """Return the rendezvous that a bundle names; older bundles name none.
+
+    Raises:
+        CredentialError: They are no endpoints.
+    """
+    listed = content.get("rendezvous", [])
+    if not isinstance(listed, list) or not all(
+        isinstance(one, str) and memberships.is_endpoint(one) for one in listed
+    ):
+        raise CredentialError("the bundle names a rendezvous that is none")
+    return listed
+
+
+def read(file: Path) -> bytes:
+    """Return a bundle's bytes.
+
+    Raises:
+        CredentialError: It cannot be read.
+    """
+    try:
+        with file.open("rb") as opened:
+            return opened.read(bundle.SIZE_LIMIT + 1)
+    except OSError as error:
+        raise CredentialError(
+            f"the bundle `{file}` cannot be read: {error.strerror}",
+            "each is good for one time, and gone once it was used",
+        ) from None
+
+
+def checked_files(content: dict[str, Any]) -> dict[str, str]:
+    """Return the files that a bundle brings, once their names are found to be harmless.
+
+    Raises:
+        CredentialError: One is not.
+    """
+    files = content.get("files")
+    if not isinstance(files, dict) or not files:
+        raise CredentialError("the bundle holds no files")
+    for name, text in files.items():
+        parts = PurePosixPath(name).parts
+        safe = parts and all(part.strip(".") and "\0" not in part for part in parts)
+        if not safe or len(parts) > 2 or name.startswith("/") or not isinstance(text, str):
+            raise CredentialError(f"the bundle holds a file with an odd name: {name!r:.60}")
+        if len(text) > FILE_LIMIT:
+            raise CredentialError(f"the bundle holds a file that is too large: {name!r:.60}")
+    return files
+
+
+def _folder_name(pool: str, holder: Holder) -> str:
+    safe = "".join(c for c in pool if c.isalnum() or c == "-")
+    return f"{safe}.{holder.role.value}.{holder.name}"
+
+
+def _destroy(file: Path, size: int) -> None:
+    """Overwrite and remove a file; a removed file's bytes may otherwise be read for long."""
+    with contextlib.suppress(OSError):
+        with file.open("r+b") as opened:
+            opened.write(secrets.token_bytes(size))
+            opened.flush()
+            os.fsync(opened.fileno())
+    try:
+        file.unlink()
+    except OSError as error:
+        raise FogftError(
+            f"this machine has joined, but `{file}` cannot be removed: {error.strerror}",
+            "remove it by hand: it is good for nothing more here",
+        ) from None

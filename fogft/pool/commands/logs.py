@@ -1,0 +1,50 @@
+"""Which logs a pool has: its manager's, its client proxy's, and one for each launch.
+
+Owns: finding them.
+Not here: reading and following them (`fogft.cli.tail`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from fogft.cloud.port import Cloud
+from fogft.errors import CloudError, FogftError, known_slots
+from fogft.model.replica import ReplicaId
+from fogft.planning.observed.history import MOVING
+from fogft.pool.folder.store import PoolStore
+
+EVENTS = 200
+
+
+def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[str, Path]]:
+    """Return logs with their names: ``manager``, ``proxy``, then ``slot.generation``.
+
+    Args:
+        store: The pool.
+        cloud: Where its machines run, or ran until lately.
+        slot: Only the logs of replicas in this slot.
+
+    Raises:
+        FogftError: There is no log of that slot (the hint lists those there are).
+    """
+    uid = store.identity().uid
+    launched = {(e.slot, e.generation) for e in store.recent(EVENTS) if e.kind not in MOVING}
+    with contextlib.suppress(CloudError):
+        launched |= {(m.id.slot, m.id.generation) for m in cloud.machines(uid)}
+    found = []
+    if slot is None:
+        found = [("manager", store.paths.manager_log), ("proxy", store.paths.proxy_log)]
+    for where, generation in sorted(launched):
+        id = ReplicaId(uid, where, generation)
+        path = cloud.log(id) if slot in (None, where) else None
+        if path is not None:
+            found.append((id.short, Path(path)))
+    if slot is not None and not found:
+        known = known_slots(slot for slot, _ in launched)
+        raise FogftError(
+            f"there is no log of a replica in slot {slot} of `{store.paths.folder.name}`",
+            f"slots with one: {known}",
+        )
+    return found

@@ -1,0 +1,168 @@
+"""``fogft rendezvous --config FILE``: a rendezvous as a process.
+
+It needs a port that robots and replicas can reach, a certificate, and nothing else. Its
+memory on disk spares callers a moment after a restart; without it they bring everything.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.errors import StateError
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.metrics.scrape import Scrape
+from fogft.model.names import POOL_UID_PATTERN
+from fogft.pool.manager import metrics as measures
+from fogft.records import cache
+from fogft.records.exchange import Exchange
+from fogft.records.record_set import RecordSet
+from fogft.records.server import RendezvousServer
+from fogft.records.signing import Verifier
+
+log = logging.getLogger(__name__)
+
+DEFAULT_LISTEN = "0.0.0.0:7450"
+_SAVE_EVERY_S = 0.5
+
+
+@dataclass(frozen=True)
+class RendezvousConfig:
+    """All that `fogft rendezvous` needs to know.
+
+    Attributes:
+        records: File that the records are kept in.
+        status: File for what was counted; None for nowhere.
+        metrics: ``host:port`` to answer Prometheus at; empty for none.
+    """
+
+    pool_uid: str
+    listen: str
+    credentials: CredentialPaths
+    records: Path
+    status: Path | None = None
+    metrics: str = ""
+
+
+def read_config(
+    path: Path, listen: str | None = None, metrics: str | None = None
+) -> RendezvousConfig:
+    """Read a rendezvous's configuration; paths in it are relative to its folder.
+
+    Raises:
+        StateError: It cannot be read, or a key is missing or of the wrong type.
+    """
+    import yaml
+
+    hint = "compare it with `templates/rendezvous.yaml`"
+    try:
+        raw: Mapping[str, Any] = yaml.safe_load(path.read_text())
+        base = path.resolve().parent
+        uid, ours = raw["pool_uid"], raw["credentials"]
+        if not isinstance(uid, str) or not POOL_UID_PATTERN.fullmatch(uid):
+            raise ValueError(f"{uid!r:.40} is not a pool's uid: quote 16 hexadecimal digits")
+        return RendezvousConfig(
+            pool_uid=uid,
+            listen=listen or str(raw.get("listen") or DEFAULT_LISTEN),
+            credentials=CredentialPaths(
+                *(base / str(ours[name]) for name in ("ca", "certificate", "key"))
+            ),
+            records=base / str(raw.get("records") or "records.json"),
+            status=base / str(raw["status"]) if raw.get("status") else None,
+            metrics=str(raw.get("metrics") or "") if metrics is None else metrics,
+        )
+    except KeyError as error:
+        raise StateError(f"`{path}`: key {error} is missing", hint) from error
+    except Exception as error:  # PyYAML passes on what its constructors raise
+        raise StateError(f"`{path}` cannot be used: {error}", hint) from error
+
+
+def run(config: RendezvousConfig) -> None:
+    """Run until a signal ends it.
+
+    Raises:
+        WireError: The port cannot be had.
+        CredentialError: The certificate, its key or the CA cannot be used.
+    """
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=logging.INFO,
+        format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
+        datefmt="%Y-%m-%dT%H:%M:%S",
+        force=True,
+    )
+    asyncio.run(_Rendezvous(config).live())
+
+
+class _Rendezvous:
+    def __init__(self, config: RendezvousConfig) -> None:
+        self._config = config
+        verify = Verifier(config.credentials.ca)
+        self._records = RecordSet(config.pool_uid, verify)
+        self._restore()
+        self._news = False
+        self._reported = ""
+        self._server = RendezvousServer(
+            config.listen, config.credentials, verify, Exchange(self._records, self._changed)
+        )
+
+    def _changed(self) -> None:
+        self._news = True
+
+    async def live(self) -> None:
+        """Serve until a signal comes."""
+        loop = asyncio.get_running_loop()
+        stop = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            loop.add_signal_handler(number, stop.set)
+        self._server.bind()
+        log.info("rendezvous_listening endpoint=%s pid=%d", self._server.endpoint, os.getpid())
+        scrape = Scrape(lambda: measures.of_rendezvous(self._server.report()))
+        scrape.at(self._config.metrics)
+        serving = loop.create_task(self._server.serve())
+        try:
+            while not stop.is_set() and not serving.done():
+                self._save()
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(stop.wait(), _SAVE_EVERY_S)
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            self._save()
+            scrape.close()
+            log.info("rendezvous_stopped")
+
+    def _restore(self) -> None:
+        try:
+            records = cache.read(self._config.records)
+        except StateError as error:  # whoever connects brings them back
+            log.error("cache_damaged reason=%r", error.message)
+            return
+        any_time = Verifier(self._config.credentials.ca, any_time=True)
+        for one in records:
+            self._records.restore(one, any_time)
+
+    def _save(self) -> None:
+        try:
+            if self._news:
+                self._news = False
+                cache.write(self._config.records, self._records.lacking({}))
+            report = {"pid": os.getpid(), "endpoint": self._server.endpoint}
+            report.update(self._server.report())
+            if self._config.status is not None and str(report) != self._reported:
+                self._reported = str(report)
+                disk.write_json(
+                    self._config.status, {**report, "written_at": time.time()}, durable=False
+                )
+        except StateError as error:
+            log.error("file_failed reason=%r", error.message)

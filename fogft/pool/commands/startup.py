@@ -1,0 +1,141 @@
+"""What `up` does: lay the pool's folder down, or change what is in it, and start its manager.
+
+Everything is written before the identity, which comes last: a pool exists once that
+stands. So an `up` that was cut short is an `up` that never was.
+
+Owns: creating and changing a pool on disk, and starting its manager.
+Not here: judging the file (`pool_file`), waiting for the services (`fogft.cli.progress`).
+"""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from fogft import disk, logfile
+from fogft.child import detached
+from fogft.errors import FogftError, PoolBusy, PoolNotFound, SpecError
+from fogft.model import intent as intents
+from fogft.model.intent import Intent
+from fogft.model.spec import PoolSpec
+from fogft.planning import lifetime
+from fogft.pool.credentials import authority
+from fogft.pool.folder.lease import read_pid
+from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
+from fogft.pool.manager import process_control
+
+MANAGER_LIMIT_S = 20.0
+
+
+@dataclass(frozen=True)
+class Written:
+    """What `write` did.
+
+    Attributes:
+        created: The pool is new.
+        changed: Its file is not the one that was applied before.
+    """
+
+    identity: Identity
+    created: bool
+    changed: bool
+
+
+def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: str) -> Written:
+    """Create a pool, or apply a changed file to it.
+
+    Args:
+        store: Of the pool named `spec.name`.
+        spec: The file, read and judged.
+        source: The file's text.
+        file: Its absolute path.
+        cloud: Where the pool runs.
+
+    Raises:
+        SpecError: A pool of this name was started from another file, or runs elsewhere.
+        PoolBusy: It is being ended right now.
+        StateError: It cannot be written; nothing has changed.
+    """
+    paths = store.paths
+    disk.make_folder(paths.folder)
+    with disk.locked(paths.intent_lock):
+        if not paths.intent_lock.exists():
+            raise PoolBusy(f"pool `{spec.name}` has just been ended", "run `fogft up` again")
+        try:
+            identity = read_identity(paths)
+        except PoolNotFound:
+            return _create(store, spec, source, Path(file), cloud)
+        _check_same(identity, spec, Path(file), cloud)
+        try:
+            before, old_source = store.spec(), paths.spec.read_text()
+        except FogftError:  # written by a version that knew other keys
+            before, old_source = spec, ""
+        after = intents.file_changed(store.intent(), before, spec)
+        begun_at = lifetime.begun_at(after, identity.created_at, store.history())
+        store.write_intent(lifetime.revived(before, after, begun_at, time.time()))
+        if old_source != source:
+            disk.write_whole(paths.spec, source)
+        return Written(identity, created=False, changed=old_source != source)
+
+
+def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Written:
+    paths = store.paths
+    uid = secrets.token_hex(8)
+    shutil.rmtree(paths.credentials, ignore_errors=True)  # of an `up` that was cut short
+    old = (
+        *(paths.history, paths.membership, paths.lease, paths.records, paths.manager_records),
+        *(paths.good_spec, paths.trial, paths.discovered),
+    )
+    for left in old:
+        left.unlink(missing_ok=True)
+    authority.create_authority(paths.credentials, uid)
+    disk.write_whole(paths.spec, source)
+    store.write_intent(Intent())
+    identity = Identity(spec.name, uid, cloud, str(file), time.time())
+    write_identity(paths, identity)
+    return Written(identity, created=True, changed=True)
+
+
+def _check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> None:
+    if Path(identity.file) != file:
+        raise SpecError(
+            f"{file}: name: pool `{spec.name}` was started from `{identity.file}`",
+            f"give this one another `name`, or end that one with `fogft down {spec.name}`",
+        )
+    if identity.cloud != cloud:
+        raise SpecError(
+            f"{file}: pool `{spec.name}` runs on cloud `{identity.cloud}`, not `{cloud}`",
+            f"end it with `fogft down {spec.name}` first",
+        )
+
+
+def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None = None) -> bool:
+    """See to it that the pool has a manager; return whether one was started.
+
+    Raises:
+        FogftError: It ended at once (the message has the end of its log).
+    """
+    paths = store.paths
+    if disk.is_locked(paths.manager_lock):
+        return False
+    name = paths.folder.name
+    words = command(name) if command else [sys.executable, "-m", "fogft", "manager", name]
+    child = detached(words, paths.manager_log)
+    end = time.monotonic() + MANAGER_LIMIT_S
+    while time.monotonic() < end:
+        if read_pid(paths) == child.pid:
+            return True
+        if child.poll() is not None:
+            if disk.is_locked(paths.manager_lock):  # another `up` was faster
+                return False
+            break
+        time.sleep(process_control.POLL_S)
+    raise FogftError(
+        f"the manager of `{name}` did not start:\n{logfile.tail(paths.manager_log)}",
+        f"its log is `{paths.manager_log}`; `fogft doctor` may know more",
+    )

@@ -1,0 +1,167 @@
+"""A pool's status as a command sees it: how old it is, and whether anybody still looks.
+
+With a living manager that is the manager's last observation. With a dead one, `ask`
+looks for itself: at the cloud and at the client proxy's report, and changes nothing.
+
+Owns: reading, ageing and renewing a status.
+Not here: its schema (`status`) and how it is shown (`fogft.cli`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from fogft import disk
+from fogft.errors import CloudError, StateError, told
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager import status
+from fogft.pool.manager.status import PoolStatus
+
+if TYPE_CHECKING:
+    from fogft.cloud.port import Cloud
+    from fogft.pool.folder.store import PoolStore
+
+EVENTS_SHOWN = 20
+_LOOK_EVERY_S = 0.05
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A status with what its reader must know of it.
+
+    Attributes:
+        age_s: Since it was observed; None when nothing was observed yet.
+        manager_alive: Whether a manager holds office now.
+    """
+
+    status: PoolStatus
+    age_s: float | None
+    manager_alive: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """Return `status.json`'s schema with ``age_s`` and ``manager_alive``."""
+        return {
+            **self.status.to_json(),
+            "age_s": self.age_s,
+            "manager_alive": self.manager_alive,
+        }
+
+
+def read(paths: PoolPaths, now: float) -> Seen:
+    """Return what the manager last saw.
+
+    Raises:
+        PoolNotFound: There is no such pool.
+        StateError: The status is damaged, or another version's.
+    """
+    alive = disk.is_locked(paths.manager_lock)
+    raw = disk.read_json(paths.status)
+    if raw is None:
+        return Seen(_unobserved(paths), None, alive)
+    seen = status.from_json(raw)
+    return Seen(seen, max(0.0, now - seen.observed_at), alive)
+
+
+def renewed(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.time) -> Seen:
+    """Have the living manager look again, and return what it saw.
+
+    Raises:
+        StateError: It did not within `limit_s`, or it died meanwhile.
+    """
+    asked_at = clock()
+    deadline = time.monotonic() + limit_s
+    with contextlib.suppress(OSError):
+        os.utime(paths.intent)  # the manager watches it; without one, its next tick comes soon
+    while True:
+        seen = read(paths, clock())
+        if seen.age_s is not None and seen.status.observed_at >= asked_at:
+            return seen
+        if not seen.manager_alive or time.monotonic() >= deadline:
+            raise StateError(
+                f"the manager of `{seen.status.pool}` did not look again within {limit_s:.0f} s",
+                "see `fogft logs`; `fogft status` shows what it saw last",
+            )
+        time.sleep(_LOOK_EVERY_S)
+
+
+def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
+    """Look at the cloud and at the client proxy's report, without a manager.
+
+    Raises:
+        PoolNotFound: There is no such pool.
+    """
+    # Not above: `fogft status` needs none of these when a manager lives.
+    from fogft.model.replica import Observed
+    from fogft.planning.observed.health import judge
+    from fogft.planning.observed.history import History
+    from fogft.planning.planner import Plan
+    from fogft.planning.rollout import describe
+    from fogft.pool.manager import proxy_report
+    from fogft.pool.manager.reconciler import Tick
+
+    paths = store.paths
+    identity, spec, intent = store.identity(), store.spec(), store.intent()
+    events = store.recent(1 << 30)
+    history = History(events)
+    report = proxy_report.read(paths.proxy_status, identity.uid)
+    trouble = ["no manager runs: the cloud was asked directly"]
+    try:
+        machines = tuple(cloud.machines(identity.uid))
+    except CloudError as error:
+        machines = None
+        trouble.append(f"the cloud did not answer: {told(error)}")
+    links = report.links if report is not None and report.fresh(now) else None
+    observed = Observed(now, machines, links)
+    health = None if machines is None else judge(identity.uid, spec, observed, history)
+    decided = Plan(wanted=intent.wanted(spec), health=health)
+    found = status.of_tick(
+        Tick(
+            identity,
+            spec,
+            intent,
+            observed,
+            decided,
+            store.membership(),
+            file=store.applied(),
+            update=None
+            if health is None
+            else describe(spec, store.good(), store.trial(), health, decided.wanted),
+        ),
+        history=history,
+        report=report,
+        recent=events[-EVENTS_SHOWN:],
+        epoch=0,
+        manager_pid=0,
+        proxy_alive=disk.is_locked(paths.proxy_lock),
+        notes=trouble,
+    )
+    return Seen(found, 0.0, disk.is_locked(paths.manager_lock))
+
+
+def _unobserved(paths: PoolPaths) -> PoolStatus:
+    """Return the status of a pool whose manager has not looked yet."""
+    from fogft.pool.folder.store import read_identity
+
+    identity = read_identity(paths)
+    return PoolStatus(
+        pool=identity.name,
+        uid=identity.uid,
+        cloud=identity.cloud,
+        file=identity.file,
+        epoch=0,
+        manager_pid=0,
+        observed_at=0.0,
+        cloud_reachable=False,
+        stopping=False,
+        target=0,
+        ready=0,
+        uplink_suspected=False,
+        usd_per_hour=0.0,
+        proxy_pid=None,
+        proxy_alive=disk.is_locked(paths.proxy_lock),
+    )

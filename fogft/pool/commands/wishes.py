@@ -1,0 +1,90 @@
+"""Change what the user wants of a pool besides its file: `scale`, `drain`, `exclude`, `include`.
+
+Each writes the new intent under the pool's lock and returns; the manager, now or when
+there is one again, acts on it.
+
+Owns: reading, changing and writing the intent as one step.
+Not here: what the operations mean (`fogft.model.intent`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fogft import disk
+from fogft.errors import FogftError, PoolBusy, known_slots
+from fogft.model import intent as intents
+from fogft.model.intent import Intent
+from fogft.pool.commands import status as seen
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import PoolStore
+
+
+def scale(store: PoolStore, by: int) -> tuple[int, int]:
+    """Want `by` more replicas (fewer when negative); return how many before and after."""
+    spec = store.spec()
+    before, after = _change(store, lambda intent: intents.scale(intent, spec, by))
+    return before.wanted(spec), after.wanted(spec)
+
+
+def drain(store: PoolStore, slot: int, now: float) -> str:
+    """Have the replica in a slot replaced; return it as ``slot.generation``.
+
+    Raises:
+        FogftError: There is none.
+    """
+    generation = generation_in(store.paths, slot, now)
+    _change(store, lambda intent: intents.drain(intent, slot, generation))
+    return f"{slot}.{generation}"
+
+
+def exclude(store: PoolStore, location: str) -> bool:
+    """Keep out of a location; return whether that is new."""
+    before, after = _change(store, lambda intent: intents.exclude(intent, location))
+    return before != after
+
+
+def include(store: PoolStore, location: str) -> None:
+    """Allow a location again.
+
+    Raises:
+        FogftError: It is not excluded.
+    """
+    _change(store, lambda intent: intents.include(intent, location))
+
+
+def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
+    """Return the highest generation of the replicas last seen in a slot.
+
+    Raises:
+        FogftError: There is none (the hint lists those there are).
+    """
+    status = seen.read(paths, now).status
+    found = [replica.generation for replica in status.replicas if replica.slot == slot]
+    if not found and any(replica.slot == slot for replica in status.by_hand):
+        raise FogftError(
+            f"the replica in slot {slot} of `{status.pool}` was started by hand",
+            "nobody replaces it: end it on its machine; "
+            f"`fogft credentials revoke replica {slot}` shuts it out",
+        )
+    if not found:
+        known = known_slots(replica.slot for replica in status.replicas)
+        raise FogftError(
+            f"pool `{status.pool}` has no replica in slot {slot}", f"slots with a replica: {known}"
+        )
+    return max(found)
+
+
+def _change(store: PoolStore, step: Callable[[Intent], Intent]) -> tuple[Intent, Intent]:
+    """Change a pool's intent under its lock; return it before and after."""
+    with disk.locked(store.paths.intent_lock):
+        store.identity()  # it may have been ended while we waited
+        before = store.intent()
+        if before.stopping:
+            raise PoolBusy(
+                f"pool `{store.paths.folder.name}` is being ended",
+                "let `fogft down` finish, then start it again with `fogft up`",
+            )
+        after = step(before)
+        store.write_intent(after)
+    return before, after

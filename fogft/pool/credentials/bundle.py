@@ -1,0 +1,201 @@
+"""A join bundle: one file that sets up a robot, gateway or replica on another machine.
+
+It is readable JSON around sealed content: the key that seals it is made from a passphrase
+(scrypt), and the readable part is sealed along with it (AES-GCM), so whoever changes a
+byte, the date included, is left with nothing. It can be opened for a limited time only.
+
+Owns: sealing and opening. Not here: what is in it (`joining`), and that it is used once.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fogft.errors import CredentialError
+from fogft.model.certificate_holder import Holder, holder_of
+
+VERSION = 1
+SIZE_LIMIT = 1 << 20
+PASSPHRASE_LEAST = 12
+# 64 MiB and about a fifth of a second a guess. Fixed by the version: a file cannot ask for more.
+_SCRYPT: dict[str, int] = {"n": 1 << 16, "r": 8, "p": 1}
+_SCRYPT_MEMORY = 128 << 20
+_SALT_BYTES, _NONCE_BYTES = 16, 12
+_ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # without what looks alike
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a bundle says of itself before it is opened. Times in seconds since the epoch."""
+
+    id: str
+    pool: str
+    common_name: str
+    issued_at: float
+    open_until: float
+
+    @property
+    def holder(self) -> Holder:
+        """Whom it is for."""
+        return holder_of(self.common_name)
+
+
+def new_passphrase() -> str:
+    """Return a passphrase of 98 random bits that can be read out over the telephone."""
+    return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(4)) for _ in range(5))
+
+
+def check_passphrase(passphrase: str) -> None:
+    """See that a passphrase is long enough.
+
+    Raises:
+        CredentialError: It is not.
+    """
+    if len(passphrase.strip()) < PASSPHRASE_LEAST:
+        raise CredentialError(
+            f"the passphrase has fewer than {PASSPHRASE_LEAST} characters",
+            "without a passphrase of yours, a good one is made and shown",
+        )
+
+
+def seal(label: Label, content: Mapping[str, Any], passphrase: str) -> bytes:
+    """Return a bundle's bytes.
+
+    Raises:
+        CredentialError: The passphrase is too short.
+    """
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+    check_passphrase(passphrase)
+    salt, nonce = secrets.token_bytes(_SALT_BYTES), secrets.token_bytes(_NONCE_BYTES)
+    readable = {
+        "fogft_bundle": VERSION,
+        "id": label.id,
+        "pool": label.pool,
+        "for": label.common_name,
+        "issued_at": label.issued_at,
+        "open_until": label.open_until,
+        "salt": base64.b64encode(salt).decode(),
+        "nonce": base64.b64encode(nonce).decode(),
+    }
+    sealed = AESGCM(_key(passphrase, salt)).encrypt(
+        nonce, json.dumps(content).encode(), _canonical(readable)
+    )
+    whole = {**readable, "sealed": base64.b64encode(sealed).decode()}
+    return (json.dumps(whole, indent=1) + "\n").encode()
+
+
+def read_label(data: bytes) -> Label:
+    """Return what a bundle says of itself. Nothing of it is proved before it is opened.
+
+    Raises:
+        CredentialError: It is no bundle.
+    """
+    return _parse(data)[0]
+
+
+def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[str, Any]]:
+    """Return a bundle's label and content.
+
+    Args:
+        data: The file's bytes.
+        passphrase: What it was sealed with.
+        now: Seconds since the epoch.
+
+    Raises:
+        CredentialError: It is no bundle, the passphrase is wrong, or its time is over.
+    """
+    from cryptography.exceptions import InvalidTag
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+    label, readable, sealed = _parse(data)
+    salt, nonce = _bytes(readable, "salt"), _bytes(readable, "nonce")
+    try:
+        opened = AESGCM(_key(passphrase, salt)).decrypt(nonce, sealed, _canonical(readable))
+        content = json.loads(opened)
+    except InvalidTag:
+        raise CredentialError(
+            "the passphrase is wrong, or the bundle was changed",
+            "it was shown by the `fogft credentials issue` that made this bundle",
+        ) from None
+    except ValueError:
+        raise CredentialError("the bundle's content cannot be read") from None
+    if now >= label.open_until:
+        raise CredentialError(
+            f"this bundle for `{label.holder.short}` is too old: it could be opened until "
+            f"{_utc(label.open_until)}",
+            f"by this machine's clock it is {_utc(now)}; if that is right, have a new one issued",
+        )
+    if not isinstance(content, dict):
+        raise CredentialError("the bundle's content cannot be read")
+    return label, content
+
+
+def _parse(data: bytes) -> tuple[Label, dict[str, Any], bytes]:
+    try:
+        if len(data) > SIZE_LIMIT:
+            raise ValueError("it is too large")
+        raw = json.loads(data)
+        if not isinstance(raw, dict) or type(raw.get("fogft_bundle")) is not int:
+            raise ValueError("it says so nowhere")
+        if raw["fogft_bundle"] != VERSION:
+            raise ValueError(f"it is of version {raw['fogft_bundle']}, not {VERSION}")
+        label = Label(
+            id=_text(raw, "id"),
+            pool=_text(raw, "pool"),
+            common_name=holder_of(_text(raw, "for")).common_name,
+            issued_at=_time(raw, "issued_at"),
+            open_until=_time(raw, "open_until"),
+        )
+        sealed = _bytes(raw, "sealed")
+        if len(_bytes(raw, "salt")) != _SALT_BYTES or len(_bytes(raw, "nonce")) != _NONCE_BYTES:
+            raise ValueError("its salt or nonce is of the wrong length")
+    except (ValueError, RecursionError) as error:
+        raise CredentialError(
+            f"this is no join bundle: {error}", "`fogft credentials issue` makes them"
+        ) from None
+    return label, {key: value for key, value in raw.items() if key != "sealed"}, sealed
+
+
+def _key(passphrase: str, salt: bytes) -> bytes:
+    return hashlib.scrypt(
+        passphrase.strip().encode(), salt=salt, dklen=32, maxmem=_SCRYPT_MEMORY, **_SCRYPT
+    )
+
+
+def _canonical(readable: Mapping[str, Any]) -> bytes:
+    return json.dumps(readable, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _text(raw: Mapping[str, Any], key: str) -> str:
+    value = raw.get(key)
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 200:
+        raise ValueError(f"its `{key}` is none")
+    return value
+
+
+def _time(raw: Mapping[str, Any], key: str) -> float:
+    value = raw.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1e11:
+        raise ValueError(f"its `{key}` is no time")
+    return float(value)
+
+
+def _bytes(raw: Mapping[str, Any], key: str) -> bytes:
+    try:
+        return base64.b64decode(raw.get(key, ""), validate=True)
+    except (binascii.Error, TypeError) as error:
+        raise ValueError(f"its `{key}` is damaged") from error
+
+
+def _utc(seconds: float) -> str:
+    import datetime
+
+    return f"{datetime.datetime.fromtimestamp(seconds, datetime.timezone.utc):%Y-%m-%d %H:%M} UTC"

@@ -1,0 +1,139 @@
+"""Use a join bundle up for everybody: who opens it says so at the rendezvous, before all else.
+
+The claim is the holder's own record, signed with the key that the bundle brings: whoever
+joined has spoken under that name and generation, and everybody keeps that. A second machine
+finds the record of the first and joins nothing. Of two that join in the same moment the
+earlier one stands, whichever rendezvous each has reached.
+
+Owns: making a claim and finding another's. Not here: opening bundles (`joining`), records.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from fogft import disk
+from fogft.errors import CredentialError
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model.certificate_holder import Holder, Role
+from fogft.records.client import RendezvousClient
+from fogft.records.record import Record, RecordKind
+from fogft.records.roster import DialIn, SlotState
+
+LIMIT_S = 15.0
+SETTLE_S = 0.5
+_POLL_S = 0.02
+_KEY = "joined"
+_LATEST_MS = 10**13
+_KEPT = 1000  # claims that this machine remembers
+_KINDS = {
+    Role.ROBOT: RecordKind.ROBOT,
+    Role.GATEWAY: RecordKind.GATEWAY,
+    Role.REPLICA: RecordKind.SLOT,
+}
+
+
+def new_token(now: float) -> str:
+    """Return what tells one claim from another; of two, the earlier is the greater text.
+
+    Records of one order are told apart by their bytes, and the greater stands (`record_set`).
+    """
+    return f"{_LATEST_MS - int(now * 1000):013d}.{secrets.token_hex(8)}"
+
+
+def own_token(claims: Path, id: str, now: float) -> str:
+    """Return this machine's claim to a bundle: the same again where it was ended in between.
+
+    Raises:
+        StateError: It cannot be written down.
+    """
+    known = dict(disk.read_json(claims) or {})
+    if id not in known:
+        latest = dict(list(known.items())[-_KEPT:])
+        disk.write_json(claims, known := {**latest, id: new_token(now)})
+    return str(known[id])
+
+
+def claim(
+    holder: Holder,
+    token: str,
+    endpoints: Sequence[str],
+    credentials: CredentialPaths,
+    *,
+    limit_s: float = LIMIT_S,
+    settle_s: float = SETTLE_S,
+    clock: Callable[[], float] = time.monotonic,
+) -> None:
+    """Claim a holder's certificate for this machine. Repeatable with the same token.
+
+    A rendezvous's own is not claimed: it can neither ask, answer nor sign anything.
+
+    Args:
+        holder: Whom the bundle is for.
+        token: This machine's, from `new_token`.
+        endpoints: ``host:port`` of each rendezvous of the pool.
+        credentials: What the bundle brought.
+        limit_s: How long to try.
+        settle_s: How long another's word may take on its way, when several join at once.
+        clock: Monotonic seconds.
+
+    Raises:
+        CredentialError: Another machine has joined with it, or nobody can tell.
+    """
+    if holder.role not in _KINDS:
+        return
+    # Two ends: what the second hears is what the rendezvous holds, whatever the first has said.
+    speaker, hearer = (RendezvousClient(endpoints, credentials, holder.pool_uid) for _ in range(2))
+    until = clock() + limit_s
+    speaker.start()
+    hearer.start()
+    try:
+        said = _content(holder.role, token)
+        # The second makes it stand above any other claim that comes later.
+        for sequence, pause_s in ((1, settle_s), (2, 0.0)):
+            kind, generation = _KINDS[holder.role], holder.generation
+            speaker.publish(kind, holder.name, generation, said, sequence=sequence)
+            while _standing(hearer, holder, sequence) is None:
+                if clock() > until:
+                    raise _nobody_tells(hearer)
+                time.sleep(_POLL_S)
+            time.sleep(pause_s)
+            found = _standing(hearer, holder, sequence)
+            if found is None or found.content.get(_KEY) != token:
+                raise _used_elsewhere(holder)
+    finally:
+        speaker.close()
+        hearer.close()
+
+
+def _content(role: Role, token: str) -> dict[str, object]:
+    said = SlotState().to_content() if role is Role.REPLICA else DialIn().to_content()
+    return {**said, _KEY: token}
+
+
+def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record | None:
+    """Return what stands for a holder, once it is as late as this claim or another's."""
+    for record in client.known.of(_KINDS[holder.role]):
+        if record.subject == holder.name and record.order >= (holder.generation, sequence):
+            return record
+    return None
+
+
+def _used_elsewhere(holder: Holder) -> CredentialError:
+    return CredentialError(
+        f"this bundle for `{holder.short}` was used before, on another machine",
+        "each is good for one time: have a new one issued. If nobody of yours has used it: "
+        f"`fogft credentials revoke {holder.role.value} {holder.name}`",
+    )
+
+
+def _nobody_tells(client: RendezvousClient) -> CredentialError:
+    said = "; ".join(str(one["detail"]) for one in client.status()["rendezvous"])
+    return CredentialError(
+        "no rendezvous of the pool tells whether this bundle was used on another machine"
+        + (f": {said}" if said.strip("; ") else ""),
+        "join while one runs and can be reached from here; the bundle is as good as before",
+    )

@@ -1,0 +1,213 @@
+"""Which certificates a pool's CA has issued, and which of them were taken back.
+
+Every issue is on disk before its certificate leaves this module, so nothing that the CA
+ever signed is missing from the list, and no generation of a name is used twice. Keys are
+not in it.
+
+Owns: ``issued.json`` beside the CA, written under its lock by the manager and by commands.
+Not here: making certificates (`credentials`), telling others of a revocation (`manager`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.errors import CredentialError, StateError
+from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.groups import FIRST_BY_HAND
+from fogft.model.replica import ReplicaId
+from fogft.pool.credentials import authority
+from fogft.pool.credentials.authority import Credential
+
+_DAY_S = 86_400.0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One certificate. Times in seconds since the epoch.
+
+    Attributes:
+        revoked_at: When it was taken back; None if it was not.
+    """
+
+    common_name: str
+    serial: str
+    issued_at: float
+    not_after: float
+    revoked_at: float | None = None
+
+    @property
+    def holder(self) -> Holder:
+        """Whom it names."""
+        return holder_of(self.common_name)
+
+    def state(self, now: float) -> str:
+        """Return ``revoked``, ``expired`` or ``good``."""
+        if self.revoked_at is not None:
+            return "revoked"
+        return "expired" if now >= self.not_after else "good"
+
+
+class Ledger:
+    """A pool's list of certificates. Safe to use from several processes.
+
+    Args:
+        folder: Holds the CA.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
+        self.path = folder / "issued.json"
+        self._folder = folder
+        self._lock = folder / "issued.lock"
+        self._clock = clock
+
+    def entries(self) -> tuple[Entry, ...]:
+        """Return all certificates, oldest first.
+
+        Raises:
+            StateError: The list is damaged.
+        """
+        raw = disk.read_json(self.path)
+        if raw is None:
+            return ()
+        try:
+            return tuple(_entry(one) for one in raw["issued"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise StateError(
+                f"`{self.path}` is damaged: {error}",
+                "without it nobody knows what was revoked; `fogft down` and `up` begin anew",
+            ) from error
+
+    def revoked(self) -> frozenset[str]:
+        """Return the common names that were taken back."""
+        return frozenset(e.common_name for e in self.entries() if e.revoked_at is not None)
+
+    def by_hand(self) -> frozenset[ReplicaId]:
+        """Return the replicas that people start themselves, and whose certificates are good."""
+        good = [e.holder for e in self.entries() if e.state(self._clock()) == "good"]
+        return frozenset(
+            ReplicaId(h.pool_uid, int(h.name), h.generation)
+            for h in good
+            if h.role is Role.REPLICA and int(h.name) >= FIRST_BY_HAND
+        )
+
+    def gateways(self) -> dict[str, tuple[int, ...]]:
+        """Return the good generations of each gateway's certificates, by name."""
+        found: dict[str, tuple[int, ...]] = {}
+        for entry in self.entries():
+            holder = entry.holder
+            if holder.role is Role.GATEWAY and entry.state(self._clock()) == "good":
+                found[holder.name] = (*found.get(holder.name, ()), holder.generation)
+        return found
+
+    def issue(self, holder: Holder, *, days: float) -> Credential:
+        """Certify a holder, and remember it.
+
+        Raises:
+            CredentialError: The CA cannot be used, or this very name is revoked.
+            StateError: It cannot be remembered; nothing was issued.
+        """
+        with disk.locked(self._lock):
+            return self._issue(holder, self.entries(), days)
+
+    def issue_next(
+        self, role: Role, name: str, pool_uid: str, *, days: float
+    ) -> tuple[Holder, Credential]:
+        """Certify the next generation of a name, and remember it.
+
+        Raises:
+            CredentialError: The CA cannot be used, or the name fits no certificate.
+            StateError: It cannot be remembered; nothing was issued.
+        """
+        with disk.locked(self._lock):
+            entries = self.entries()
+            used = [e.holder.generation for e in entries if _is(e, role, name)]
+            holder = Holder(role, name, max(used, default=0) + 1, pool_uid)
+            try:
+                holder_of(holder.common_name)
+            except ValueError:
+                raise CredentialError(
+                    f"a {role.value} cannot be named `{name}`",
+                    "use a slot's number"
+                    if role is Role.REPLICA
+                    else "use letters, digits and dashes, 28 at most",
+                ) from None
+            return holder, self._issue(holder, entries, days)
+
+    def _issue(self, holder: Holder, entries: tuple[Entry, ...], days: float) -> Credential:
+        if any(e.common_name == holder.common_name and e.revoked_at for e in entries):
+            raise CredentialError(
+                f"the certificate of {holder.role.value} `{holder.short}` is revoked",
+                "`fogft credentials issue` makes its next generation",
+            )
+        issued = authority.issue(self._folder, holder.common_name, role=holder.role, days=days)
+        said = authority.describe_pem(issued.certificate_pem)
+        entry = Entry(holder.common_name, said.serial, self._clock(), said.not_after.timestamp())
+        self._write((*self._kept(entries), entry))
+        return issued
+
+    def revoke(self, holders: Iterable[Holder]) -> None:
+        """Take certificates back, for good. Repeatable.
+
+        Raises:
+            StateError: It cannot be written; nothing was revoked.
+        """
+        names, now = {holder.common_name for holder in holders}, self._clock()
+        with disk.locked(self._lock):
+            self._write(
+                replace(e, revoked_at=now) if e.common_name in names and e.revoked_at is None else e
+                for e in self.entries()
+            )
+
+    def named(self, role: Role, name: str) -> list[Holder]:
+        """Return the holders that a role and ``name`` or ``name.generation`` mean.
+
+        Raises:
+            CredentialError: There is none (the hint lists those there are).
+        """
+        holders = list(dict.fromkeys(e.holder for e in self.entries() if e.revoked_at is None))
+        found = [h for h in holders if h.role is role and name in (h.name, h.short)]
+        if not found:
+            known = ", ".join(f"`{h.short}`" for h in holders if h.role is role) or "none"
+            raise CredentialError(
+                f"there is no certificate of {role.value} `{name}` to revoke",
+                f"those of this role that are not revoked: {known}",
+            )
+        return found
+
+    def _kept(self, entries: Iterable[Entry]) -> list[Entry]:
+        """Return what must be remembered: what is valid, and each name's last generation."""
+        now = self._clock()
+        last = {(e.holder.role, e.holder.name): e for e in entries}
+        return [
+            e
+            for e in entries
+            if now < e.not_after + _DAY_S or last[(e.holder.role, e.holder.name)] is e
+        ]
+
+    def _write(self, entries: Iterable[Entry]) -> None:
+        disk.write_json(self.path, {"issued": [asdict(entry) for entry in entries]})
+
+
+def _is(entry: Entry, role: Role, name: str) -> bool:
+    holder = entry.holder
+    return (holder.role, holder.name) == (role, name)
+
+
+def _entry(raw: Any) -> Entry:
+    revoked_at = raw["revoked_at"]
+    entry = Entry(
+        common_name=str(raw["common_name"]),
+        serial=str(raw["serial"]),
+        issued_at=float(raw["issued_at"]),
+        not_after=float(raw["not_after"]),
+        revoked_at=None if revoked_at is None else float(revoked_at),
+    )
+    holder_of(entry.common_name)
+    return entry

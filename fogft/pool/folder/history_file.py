@@ -1,0 +1,120 @@
+"""What happened in a pool, as lines of a file: an event is on disk before anything follows from it.
+
+A launch is written before the cloud is asked, so that its generation is never used twice.
+
+Owns: `history.jsonl`. Not here: what follows from events (`fogft.planning.observed.history`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.errors import StateError
+from fogft.planning.observed.history import Event, History, compacted
+
+COMPACT_AFTER = 20_000
+
+
+class HistoryFile:
+    """The events of one pool. Safe to use from several threads; one process writes it.
+
+    Args:
+        path: Where; made with the first event.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(self, path: Path, clock: Callable[[], float]) -> None:
+        self._path = path
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._history: History | None = None
+        self._appended = 0
+
+    def history(self) -> History:
+        """Return what happened so far."""
+        with self._lock:
+            if self._history is None:
+                self._history = History(self._load())
+            return self._history
+
+    def append(self, event: Event) -> None:
+        """Remember an event, on disk before this returns.
+
+        Raises:
+            StateError: It cannot be written. The event did not happen.
+        """
+        history = self.history()
+        with self._lock:
+            try:
+                _append_durably(self._path, _line(event).encode())
+            except OSError as error:
+                raise StateError(
+                    f"`{self._path}` cannot be written: {error.strerror}",
+                    "check the disk's free space and the folder's owner",
+                ) from error
+            history.add(event)
+            self._appended += 1
+            if self._appended >= COMPACT_AFTER:
+                self._history = History(self._load())
+
+    def recent(self, count: int) -> list[Event]:
+        """Return the last events, oldest first."""
+        return _read_events(self._path)[-count:]
+
+    def _load(self) -> list[Event]:
+        events = _read_events(self._path)
+        kept = compacted(events, self._clock())
+        self._appended = 0
+        if len(kept) < len(events):
+            disk.write_whole(self._path, "".join(map(_line, kept)))
+        return kept
+
+
+def _line(event: Event) -> str:
+    return json.dumps(event.to_json()) + "\n"
+
+
+def _append_durably(path: Path, line: bytes) -> None:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    try:
+        size = os.fstat(descriptor).st_size
+        if size and os.pread(descriptor, 1, size - 1) != b"\n":
+            line = b"\n" + line  # a crash left a torn last line: it stays alone on its own
+        if os.write(descriptor, line) != len(line):
+            os.ftruncate(descriptor, size)
+            raise OSError(28, "No space left on device")
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _read_events(path: Path) -> list[Event]:
+    """Return the events of a file, without a torn last line and what else is damaged.
+
+    A line that cannot be read is skipped but its generation cannot be: the cloud's list
+    then still keeps generations from being used twice.
+    """
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return []
+    events: list[Event] = []
+    for line in lines:
+        event = _event(line)
+        if event is not None:
+            events.append(event)
+    return events
+
+
+def _event(line: bytes) -> Event | None:
+    try:
+        value: Any = json.loads(line)
+        return Event.from_json(value)
+    except (ValueError, StateError):
+        return None

@@ -1,0 +1,82 @@
+"""The manager's office: one holder a pool, an epoch for each, a beat while it works.
+
+The lock keeps two managers of one folder apart; the epoch, which goes into every
+membership, fences off what an earlier one may still write; the beat tells the proxies
+(and through them the replicas) that somebody looks after the pool.
+
+Owns: `manager.lock` and `lease.json`.
+"""
+
+from __future__ import annotations
+
+import os
+
+from fogft import disk
+from fogft.errors import PoolBusy, StateError
+from fogft.pool.folder.paths import PoolPaths
+
+
+class Lease:
+    """Held from `take` to `release` or the end of the process."""
+
+    def __init__(self, paths: PoolPaths, lock: disk.Lock, epoch: int) -> None:
+        self._paths = paths
+        self._lock = lock
+        self._beat = 0
+        self.epoch = epoch
+
+    @classmethod
+    def take(cls, paths: PoolPaths, *, at_least: int = 0) -> Lease:
+        """Take office under an epoch above all earlier ones, and above `at_least`.
+
+        Raises:
+            PoolBusy: Another manager is in office.
+            StateError: The lease cannot be written.
+        """
+        lock = disk.Lock(paths.manager_lock)
+        if not lock.acquire(wait=False):
+            raise PoolBusy(
+                f"pool `{paths.folder.name}` has a manager already"
+                + (f" (pid {pid})" if (pid := read_pid(paths)) else "")
+            )
+        lease = cls(paths, lock, max(_read_epoch(paths), at_least) + 1)
+        lease._write()
+        return lease
+
+    def beat(self) -> None:
+        """Show that the manager works.
+
+        Raises:
+            PoolBusy: A later manager is in office: this one must stop at once.
+            StateError: The lease cannot be written.
+        """
+        if _read_epoch(self._paths) > self.epoch:
+            raise PoolBusy(f"pool `{self._paths.folder.name}` has a later manager")
+        self._beat += 1
+        self._write()
+
+    def _write(self) -> None:
+        value = {"epoch": self.epoch, "pid": os.getpid(), "beat": self._beat}
+        disk.write_json(self._paths.lease, value, durable=self._beat == 0)
+
+    def release(self) -> None:
+        """Leave office. Repeatable."""
+        self._lock.release()
+
+
+def read_pid(paths: PoolPaths) -> int | None:
+    """Return the process id of the manager last in office, if it is known."""
+    return _read_number(paths, "pid")
+
+
+def _read_epoch(paths: PoolPaths) -> int:
+    return _read_number(paths, "epoch") or 0
+
+
+def _read_number(paths: PoolPaths, key: str) -> int | None:
+    try:
+        raw = disk.read_json(paths.lease)
+    except StateError:
+        return None
+    value = raw.get(key) if isinstance(raw, dict) else None
+    return value if isinstance(value, int) and not isinstance(value, bool) else None

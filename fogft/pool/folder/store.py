@@ -1,0 +1,274 @@
+"""What a pool remembers on disk, as the manager and the commands read and write it.
+
+Owns: identity, spec, intent and membership: their files.
+Not here: what to remember (`fogft.core`), what happened (`history_file`) and how a file is replaced
+(`fogft.disk`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Protocol
+
+from fogft import disk
+from fogft.errors import PoolNotFound, SpecError, StateError
+from fogft.model import intent as intents
+from fogft.model import membership as memberships
+from fogft.model.intent import Intent
+from fogft.model.names import POOL_UID_PATTERN
+from fogft.model.replica import Membership
+from fogft.model.spec import PoolSpec
+from fogft.planning.observed.history import Event, History
+from fogft.planning.rollout import Trial
+from fogft.pool.folder import discovered
+from fogft.pool.folder.history_file import HistoryFile
+from fogft.pool.folder.paths import PoolPaths
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a pool is, for good.
+
+    Attributes:
+        uid: 16 random hexadecimal digits.
+        file: Absolute path of the pool file.
+        created_at: Seconds since the epoch.
+    """
+
+    name: str
+    uid: str
+    cloud: str
+    file: str
+    created_at: float
+
+
+class Store(Protocol):
+    """What the reconciler needs to remember and to be told."""
+
+    def identity(self) -> Identity:
+        """Return what the pool is."""
+
+    def spec(self) -> PoolSpec:
+        """Return the pool file in force: as applied last, or the good one after a rollback."""
+
+    def applied(self) -> str:
+        """Return the digest of the pool file that was applied last."""
+
+    def good(self) -> PoolSpec | None:
+        """Return the last file with which the pool was wholly ready; None for none yet."""
+
+    def keep_good(self, spec: PoolSpec) -> bool:
+        """Keep the file that `spec` was read from as the good one, if it was read last."""
+
+    def trial(self) -> Trial:
+        """Return what is remembered of the file applied last, or of an earlier one."""
+
+    def write_trial(self, trial: Trial) -> None:
+        """Remember it."""
+
+    def intent(self) -> Intent:
+        """Return what the user wants besides the file."""
+
+    def history(self) -> History:
+        """Return what happened so far, `append`ed events included."""
+
+    def append(self, event: Event) -> None:
+        """Remember an event; when this returns it survives a crash."""
+
+    def membership(self) -> Membership | None:
+        """Return the membership as last written."""
+
+    def write_membership(self, membership: Membership) -> None:
+        """Publish a membership."""
+
+
+class PoolStore:
+    """A pool's folder. Safe to use from several threads; one process writes each file.
+
+    Args:
+        paths: Where.
+        parse: Reads a pool file's text: ``parse(text, file) -> PoolSpec``.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(
+        self,
+        paths: PoolPaths,
+        parse: Callable[[str, str], PoolSpec],
+        clock: Callable[[], float],
+    ) -> None:
+        self.paths = paths
+        self._parse = parse
+        self._events = HistoryFile(paths.history, clock)
+        self._spec: tuple[bytes, PoolSpec] | None = None
+        self._good: tuple[bytes, PoolSpec] | None = None
+
+    def identity(self) -> Identity:
+        """Return what the pool is.
+
+        Raises:
+            PoolNotFound: There is none.
+            StateError: Its file is damaged.
+        """
+        return read_identity(self.paths)
+
+    def spec(self) -> PoolSpec:
+        """Return the pool file in force: as applied last, or the good one after a rollback.
+
+        Where it lists no services, what was discovered is with it.
+
+        Raises:
+            PoolNotFound: There is none.
+            SpecError: It is wrong (`up` never stores such a file).
+        """
+        raw = self._applied()
+        trial = self.trial()
+        if trial.fault and trial.file == digest(raw):
+            good = self.good()
+            if good is not None:
+                return good
+        if self._spec is None or self._spec[0] != raw:
+            self._spec = (raw, self._read(raw))
+        self._spec = self._completed(self._spec)
+        return self._spec[1]
+
+    def _completed(self, read: tuple[bytes, PoolSpec]) -> tuple[bytes, PoolSpec]:
+        """Add what was discovered to a spec that lists no services; the same object if known."""
+        raw, spec = read
+        if not spec.services:
+            found = discovered.read(self.paths.discovered).specs()
+            if found != spec.discovered:
+                return raw, replace(spec, discovered=found)
+        return read
+
+    def _read(self, raw: bytes) -> PoolSpec:
+        return self._parse(raw.decode(), self.identity().file)
+
+    def _applied(self) -> bytes:
+        try:
+            return self.paths.spec.read_bytes()
+        except FileNotFoundError:
+            raise PoolNotFound(f"pool `{self.paths.folder.name}` has no spec") from None
+
+    def applied(self) -> str:
+        """Return the digest of the pool file that was applied last.
+
+        Raises:
+            PoolNotFound: There is none.
+        """
+        return digest(self._applied())
+
+    def good(self) -> PoolSpec | None:
+        """Return the last file with which the pool was wholly ready; None for none yet."""
+        try:
+            raw = self.paths.good_spec.read_bytes()
+        except FileNotFoundError:
+            return None
+        if self._good is None or self._good[0] != raw:
+            try:
+                self._good = (raw, self._read(raw))
+            except SpecError:  # it was good for a version of fogft that knew other keys
+                return None
+        self._good = self._completed(self._good)
+        return self._good[1]
+
+    def keep_good(self, spec: PoolSpec) -> bool:
+        """Keep the file that `spec` was read from as the good one, if it was read last.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        if self._spec is None or self._spec[1] is not spec:
+            return False
+        disk.write_whole(self.paths.good_spec, self._spec[0])
+        return True
+
+    def trial(self) -> Trial:
+        """Return what is remembered of the file applied last, or of an earlier one."""
+        try:
+            raw = disk.read_json(self.paths.trial)
+            return Trial() if raw is None else Trial(**raw)
+        except (StateError, TypeError):
+            return Trial()  # damaged: the file is tried again
+
+    def write_trial(self, trial: Trial) -> None:
+        """Remember it.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        disk.write_json(self.paths.trial, asdict(trial))
+
+    def intent(self) -> Intent:
+        """Return what the user wants besides the file; nothing where nothing was asked."""
+        raw = disk.read_json(self.paths.intent)
+        return Intent() if raw is None else intents.from_json(raw)
+
+    def write_intent(self, intent: Intent) -> None:
+        """Store the user's wishes; the caller holds `intent_lock`."""
+        disk.write_json(self.paths.intent, intents.to_json(intent))
+
+    def history(self) -> History:
+        """Return what happened so far."""
+        return self._events.history()
+
+    def append(self, event: Event) -> None:
+        """Remember an event, on disk before this returns.
+
+        Raises:
+            StateError: It cannot be written. The event did not happen.
+        """
+        self._events.append(event)
+
+    def recent(self, count: int = 20) -> list[Event]:
+        """Return the last events, oldest first."""
+        return self._events.recent(count)
+
+    def membership(self) -> Membership | None:
+        """Return the membership as last written; None where it is missing or damaged."""
+        try:
+            raw = disk.read_json(self.paths.membership)
+            return None if raw is None else memberships.from_dict(raw)
+        except StateError:
+            return None
+
+    def write_membership(self, membership: Membership) -> None:
+        """Publish a membership."""
+        disk.write_json(self.paths.membership, memberships.to_dict(membership))
+
+
+def digest(source: bytes) -> str:
+    """Return 16 hexadecimal digits that name a pool file's text."""
+    return hashlib.sha256(source).hexdigest()[:16]
+
+
+def read_identity(paths: PoolPaths) -> Identity:
+    """Return what the pool in a folder is.
+
+    Raises:
+        PoolNotFound: There is none.
+        StateError: Its file is damaged.
+    """
+    raw = disk.read_json(paths.identity)
+    if raw is None:
+        raise PoolNotFound(f"there is no pool `{paths.folder.name}`", "`fogft up FILE` starts one")
+    try:
+        identity = Identity(
+            name=str(raw["name"]),
+            uid=str(raw["uid"]),
+            cloud=str(raw["cloud"]),
+            file=str(raw["file"]),
+            created_at=float(raw["created_at"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise StateError(f"`{paths.identity}` is damaged: {error!r}") from error
+    if not POOL_UID_PATTERN.fullmatch(identity.uid):
+        raise StateError(f"`{paths.identity}` is damaged: `uid` is not 16 hexadecimal digits")
+    return identity
+
+
+def write_identity(paths: PoolPaths, identity: Identity) -> None:
+    """Store what a pool is; the caller holds `intent_lock`."""
+    disk.write_json(paths.identity, asdict(identity))

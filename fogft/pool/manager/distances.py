@@ -1,0 +1,234 @@
+"""How far regions are from the robot: told, measured, or guessed, in this order.
+
+    the pool file's `rtt_s`, links to replicas, connects to regional endpoints, great circles
+
+A connect is timed on its own, after the name is resolved; the fastest of a few counts, for
+everything slower is somebody's queue. Measurements are kept in the home folder for a day and
+renewed in the background. A link refines what is known of a region otherwise: where nothing
+else is known, a region with a replica would look nearer than all others.
+
+Owns: measuring, keeping, and the order above.
+Not here: what answers where (`fogft.cloud.geography`), what distances are for (`score`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from fogft import disk
+from fogft.cloud import geography
+from fogft.errors import StateError
+from fogft.model.choices import PlacementSpec
+from fogft.model.replica import LinkReport, LinkState, Machine, Offer
+from fogft.model.spec import PoolSpec
+
+FRESH_S = 86_400.0
+RETRY_S = 900.0
+CONNECTS = 3
+CONNECT_LIMIT_S = 2.0
+REMEMBERED_RTTS = 31
+
+Endpoint = Callable[[str], "tuple[str, int] | None"]
+
+
+@dataclass(frozen=True)
+class Distance:
+    """A round trip, and how it is known.
+
+    Attributes:
+        source: ``pool file``, ``links``, ``measured`` or ``estimated``.
+        as_of: When it was measured, in seconds since the epoch; 0 where that means nothing.
+    """
+
+    rtt_s: float
+    source: str
+    as_of: float = 0.0
+
+
+def connect_time(host: str, port: int) -> float:
+    """Return how long a TCP connect takes, in seconds: about one round trip.
+
+    Raises:
+        OSError: Nothing answers.
+    """
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    times = []
+    for _ in range(CONNECTS):
+        family, kind, protocol, _, address = found[0]
+        with socket.socket(family, kind, protocol) as one:
+            one.settimeout(CONNECT_LIMIT_S)
+            began = time.perf_counter()
+            one.connect(address)
+            times.append(time.perf_counter() - began)
+    return min(times)
+
+
+class Latencies:
+    """What is known of distances on this machine, by ``cloud/region``.
+
+    Args:
+        file: Where measurements are kept.
+        clock: Seconds since the epoch.
+        endpoint: What answers in a region.
+        connect: Times one connect; `connect_time` unless told.
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        *,
+        clock: Callable[[], float] = time.time,
+        endpoint: Endpoint = geography.endpoint,
+        connect: Callable[[str, int], float] | None = None,
+    ) -> None:
+        self._file = file
+        self._clock = clock
+        self._endpoint = endpoint
+        self._connect = connect or connect_time
+
+    def measured(self) -> Mapping[str, Distance]:
+        """Return what was measured here, whatever its age. A damaged file holds nothing."""
+        with contextlib.suppress(StateError, OSError):
+            raw = disk.read_json(self._file)
+            if isinstance(raw, dict):
+                return {k: d for k, v in raw.items() if (d := _distance(v)) is not None}
+        return {}
+
+    def stale(self, regions: Collection[str]) -> list[str]:
+        """Return the regions that should be measured: never, or a day ago, or in the future."""
+        kept, now = self.measured(), self._clock()
+        return sorted(
+            region
+            for region in regions
+            if self._endpoint(region) is not None
+            and not (region in kept and 0 <= now - kept[region].as_of < FRESH_S)
+        )
+
+    def measure(self, regions: Iterable[str]) -> Mapping[str, str]:
+        """Measure regions side by side and keep the results; return what failed, with why."""
+        wanted = [(r, e) for r in sorted(set(regions)) if (e := self._endpoint(r)) is not None]
+        if not wanted:
+            return {}
+        now, failed = self._clock(), {}
+        found: dict[str, Distance] = {}
+        with ThreadPoolExecutor(min(8, len(wanted)), "latency") as pool:
+            for (region, _), result in zip(wanted, pool.map(self._try, wanted), strict=True):
+                if isinstance(result, float):
+                    found[region] = Distance(result, "measured", now)
+                else:
+                    failed[region] = result
+        if found:
+            kept = {**self.measured(), **found}
+            plain = {r: {"rtt_s": d.rtt_s, "as_of": d.as_of} for r, d in kept.items()}
+            disk.make_folder(self._file.parent)
+            disk.write_json(self._file, plain, durable=False)
+        return failed
+
+    def known(
+        self, regions: Iterable[str], placement: PlacementSpec, links: Mapping[str, float]
+    ) -> dict[str, Distance]:
+        """Return the best that is known of each region; regions of which nothing is are left out.
+
+        Args:
+            regions: ``cloud/region``.
+            placement: The pool file's word.
+            links: Round trips to running replicas by region.
+        """
+        measured, out = self.measured(), {}
+        for region in regions:
+            told = placement.rtt_s.get(region, placement.rtt_s.get(region.split("/")[0]))
+            if told is not None:
+                out[region] = Distance(told, "pool file")
+                continue
+            found = measured.get(region) or _estimated(region, placement)
+            if found is not None:
+                out[region] = Distance(links[region], "links") if region in links else found
+        return out
+
+    def _try(self, wanted: tuple[str, tuple[str, int]]) -> float | str:
+        try:
+            return self._connect(*wanted[1])
+        except OSError as error:
+            return str(error)
+
+
+class Distances:
+    """What the manager hands to its planner each tick. Measures in the background.
+
+    Args:
+        latencies: What is known on this machine.
+        submit: Runs a function on another thread.
+    """
+
+    def __init__(
+        self, latencies: Latencies, submit: Callable[[Callable[[], object]], object]
+    ) -> None:
+        self._latencies = latencies
+        self._submit = submit
+        self._looked_at = -math.inf
+        self._rtts: dict[str, deque[float]] = {}
+        self._busy = threading.Lock()
+
+    def __call__(
+        self,
+        spec: PoolSpec,
+        offers: Sequence[Offer],
+        machines: Sequence[Machine],
+        links: Sequence[LinkReport],
+    ) -> Mapping[str, float]:
+        """Return ``cloud/region`` -> round trip in seconds, where it is known."""
+        regions = regions_of(offers)
+        now = time.monotonic()
+        if regions and now - self._looked_at >= RETRY_S:
+            self._looked_at = now
+            self._submit(lambda: self._renew(regions))
+        known = self._latencies.known(regions, spec.placement, self._from_links(machines, links))
+        return {region: distance.rtt_s for region, distance in known.items()}
+
+    def _renew(self, regions: Collection[str]) -> None:
+        if self._busy.acquire(blocking=False):
+            try:
+                self._latencies.measure(self._latencies.stale(regions))
+            finally:
+                self._busy.release()
+
+    def _from_links(
+        self, machines: Sequence[Machine], links: Sequence[LinkReport]
+    ) -> dict[str, float]:
+        """Return the median of the last round trips by region: one slow probe moves nothing."""
+        where = {m.id: f"{m.placement.cloud}/{m.placement.region}" for m in machines}
+        for link in links:
+            if link.rtt_s is not None and link.state is LinkState.UP and link.id in where:
+                kept = self._rtts.setdefault(where[link.id], deque(maxlen=REMEMBERED_RTTS))
+                kept.append(link.rtt_s)
+        return {region: statistics.median(kept) for region, kept in self._rtts.items()}
+
+
+def regions_of(offers: Iterable[Offer]) -> set[str]:
+    """Return the ``cloud/region`` of offers."""
+    return {f"{o.placement.cloud}/{o.placement.region}" for o in offers}
+
+
+def _estimated(region: str, placement: PlacementSpec) -> Distance | None:
+    there = geography.position(region)
+    if placement.robot_at is None or there is None:
+        return None
+    return Distance(geography.estimated_rtt_s(placement.robot_at, there), "estimated")
+
+
+def _distance(raw: object) -> Distance | None:
+    try:
+        rtt_s, as_of = float(raw["rtt_s"]), float(raw["as_of"])  # type: ignore[index]
+    except (KeyError, TypeError, ValueError):
+        return None
+    return Distance(rtt_s, "measured", as_of) if 0 < rtt_s < 60 and math.isfinite(as_of) else None

@@ -1,0 +1,307 @@
+"""The manager: one process a pool that ticks, once a second or when something changes.
+
+SIGTERM ends the managing, never the pool: replicas and the client proxy run on, and the
+next manager takes over what it finds.
+
+Owns: the loop, what wakes it, and the pool's status file.
+Not here: a tick's work (`reconciler`), the client proxy's life (`proxy_supervisor`).
+"""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from fogft import disk, logfile
+from fogft.cloud.port import Cloud
+from fogft.errors import FogftError, PoolBusy, PoolNotFound
+from fogft.metrics.scrape import Scrape
+from fogft.model.replica import LinkReport
+from fogft.planning import lifetime
+from fogft.pool.credentials.ledger import Ledger
+from fogft.pool.folder.discovered import Discovery
+from fogft.pool.folder.lease import Lease
+from fogft.pool.folder.paths import latency_file
+from fogft.pool.folder.store import Identity, PoolStore
+from fogft.pool.manager import clocks, configuration, proxy_report, shutdown, status, teardown
+from fogft.pool.manager import metrics as measures
+from fogft.pool.manager.announcing import ManagerRecords
+from fogft.pool.manager.distances import Distances, Latencies
+from fogft.pool.manager.proxy_supervisor import ProxySupervisor
+from fogft.pool.manager.reconciler import Reconciler, Tick
+
+log = logging.getLogger(__name__)
+
+TICK_S = 1.0
+WATCH_S = 0.05
+CERTIFY_EVERY_S = 3600.0
+LEAVE_LIMIT_S = 60.0  # then it is tried again in the next round
+
+
+def on_thread(run: Callable[[], object]) -> None:
+    """Run a function on a thread that does not keep the process alive."""
+    threading.Thread(target=run, daemon=True).start()
+
+
+class Manager:
+    """Manages one pool until told to stop. Holds the pool's lease from the start.
+
+    Args:
+        store: The pool's folder.
+        cloud: Where its machines run.
+        proxy_command: What to start as client proxy, in place of our own.
+        metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
+
+    Raises:
+        PoolBusy: The pool has a manager.
+        PoolNotFound: There is no such pool.
+    """
+
+    def __init__(
+        self,
+        store: PoolStore,
+        cloud: Cloud,
+        *,
+        proxy_command: Sequence[str] | None = None,
+        metrics: str | None = None,
+    ) -> None:
+        self._store = store
+        self._cloud = cloud
+        self._paths = store.paths
+        self._identity = store.identity()
+        published = store.membership()
+        self._lease = Lease.take(self._paths, at_least=published.epoch if published else 0)
+        self._wake = threading.Event()
+        self._proxy = ProxySupervisor(self._paths, time.monotonic, proxy_command)
+        self._ledger = Ledger(self._paths.credentials)
+        self._certified_at: float | None = None
+        self._revoked: frozenset[str] = frozenset()
+        self._records = ManagerRecords(self._paths, self._identity.uid, self._lease.epoch)
+        self._discovery = Discovery(self._paths.discovered)
+        self._seen: dict[Path, tuple[int, int, int] | None] = {}
+        self._digest: object = None
+        self._trouble: list[str] = []
+        self._told: status.PoolStatus | None = None
+        self._scrape = Scrape(lambda: measures.of_pool(self._told))
+        self._metrics = metrics
+        self._replicas: Sequence[status.ReplicaStatus] = ()
+        self._reconciler = Reconciler(
+            cloud,
+            store,
+            clock=time.time,
+            reading=clocks.read,
+            links=self._links,
+            build_order=lambda *order: configuration.build_order(self._paths, *order),
+            submit=on_thread,
+            epoch=self._lease.epoch,
+            revoked=self._ledger.revoked,
+            by_hand=self._ledger.by_hand,
+            gateways=self._ledger.gateways,
+            on_done=self._wake.set,
+            distances=Distances(Latencies(latency_file()), on_thread),
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Manage until `stop` is set or the pool's folder is gone.
+
+        Raises:
+            PoolBusy: A later manager has taken over.
+        """
+        log.info("manager_started pool=%s epoch=%d", self._identity.name, self._lease.epoch)
+        try:
+            while not stop.is_set():
+                self._lease.beat()
+                if self._work():
+                    break
+                self._rest(stop)
+        except PoolNotFound:
+            log.info("manager_stopped pool=%s reason=ended", self._identity.name)
+        finally:
+            self._scrape.close()
+            self._records.close()
+            self._lease.release()
+        log.info("manager_stopped pool=%s", self._identity.name)
+
+    def _work(self) -> bool:
+        """Do one round. What goes wrong is logged and tried again in the next one.
+
+        Returns:
+            Whether the pool has ended by itself: there is nothing left to manage.
+        """
+        self._trouble = []
+        for path in (self._paths.manager_log, self._paths.proxy_log):
+            logfile.bound(path)
+        self._attempt(self._keep_proxy)
+        tick = self._attempt_tick()
+        if tick is None:
+            return False
+        self._scrape.at(tick.spec.metrics.manager if self._metrics is None else self._metrics)
+        self._attempt(lambda: self._discover(tick))
+        self._attempt(lambda: self._records.look(tick.spec.rendezvous, tick.membership))
+        if tick.over and tick.observed.machines == ():
+            self._attempt(self._leave)
+            if not self._trouble:
+                ended = f"by itself, after {tick.spec.max_hours:g} hours (`max_hours`)"
+                self._attempt(lambda: self._write_status(tick, ended))
+                return not self._trouble
+        self._attempt(lambda: self._write_status(tick))
+        return False
+
+    def _discover(self, tick: Tick) -> None:
+        if self._discovery.look(tick.spec, tick.observed):
+            log.info("services_discovered pool=%s", self._identity.name)
+            self._wake.set()  # the client proxy is to know
+
+    def _leave(self) -> None:
+        """See to it that nothing of a pool that ends by itself is left but its folder."""
+
+        def done(what: str) -> None:
+            log.info("ended pool=%s what=%r", self._identity.name, what)
+
+        shutdown.end_client_proxy(self._paths, self._identity.uid, done)
+        teardown.end_machines(
+            self._cloud,
+            self._identity.uid,
+            known=teardown.known(self._store),
+            done=done,
+            warned=lambda what: log.warning("not_verified reason=%r", what),
+            limit_s=LEAVE_LIMIT_S,
+        )
+
+    def _attempt(self, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except (PoolNotFound, PoolBusy):
+            raise
+        except FogftError as error:
+            log.error("manager_step_failed reason=%r", error.message)
+            self._trouble.append(error.message)
+
+    def _attempt_tick(self) -> Tick | None:
+        ticks: list[Tick] = []
+        self._attempt(lambda: ticks.append(self._reconciler.tick()))
+        return ticks[0] if ticks else None
+
+    def _keep_proxy(self) -> None:
+        now = time.time()
+        revoked = self._ledger.revoked()
+        due = self._certified_at is None or abs(now - self._certified_at) > CERTIFY_EVERY_S
+        if due or revoked != self._revoked:
+            utc = datetime.datetime.now(datetime.timezone.utc)
+            configuration.certify_robot(self._paths, self._identity, self._store.spec(), utc)
+            self._certified_at, self._revoked = now, revoked
+        configuration.write_proxy_config(self._paths, self._identity, self._store.spec())
+        intent = self._store.intent()
+        begun_at = lifetime.begun_at(intent, self._identity.created_at, self._store.history())
+        over = lifetime.is_over(self._store.spec(), begun_at, time.time())
+        if not intent.stopping and not over:
+            self._proxy.look()
+
+    def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...] | None:
+        report = proxy_report.read(self._paths.proxy_status, pool_uid)
+        return report.links if report is not None and report.fresh(now) else None
+
+    def _write_status(self, tick: Tick, ended: str = "") -> None:
+        report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
+        fresh = report is not None and report.fresh(time.time())
+        notes = [
+            *self._trouble,
+            *self._discovery.notes,
+            *filter(None, (self._proxy.trouble, self._records.trouble)),
+        ]
+        if (report is None or not fresh) and not tick.over:
+            when = "lately" if report else "yet"
+            notes.append(f"the client proxy has not reported {when}")
+        seen = status.of_tick(
+            tick,
+            history=self._store.history(),
+            report=report if fresh else None,
+            recent=self._store.recent(),
+            epoch=self._lease.epoch,
+            manager_pid=os.getpid(),
+            proxy_alive=fresh,
+            notes=notes,
+        )
+        if seen.cloud_reachable:
+            self._replicas = seen.replicas
+        else:  # show what was seen last; `cloud_reachable` says how it is meant
+            seen = replace(seen, replicas=self._replicas)
+        if ended:
+            seen = replace(seen, ended=ended, proxy_alive=False, proxy_pid=None, notes=[])
+            log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
+        self._told = seen
+        disk.write_json(self._paths.status, seen.to_json(), durable=False)
+
+    # -- waiting ----------------------------------------------------------------------------
+
+    def _rest(self, stop: threading.Event) -> None:
+        """Wait for the next tick, or for something to react to."""
+        end = time.monotonic() + TICK_S
+        while time.monotonic() < end and not stop.is_set():
+            if self._wake.wait(WATCH_S) or self._something_changed():
+                self._wake.clear()
+                return
+
+    def _something_changed(self) -> bool:
+        paths = self._paths
+        watched = (paths.spec, paths.intent, self._ledger.path)
+        changed = [p for p in watched if self._is_new(p)]
+        if self._is_new(paths.proxy_status):
+            report = proxy_report.read(paths.proxy_status, self._identity.uid)
+            digest = report.digest() if report is not None else None
+            if digest != self._digest:
+                self._digest = digest
+                return True
+        return bool(changed)
+
+    def _is_new(self, path: Path) -> bool:
+        try:
+            stat = path.stat()
+            mark = (stat.st_mtime_ns, stat.st_ino, stat.st_size)
+        except OSError:
+            mark = None
+        known = path in self._seen
+        old, self._seen[path] = self._seen.get(path), mark
+        return known and mark != old
+
+
+def run(
+    store: PoolStore,
+    cloud_of: Callable[[Identity], Cloud],
+    *,
+    proxy_command: Sequence[str] | None = None,
+    metrics: str | None = None,
+) -> None:
+    """Run a pool's manager in this process until a signal ends it, or the pool has ended.
+
+    Args:
+        store: The pool.
+        cloud_of: Returns the cloud that a pool runs on.
+        proxy_command: What to start as client proxy, in place of our own.
+        metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
+
+    Raises:
+        PoolBusy: The pool has a manager, or a later one has taken over.
+        PoolNotFound: There is no such pool.
+    """
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=logging.WARNING,  # of what others log
+        format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
+        datefmt="%Y-%m-%dT%H:%M:%S",
+        force=True,
+    )
+    logging.getLogger("fogft").setLevel(logging.INFO)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda *_: stop.set())
+    cloud = cloud_of(store.identity())
+    Manager(store, cloud, proxy_command=proxy_command, metrics=metrics).run(stop)

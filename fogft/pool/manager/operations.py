@@ -1,0 +1,86 @@
+"""Cloud calls that take long, off the manager's loop: never two at once on one replica.
+
+An operation stays in the list until its outcome was collected, so whoever takes the list
+*before* asking the cloud what exists misses nothing: an order is either still in the list
+or already in the cloud's.
+
+Owns: which replicas have an operation under way, and how it ended.
+Not here: what to order (`reconciler`) and the threads (the `Submit` that comes in).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from fogft.errors import FogftError
+from fogft.model.replica import ReplicaId
+
+log = logging.getLogger(__name__)
+
+Submit = Callable[[Callable[[], None]], object]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[T]):
+    """How an operation ended: `error` is None when it was done."""
+
+    id: ReplicaId
+    subject: T
+    error: Exception | None
+
+
+class Operations(Generic[T]):
+    """Operations under way, each with what it is about.
+
+    Args:
+        submit: Runs a function, now or on another thread.
+        on_done: Called from there when one has ended.
+    """
+
+    def __init__(self, submit: Submit, on_done: Callable[[], None] = lambda: None) -> None:
+        self._submit = submit
+        self._on_done = on_done
+        self._lock = threading.Lock()
+        self._busy: dict[ReplicaId, T] = {}
+        self._outcomes: list[Outcome[T]] = []
+
+    def busy(self) -> Mapping[ReplicaId, T]:
+        """Return what is under way, or ended and not yet collected."""
+        with self._lock:
+            return dict(self._busy)
+
+    def collect(self) -> list[Outcome[T]]:
+        """Return the outcomes since the last call; their replicas are free again."""
+        with self._lock:
+            outcomes, self._outcomes = self._outcomes, []
+            for outcome in outcomes:
+                del self._busy[outcome.id]
+            return outcomes
+
+    def start(self, id: ReplicaId, subject: T, operation: Callable[[], None]) -> bool:
+        """Begin one, or return False when this replica has one under way."""
+        with self._lock:
+            if id in self._busy:
+                return False
+            self._busy[id] = subject
+        self._submit(lambda: self._run(id, subject, operation))
+        return True
+
+    def _run(self, id: ReplicaId, subject: T, operation: Callable[[], None]) -> None:
+        error: Exception | None = None
+        try:
+            operation()
+        except FogftError as refused:
+            error = refused
+        except Exception as unexpected:
+            log.exception("operation_broke replica=%s", id.short)
+            error = unexpected
+        with self._lock:
+            self._outcomes.append(Outcome(id, subject, error))
+        del error  # its traceback holds this frame: neither is to keep the other alive
+        self._on_done()

@@ -1,0 +1,366 @@
+"""Observe, plan, apply: one tick at a time, each from the world as it is.
+
+Killed at any point it leaves nothing that its successor does not repair: a launch is in
+the history before the cloud is asked, and everything else is read again from the cloud.
+
+Owns: the order of reading and writing within a tick.
+Not here: the decisions (`fogft.planning.planner`), the loop and the processes (`manager`).
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from fogft.cloud.port import Cloud, Launch, Refreshing
+from fogft.errors import CloudError, FogftError, NoCapacity, QuotaExceeded, told
+from fogft.model.groups import replica_hash, sales, task_at
+from fogft.model.intent import Intent
+from fogft.model.membership import Found, members_of, successor, with_by_hand
+from fogft.model.replica import (
+    LinkReport,
+    Machine,
+    MachinePhase,
+    Membership,
+    Observed,
+    Offer,
+    ReplicaId,
+    by_id,
+)
+from fogft.model.spec import PoolSpec
+from fogft.model.topology import certified
+from fogft.planning import lifetime
+from fogft.planning.observed.clock_jumps import Reading
+from fogft.planning.observed.health import judge
+from fogft.planning.observed.history import EventKind, History
+from fogft.planning.observed.refresh import Silent
+from fogft.planning.planner import Plan, PlannedLaunch, plan
+from fogft.planning.rollout import Update
+from fogft.pool.folder.store import Identity, Store
+from fogft.pool.manager import offers
+from fogft.pool.manager.operations import Operations, Submit
+from fogft.pool.manager.remembering import Remembering
+from fogft.pool.manager.timekeeping import Timekeeping
+from fogft.pool.manager.updating import Updating
+
+log = logging.getLogger(__name__)
+
+OFFERS_EVERY_S = 30.0
+
+Links = Callable[[str, float], "tuple[LinkReport, ...] | None"]
+Distances = Callable[
+    [PoolSpec, Sequence[Offer], Sequence[Machine], Sequence[LinkReport]], Mapping[str, float]
+]
+BuildOrder = Callable[[Identity, PoolSpec, PlannedLaunch], Launch]
+
+
+class Tick(NamedTuple):
+    """What one tick saw and decided.
+
+    Attributes:
+        over: Its hours are used up: the pool ends by itself.
+        update: The update under way, or the one that was given up; None where there is none.
+        file: Digest of the pool file that was applied last.
+    """
+
+    identity: Identity
+    spec: PoolSpec
+    intent: Intent
+    observed: Observed
+    plan: Plan
+    membership: Membership | None
+    over: bool = False
+    update: Update | None = None
+    file: str = ""
+
+
+def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
+    """Return an order without files: all that a cloud needs, and nothing to serve with."""
+    return Launch(
+        id=ReplicaId(identity.uid, planned.slot, planned.generation),
+        pool=identity.name,
+        placement=planned.offer.placement,
+        usd_per_hour=planned.offer.usd_per_hour,
+        spec_hash=replica_hash(spec, planned.slot),
+        task=task_at(spec, planned.slot),
+        dials_out=bool(spec.dial_in),
+    )
+
+
+class Reconciler:
+    """Brings one pool to what is wanted.
+
+    Args:
+        cloud: Where its machines run.
+        store: What it remembers.
+        clock: Seconds since the epoch.
+        reading: Tells in place of `clock` what it is, and whether it was set; see
+            `planning.observed.clock_jumps`.
+        links: ``links(pool_uid, now)``: a fresh report of the client proxy, or None.
+        build_order: Makes the order of a planned launch, files included.
+        submit: Runs a long cloud call, now or on another thread.
+        epoch: Of the lease; goes into every membership.
+        revoked: Common names of certificates that were taken back.
+        by_hand: Replicas that people start themselves, and that are still let in.
+        gateways: Name -> generations of its certificates that are good.
+        on_done: Called when a long cloud call has ended.
+        distances: Says how far regions are from the robot, of what is sold and what runs.
+    """
+
+    def __init__(
+        self,
+        cloud: Cloud,
+        store: Store,
+        *,
+        clock: Callable[[], float],
+        reading: Callable[[], Reading] | None = None,
+        links: Links,
+        build_order: BuildOrder = bare_order,
+        submit: Submit = lambda run: run(),
+        epoch: int = 1,
+        revoked: Callable[[], frozenset[str]] = frozenset,
+        by_hand: Callable[[], frozenset[ReplicaId]] = frozenset,
+        gateways: Callable[[], Mapping[str, tuple[int, ...]]] = dict,
+        on_done: Callable[[], None] = lambda: None,
+        distances: Distances = lambda spec, *_: spec.placement.rtt_s,
+    ) -> None:
+        self._cloud = cloud
+        self._refreshing = cloud if isinstance(cloud, Refreshing) else None
+        self._distances = distances
+        self._store = store
+        self._links = links
+        self._build_order = build_order
+        self._epoch = epoch
+        self._revoked = revoked
+        self._by_hand = by_hand
+        self._gateways = gateways
+        # A planned launch is what a launch is about; None stands for a termination.
+        self._operations: Operations[Machine | None] = Operations(submit, on_done)
+        self._refreshes: Operations[None] = Operations(submit, on_done)
+        self._silent = Silent()
+        self._offers: tuple[Offer, ...] = ()
+        self._offers_for: tuple[str, float] | None = None
+        self._updating = Updating(store)
+        self._time = Timekeeping(store, self._updating, clock, reading)
+        self._remember = Remembering(store, lambda: self._time.now)
+        self._membership: Membership | None = store.membership()
+        self._published_for: tuple[Any, ...] | None = None  # what it follows from
+
+    def tick(self) -> Tick:
+        """Observe, plan and apply once.
+
+        Raises:
+            StateError: Something cannot be read or written; nothing was launched for it.
+        """
+        identity, spec, intent = self._store.identity(), self._store.spec(), self._store.intent()
+        history = self._store.history()
+        if self._time.look():
+            self._silent = Silent()
+        self._settle_outcomes()
+        observed, trouble = self._observe(identity, spec)
+        asked, (spec, trial) = spec, self._updating.look(identity.uid, observed, history)
+        if spec is not asked:  # rolled back: what is sold to it may differ
+            observed, trouble = self._observe(identity, spec)
+        health, judged_at = None, 0
+        if observed.machines is not None:
+            self._remember.losses(observed)
+            self._ask_about_silent(observed, history)
+            health, judged_at = judge(identity.uid, spec, observed, history), history.version
+            self._remember.health(health, history, observed.now)
+        if history.version != judged_at:  # it remembers more now: judge by all of it
+            health = None
+        begun_at = lifetime.begun_at(intent, identity.created_at, history)
+        trouble += [*lifetime.notes(spec, begun_at, observed.now), *self._time.notes]
+        over = lifetime.is_over(spec, begun_at, observed.now)
+        if over:
+            intent = replace(intent, stopping=True)
+        decided = plan(identity.uid, spec, intent, observed, history, health=health)
+        if over:
+            ends = tuple(end._replace(reason="`max_hours` is over") for end in decided.terminations)
+            decided = decided._replace(terminations=ends)
+        update = None
+        if decided.health is not None and not intent.stopping:
+            update = self._updating.settle(
+                spec, trial, decided.health, history, wanted=decided.wanted, now=observed.now
+            )
+        trouble += [update.told] if update is not None else []
+        if trouble:
+            decided = decided._replace(notes=(*decided.notes, *trouble))
+        if observed.machines is not None:
+            self._apply(identity, spec, observed, decided, history)
+        return Tick(
+            identity, spec, intent, observed, decided, self._membership, over, update, trial.file
+        )
+
+    # -- observe ----------------------------------------------------------------------------
+
+    def _settle_outcomes(self) -> None:
+        for outcome in self._operations.collect():
+            id, error = outcome.id, outcome.error
+            if error is None:
+                continue
+            if outcome.subject is None:
+                log.warning("terminate_failed replica=%s reason=%r", id.short, str(error))
+            else:
+                log.warning(
+                    "launch_refused replica=%s zone=%s reason=%r",
+                    id.short,
+                    outcome.subject.placement.location,
+                    str(error),
+                )
+                cause = _refusal(error)
+                if cause:
+                    self._remember.add(EventKind.REFUSED, id, detail=f"{cause}: {error}")
+
+    def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[str]]:
+        trouble: list[str] = []
+        busy = self._operations.busy()  # before the cloud is asked: see `operations`
+        now = self._time.now
+        machines: tuple[Machine, ...] | None = None
+        try:
+            listed = {m.id: m for m in self._cloud.machines(identity.uid)}
+            for id, order in busy.items():
+                if order is not None:
+                    listed[id] = replace(listed.get(id, order), launched_at=now)
+            machines = tuple(sorted(listed.values(), key=by_id))
+        except CloudError as error:
+            log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
+            trouble.append(f"the cloud did not answer: {told(error)}")
+        sold = self._current_offers(spec, now, trouble) if machines is not None else ()
+        ending = frozenset(id for id, order in busy.items() if order is None)
+        links = self._links(identity.uid, now)
+        rtt_s = self._distances(spec, sold, machines or (), links or ())
+        return Observed(now, machines, links, sold, ending, rtt_s, self._time.doubt_s), trouble
+
+    def _ask_about_silent(self, observed: Observed, history: History) -> None:
+        """Have the cloud asked about replicas that fell silent, where its list is from memory."""
+        cloud = self._refreshing
+        if cloud is None:
+            return
+        for outcome in self._refreshes.collect():
+            if outcome.error is not None:
+                log.warning("refresh_failed replica=%s reason=%r", outcome.id.short, outcome.error)
+        for id in self._silent.due(observed, history):
+            if self._refreshes.start(id, None, functools.partial(cloud.refresh, id)):
+                log.info("refresh_ordered replica=%s", id.short)
+
+    def _current_offers(self, spec: PoolSpec, now: float, trouble: list[str]) -> tuple[Offer, ...]:
+        key = spec.derived.get("sales")
+        if key is None:
+            key = spec.derived["sales"] = json.dumps(sales(spec), sort_keys=True, default=str)
+        known = self._offers_for
+        if known is None or known[0] != key or not 0 <= now - known[1] < OFFERS_EVERY_S:
+            try:
+                sold = offers.ask(self._cloud, spec)
+                if sold != self._offers:  # the planner keeps what it worked out of a tuple
+                    self._offers = sold
+                self._offers_for = (key, now)
+            except FogftError as error:
+                trouble.append(f"no prices can be had: {told(error)}")
+                if known is None or known[0] != key:
+                    return ()
+        return self._offers
+
+    # -- apply ------------------------------------------------------------------------------
+
+    def _apply(
+        self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan, history: History
+    ) -> None:
+        self._mark_draining(plan, observed, history)
+        self._publish(identity, spec, observed, plan)
+        for planned in plan.launches:
+            self._launch(identity, spec, planned)
+        for end in plan.terminations:
+            self._terminate(end.id, end.reason, history)
+
+    def _mark_draining(self, plan: Plan, observed: Observed, history: History) -> None:
+        ends = {end.id for end in plan.terminations} | observed.ending
+        for machine in observed.machines or ():
+            record = history.record(machine.id.slot, machine.id.generation)
+            if record is None or record.closed is not None:
+                continue
+            if machine.id in plan.draining:
+                if record.draining_since is None:
+                    self._remember.add(EventKind.DRAINING, machine.id)
+            elif record.draining_since is not None and machine.id not in ends:
+                self._remember.add(EventKind.UNDRAINED, machine.id)
+
+    def _publish(self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan) -> None:
+        revoked = self._revoked()
+        found = Found.of(spec)
+        by_hand = self._by_hand() if found is not Found.BY_CLOUD else frozenset()
+        gateways = self._gateways() if spec.topology else {}
+        ending = {end.id for end in plan.terminations} | observed.ending
+        machines = observed.machines or ()
+        if found is Found.BY_CLOUD:  # others can be found by nobody
+            machines = tuple([m for m in machines if m.endpoint is not None])
+        cause = spec, machines, plan.draining, ending, revoked, by_hand, gateways
+        if cause == self._published_for:
+            return
+        members = members_of(
+            machines,
+            pool_uid=identity.uid,
+            draining=plan.draining,
+            ending=ending,
+            revoked=revoked,
+            found=found,
+        )
+        members = with_by_hand(members, by_hand)
+        membership = successor(
+            self._membership,
+            pool=identity.name,
+            pool_uid=identity.uid,
+            epoch=self._epoch,
+            members=members,
+            revoked=revoked,
+            topology=certified(spec.topology, gateways) if spec.topology else None,
+        )
+        if membership is not None:
+            self._store.write_membership(membership)
+            self._membership = membership
+        self._published_for = cause
+
+    def _launch(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> None:
+        order = self._build_order(identity, spec, planned)
+        location = order.placement.location
+        self._remember.add(
+            EventKind.LAUNCH,
+            order.id,
+            location=location,
+            detail=planned.reason,
+            on_demand=not order.placement.spot,
+        )
+        log.info("launch_ordered replica=%s zone=%s %s", order.id.short, location, planned.reason)
+        expected = Machine(
+            id=order.id,
+            placement=order.placement,
+            phase=MachinePhase.PROVISIONING,
+            launched_at=self._time.now,
+            usd_per_hour=order.usd_per_hour,
+            spec_hash=order.spec_hash,
+        )
+        self._operations.start(order.id, expected, lambda: self._cloud.launch(order))
+
+    def _terminate(self, id: ReplicaId, reason: str, history: History) -> None:
+        if id in self._operations.busy():
+            return  # its launch is under way: a later tick ends it
+        record = history.record(id.slot, id.generation)
+        if record is None or not record.ending:
+            self._remember.add(EventKind.ENDING, id, detail=reason)
+            log.info("terminate_ordered replica=%s reason=%r", id.short, reason)
+        self._operations.start(id, None, lambda: self._cloud.terminate(id))
+
+
+def _refusal(error: Exception) -> str:
+    """Return the cause of a refused launch; empty when it may have been launched all the same."""
+    if isinstance(error, NoCapacity):
+        return "capacity"
+    if isinstance(error, QuotaExceeded):
+        return "quota"
+    if isinstance(error, CloudError) and type(error) is not CloudError:
+        return ""  # unreachable: the cloud's list will tell
+    return "error"

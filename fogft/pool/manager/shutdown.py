@@ -1,0 +1,111 @@
+"""What `down` does: end everything of a pool, whether or not its manager lives.
+
+Manager first (it would repair what we end), then the client proxy, then every machine
+that carries the pool's uid, then the folder. Stopped half-way, it can be run again.
+
+Owns: the order, and the end of our own processes.
+Not here: the machines, and the proof that none is left (`farewell`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from fogft import disk
+from fogft.cloud.port import Cloud
+from fogft.errors import FogftError, PoolNotFound, StateError
+from fogft.model.intent import Intent
+from fogft.pool.folder import lease
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import Identity, PoolStore
+from fogft.pool.manager import process_control, proxy_report, teardown
+
+LIMIT_S = 600.0
+
+
+def end(
+    store: PoolStore,
+    cloud_of: Callable[[Identity], Cloud],
+    *,
+    told: Callable[[str], None] = lambda _: None,
+    warned: Callable[[str], None] = lambda _: None,
+    limit_s: float = LIMIT_S,
+) -> list[str]:
+    """End a pool and return what was ended, in words, in order.
+
+    Args:
+        store: The pool.
+        cloud_of: Returns the cloud that a pool runs on.
+        told: Called with each thing as it has been ended.
+        warned: Called with what could not be made certain.
+        limit_s: How long machines may take to go.
+
+    Raises:
+        PoolNotFound: There is no such pool (any more).
+        CloudUnreachable: It cannot be told what is left; run it again.
+        FogftError: Something did not end (the message says what); run it again.
+    """
+    paths, identity = store.paths, store.identity()
+    ended: list[str] = []
+
+    def done(what: str) -> None:
+        ended.append(what)
+        told(what)
+
+    with disk.locked(paths.intent_lock):
+        try:
+            identity = store.identity()
+        except PoolNotFound:
+            return ended  # another `down` was faster
+        _end_process(done, "manager", paths.manager_lock, lease.read_pid(paths))
+        # Should this be cut short, whoever manages the pool next goes on ending it.
+        with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
+            store.write_intent(replace(_intent(store), stopping=True))
+        end_client_proxy(paths, identity.uid, done)
+        teardown.end_machines(
+            cloud_of(identity),
+            identity.uid,
+            known=teardown.known(store),
+            done=done,
+            warned=warned,
+            limit_s=limit_s,
+        )
+        # The identity first: from here on there is no such pool.
+        paths.identity.unlink(missing_ok=True)
+        shutil.rmtree(paths.folder, ignore_errors=True)
+    return ended
+
+
+def end_client_proxy(paths: PoolPaths, uid: str, done: Callable[[str], None]) -> None:
+    """End a pool's client proxy; tell it if there was one. Repeatable.
+
+    Raises:
+        FogftError: It does not end.
+    """
+    report = proxy_report.read(paths.proxy_status, uid)
+    pid = report.pid if report is not None else None
+    _end_process(done, "client proxy", paths.proxy_lock, pid)
+
+
+def _intent(store: PoolStore) -> Intent:
+    try:
+        return store.intent()
+    except StateError:
+        return Intent()
+
+
+def _end_process(
+    done: Callable[[str], None], what: str, lock: Path, suspected_pid: int | None
+) -> None:
+    pid = process_control.end_holder(lock, suspected_pid=suspected_pid)
+    if disk.is_locked(lock):
+        raise FogftError(
+            f"the {what} of `{lock.parent.name}` does not end",
+            "it belongs to another user, or hangs in the kernel; end it and run `fogft down` again",
+        )
+    if pid is not None:
+        done(f"{what} (pid {pid})")

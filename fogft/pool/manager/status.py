@@ -1,0 +1,332 @@
+"""`status.json`: what the manager last saw of its pool, for people and programs.
+
+Owns: the schema, and turning one tick of the manager into it.
+Not here: how it is shown (`fogft.cli`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from fogft.errors import StateError
+from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
+from fogft.planning.observed.history import MOVING, Event, EventKind, History
+
+if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
+    from fogft.model.spec import PoolSpec
+    from fogft.planning.observed.health import Judged
+    from fogft.pool.manager.proxy_report import ProxyReport
+    from fogft.pool.manager.reconciler import Tick
+
+WORDS = {
+    EventKind.LAUNCH: "launched",
+    EventKind.REFUSED: "refused",
+    EventKind.READY: "ready",
+    EventKind.UNREADY: "not ready",
+    EventKind.DRAINING: "draining",
+    EventKind.UNDRAINED: "kept after all",
+    EventKind.FAILED: "failed",
+    EventKind.ENDING: "ending",
+    EventKind.ENDED: "ended",
+    EventKind.GONE: "gone",
+    EventKind.CLOCK: "clock set",
+    EventKind.SLEPT: "slept",
+}
+
+
+@dataclass(frozen=True)
+class ReplicaStatus:
+    """One replica. Ages and durations in seconds; None for unknown.
+
+    Attributes:
+        link: ``connecting``, ``up`` or ``suspect``; empty when there is no link.
+        verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
+            ``at risk``.
+        age_s: Since its launch; None where that was somebody else's.
+        differs: The type of a service is not the same there as here; `detail` says how.
+    """
+
+    slot: int
+    generation: int
+    phase: str
+    verdict: str
+    location: str
+    instance: str
+    spot: bool
+    usd_per_hour: float
+    endpoint: str | None
+    link: str
+    rtt_s: float | None
+    silent_for_s: float
+    won: int
+    in_flight: int
+    restarts: int
+    age_s: float | None
+    detail: str
+    differs: bool = False
+
+
+@dataclass(frozen=True)
+class ServiceStatus:
+    """One service: how many replicas answer it, and the proxy's counters (0 when unknown)."""
+
+    name: str
+    type: str
+    ready_replicas: int
+    counters: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class UpdateStatus:
+    """An update under way, or the last one where it was given up.
+
+    Attributes:
+        state: ``in progress``, ``stopped`` or ``rolled back``.
+        done: Replicas of the version that is wanted now which serve.
+        of: How many are wanted.
+        fault: Why it was given up; empty while it was not.
+    """
+
+    state: str
+    done: int
+    of: int
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class PoolStatus:
+    """The whole pool.
+
+    Attributes:
+        observed_at: Seconds since the epoch.
+        cloud_reachable: Whether the cloud could say what exists; if not, `replicas` is
+            what was seen last and `ready` is 0.
+        by_hand: Replicas that people started themselves, beside those of `replicas`.
+        target: Replicas wanted now.
+        ready: Replicas whose services answer and that are to stay.
+        ended: Why the manager has ended the pool by itself; empty while it runs.
+        notes: Why the pool is not yet as wanted, in sentences.
+        topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
+            how this machine's robot finds its gateways; empty where there are none.
+        events: The last things that happened: ``{at, event, replica, location, detail}``.
+        applied: Digest of the pool file that was applied last.
+    """
+
+    pool: str
+    uid: str
+    cloud: str
+    file: str
+    epoch: int
+    manager_pid: int
+    observed_at: float
+    cloud_reachable: bool
+    stopping: bool
+    target: int
+    ready: int
+    uplink_suspected: bool
+    usd_per_hour: float
+    proxy_pid: int | None
+    proxy_alive: bool
+    ended: str = ""
+    excluded: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    replicas: Sequence[ReplicaStatus] = ()
+    by_hand: Sequence[ReplicaStatus] = ()
+    services: Sequence[ServiceStatus] = ()
+    events: Sequence[Mapping[str, Any]] = ()
+    applied: str = ""
+    update: UpdateStatus | None = None
+    topology: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the JSON form."""
+        return asdict(self)
+
+
+def from_json(raw: Any) -> PoolStatus:
+    """Read a status back.
+
+    Raises:
+        StateError: It is none, or of another version of fogft.
+    """
+    try:
+        replicas = [ReplicaStatus(**replica) for replica in raw["replicas"]]
+        by_hand = [ReplicaStatus(**replica) for replica in raw.get("by_hand", ())]
+        services = [ServiceStatus(**service) for service in raw["services"]]
+        update = UpdateStatus(**raw["update"]) if raw.get("update") else None
+        found = {"replicas": replicas, "by_hand": by_hand, "services": services, "update": update}
+        return PoolStatus(**{**raw, **found})
+    except (KeyError, TypeError, AttributeError) as error:
+        raise StateError(f"not a status: {error}", "is the manager of another version?") from error
+
+
+def of_tick(
+    tick: Tick,
+    *,
+    history: History,
+    report: ProxyReport | None,
+    recent: Sequence[Event],
+    epoch: int,
+    manager_pid: int,
+    proxy_alive: bool,
+    notes: Sequence[str] = (),
+) -> PoolStatus:
+    """Return the status after a tick."""
+    from fogft.model.groups import FIRST_BY_HAND
+
+    health, observed, plan = tick.plan.health, tick.observed, tick.plan
+    judged = health.replicas if health is not None else ()
+    leaving = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
+    replicas = [_replica(one, leaving, history, observed.now) for one in judged]
+    links = {link.id: link for link in observed.links or ()}
+    members = tick.membership.members if tick.membership is not None else ()
+    by_hand = [member.id for member in members if member.id.slot >= FIRST_BY_HAND]
+    heard = [one.link for one in judged if one.link is not None]
+    heard += [links[id] for id in by_hand if id in links]
+    return PoolStatus(
+        pool=tick.identity.name,
+        uid=tick.identity.uid,
+        cloud=tick.identity.cloud,
+        file=tick.identity.file,
+        epoch=epoch,
+        manager_pid=manager_pid,
+        observed_at=observed.now,
+        cloud_reachable=observed.machines is not None,
+        stopping=tick.intent.stopping,
+        target=plan.wanted,
+        ready=sum(replica.phase == Phase.READY.value for replica in replicas),
+        uplink_suspected=bool(health and health.uplink_suspected),
+        usd_per_hour=sum(one.machine.usd_per_hour for one in judged),
+        proxy_pid=report.pid if report is not None and proxy_alive else None,
+        proxy_alive=proxy_alive,
+        excluded=sorted(tick.intent.excluded),
+        notes=[*plan.notes, *_without_certificate(tick), *notes],
+        replicas=replicas,
+        by_hand=[_started_by_hand(member, links, tick.spec) for member in by_hand],
+        services=_services(tick.spec, heard, report),
+        events=[_event(event) for event in recent],
+        topology=_topology(tick, report if proxy_alive else None),
+        applied=tick.file,
+        update=_update(tick),
+    )
+
+
+def _update(tick: Tick) -> UpdateStatus | None:
+    update = tick.update
+    if update is None:
+        return None
+    return UpdateStatus(update.state.value, update.done, update.of, update.fault)
+
+
+def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
+    from fogft.model import topology
+
+    here = tick.membership.topology if tick.membership is not None else tick.spec.topology
+    if not here:
+        return {}
+    links = [dict(one) for one in report.gateways] if report is not None else []
+    robot = report.robot if report is not None else ""
+    return {"robot": robot, **topology.to_plain(here), "links": links}
+
+
+def _without_certificate(tick: Tick) -> list[str]:
+    if tick.membership is None:
+        return []
+    return [
+        f"gateway `{gateway.name}` has no certificate: `fogft credentials issue gateway "
+        f"{gateway.name}`"
+        for gateway in tick.membership.topology.gateways
+        if not gateway.generations
+    ]
+
+
+def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float) -> ReplicaStatus:
+    machine, link = one.machine, one.link
+    record = history.record(one.id.slot, one.id.generation)
+    launched_at = record.launched_at if record is not None else machine.launched_at
+    phase = one.phase
+    if one.id in leaving and phase is not Phase.GONE:
+        phase = Phase.DRAINING
+    return ReplicaStatus(
+        slot=one.id.slot,
+        generation=one.id.generation,
+        phase=phase.value,
+        verdict=one.verdict.value,
+        location=machine.placement.location,
+        instance=machine.placement.instance,
+        spot=machine.placement.spot,
+        usd_per_hour=machine.usd_per_hour,
+        endpoint=machine.endpoint,
+        link=link.state.value if link is not None else "",
+        rtt_s=link.rtt_s if link is not None else None,
+        silent_for_s=link.silent_for_s if link is not None else 0.0,
+        won=link.won if link is not None else 0,
+        in_flight=link.in_flight if link is not None else 0,
+        restarts=link.restarts if link is not None else 0,
+        age_s=max(0.0, now - launched_at),
+        detail=_detail(one),
+        differs=link is not None and link.differs,
+    )
+
+
+def _started_by_hand(
+    id: ReplicaId, links: Mapping[ReplicaId, LinkReport], spec: PoolSpec
+) -> ReplicaStatus:
+    link = links.get(id) or LinkReport(id, LinkState.CONNECTING, detail="it was not found yet")
+    ready = link.state is LinkState.UP and {s.name for s in spec.services} <= link.ready
+    phase = Phase.DRAINING if link.draining else Phase.READY if ready else Phase.STARTING
+    return ReplicaStatus(
+        slot=id.slot,
+        generation=id.generation,
+        phase=phase.value,
+        verdict="good",
+        location="by hand",
+        instance="",
+        spot=False,
+        usd_per_hour=0.0,
+        endpoint=None,
+        link=link.state.value if id in links else "",
+        rtt_s=link.rtt_s,
+        silent_for_s=link.silent_for_s,
+        won=link.won,
+        in_flight=link.in_flight,
+        restarts=link.restarts,
+        age_s=None,
+        detail=link.detail,
+        differs=link.differs,
+    )
+
+
+def _detail(one: Judged) -> str:
+    """Return what is worth knowing of a replica: what is wrong, else what is being done."""
+    link, progress = one.link, one.machine.progress
+    if one.why or (progress and (link is None or link.state is LinkState.CONNECTING)):
+        return one.why or progress
+    return link.detail if link is not None else ""
+
+
+def _services(
+    spec: PoolSpec, links: Sequence[LinkReport], report: ProxyReport | None
+) -> list[ServiceStatus]:
+    counters = report.services if report is not None else {}
+    return [
+        ServiceStatus(
+            name=service.name,
+            type=service.type,
+            ready_replicas=sum(service.name in link.ready for link in links),
+            counters=counters.get(service.name, {}),
+        )
+        for service in spec.proxied
+    ]
+
+
+def _event(event: Event) -> dict[str, Any]:
+    return {
+        "at": event.at,
+        "event": WORDS[event.kind],
+        "replica": "" if event.kind in MOVING else f"{event.slot}.{event.generation}",
+        "location": event.location,
+        "detail": event.detail,
+    }

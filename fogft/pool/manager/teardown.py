@@ -1,0 +1,146 @@
+"""End every machine of a pool, and believe it only when the clouds themselves say so.
+
+Owns: ending them side by side until none is listed, the last look past every memory, and what
+to say when it cannot be told what still runs.
+Not here: ending one machine (`fogft.cloud`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from fogft.cloud.port import Auditing, Cloud
+from fogft.errors import CloudError, CloudUnreachable, FogftError, StateError
+from fogft.model.replica import Machine, ReplicaId
+from fogft.pool.folder.store import PoolStore
+
+ASK_AGAIN_S = 1.0
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is remembered of a pool's machines, for when its cloud does not answer.
+
+    Attributes:
+        pool: Its name.
+        running: Replicas that were launched and have not ended as far as was seen, in words.
+        clouds: Where any were ever launched.
+        orphan_after_s: When replicas without a manager end by themselves; None if not known.
+    """
+
+    pool: str
+    running: tuple[str, ...] = ()
+    clouds: frozenset[str] = frozenset()
+    orphan_after_s: float | None = None
+
+
+def known(store: PoolStore) -> Known:
+    """Return what a pool's folder remembers. Never fails: it is for bad times."""
+    pool = store.paths.folder.name
+    try:
+        history = store.history()
+        running = tuple(
+            f"replica {r.slot}.{r.generation} ({r.location})"
+            for r in sorted(history.open(), key=lambda r: (r.slot, r.generation))
+        )
+        clouds = frozenset(place.split("/")[0] for place in history.locations if place)
+        return Known(pool, running, clouds, store.spec().health.orphan_after_s)
+    except FogftError:
+        return Known(pool)
+
+
+def end_machines(
+    cloud: Cloud,
+    uid: str,
+    *,
+    known: Known,
+    done: Callable[[str], None],
+    warned: Callable[[str], None],
+    limit_s: float,
+) -> None:
+    """End all machines that carry a pool's uid; return when none is left.
+
+    Raises:
+        CloudUnreachable: It cannot be told what is left; the message lists what may be.
+        FogftError: Some did not end within `limit_s`; the message says which, and why.
+    """
+    deadline = time.monotonic() + limit_s
+    told: set[str] = set()
+    refusals: dict[ReplicaId, CloudError] | None = None
+    while True:
+        try:
+            left = _left(cloud, uid, known, warned)
+        except CloudUnreachable as error:
+            raise _unknown(error, known) from error
+        if not left:
+            return
+        if refusals is not None:
+            if time.monotonic() > deadline:
+                still = CloudError("it is still listed")
+                raise _stubborn({m: refusals.get(m.id, still) for m in left}, known)
+            time.sleep(ASK_AGAIN_S if refusals else 0.0)
+        refusals = _end(cloud, left)
+        for machine in left:
+            short = machine.id.short
+            if machine.id not in refusals and short not in told:
+                told.add(short)
+                done(f"replica {short} ({machine.placement.location})")
+
+
+def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -> Sequence[Machine]:
+    """Return what exists; once nothing is listed, what the clouds' own lists have beside."""
+    left = [m for m in cloud.machines(uid) if m.id.pool_uid == uid]
+    if left or not isinstance(cloud, Auditing):
+        return left
+    audit = cloud.audit(uid)
+    left = [m for m in audit.machines if m.id.pool_uid == uid]
+    if not left:
+        for name in sorted(known.clouds - audit.asked):
+            warned(
+                f"`{name}` could not be asked itself: that nothing is left there is SkyPilot's "
+                f"word; its console shows machines with the label `fogft-pool={uid}`"
+            )
+    return left
+
+
+def _end(cloud: Cloud, machines: Iterable[Machine]) -> dict[ReplicaId, CloudError]:
+    """End machines side by side; return those that did not end, with why."""
+
+    def terminate(machine: Machine) -> tuple[Machine, CloudError | StateError | None]:
+        try:
+            cloud.terminate(machine.id)
+        except (CloudError, StateError) as refused:
+            return machine, refused
+        return machine, None
+
+    with ThreadPoolExecutor(max_workers=8) as threads:
+        outcomes = list(threads.map(terminate, machines))
+    return {
+        machine.id: error
+        if isinstance(error, CloudError)
+        else CloudError(error.message, error.hint)
+        for machine, error in outcomes
+        if error is not None
+    }
+
+
+def _stubborn(refusals: dict[Machine, CloudError], known: Known) -> FogftError:
+    names = ", ".join(f"`{m.id.short}` ({m.placement.location})" for m in refusals)
+    why = "; ".join(sorted({error.message for error in refusals.values()}))
+    hints = sorted({error.hint for error in refusals.values() if error.hint})
+    return FogftError(
+        f"these replicas did not end: {names}: {why}",
+        "; ".join([f"run `fogft down {known.pool}` again", *hints]),
+    )
+
+
+def _unknown(error: CloudUnreachable, known: Known) -> CloudUnreachable:
+    lines = [f"it cannot be told what of `{known.pool}` still runs: {error.message}"]
+    lines += [f"  may still run: {replica}" for replica in known.running]
+    hints = [f"run `fogft down {known.pool}` again", *([error.hint] if error.hint else [])]
+    if known.orphan_after_s is not None:
+        hints.append(f"what hears of no manager ends by itself after {known.orphan_after_s:.0f} s")
+    return CloudUnreachable("\n".join(lines), "; ".join(hints))

@@ -1,0 +1,93 @@
+"""Follow a changed pool file through, and go back to the last good one when it must not stay.
+
+Two files, both the manager's: the good file, byte for byte, and what is remembered of the one
+applied last. `up` writes neither: another file's digest makes what is remembered void, so the
+next `up` with a changed file tries again. Killed anywhere, the next tick goes on.
+
+Owns: when the good file is kept, and when a version is given up.
+Not here: the judgement (`fogft.planning.rollout`), the files' place (`store`).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from fogft.model.replica import Observed
+from fogft.model.spec import PoolSpec
+from fogft.planning import rollout
+from fogft.planning.observed.health import Health, judge
+from fogft.planning.observed.history import History
+from fogft.planning.rollout import Trial, Update
+from fogft.pool.folder.store import Store
+
+log = logging.getLogger(__name__)
+
+
+class Updating:
+    """The updates of one pool.
+
+    Args:
+        store: What it remembers.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def look(self, uid: str, observed: Observed, history: History) -> tuple[PoolSpec, Trial]:
+        """Give up the file that is being applied if it must be; return the file in force.
+
+        Raises:
+            StateError: What must be remembered cannot be written.
+        """
+        store = self._store
+        spec, good, trial = store.spec(), store.good(), store.trial()
+        if trial.file != store.applied():
+            trial = Trial(store.applied(), began_at=observed.now)
+            store.write_trial(trial)
+            log.info("file_applied file=%s", trial.file)
+        if good is None or good is spec or trial.fault or observed.machines is None:
+            return spec, trial
+        health = judge(uid, spec, observed, history)
+        fault = rollout.fault(spec, good, health, history, trial.began_at)
+        if not fault:
+            return spec, trial
+        trial = replace(trial, fault=fault)
+        store.write_trial(trial)
+        log.error("update_stopped file=%s reason=%r", trial.file, fault)
+        return store.spec(), trial
+
+    def move(self, by_s: float) -> None:
+        """Let what is remembered be later: the clock was set.
+
+        Raises:
+            StateError: It cannot be written.
+        """
+        trial = self._store.trial()
+        if trial.began_at:
+            self._store.write_trial(replace(trial, began_at=trial.began_at + by_s))
+
+    def settle(
+        self,
+        spec: PoolSpec,
+        trial: Trial,
+        health: Health,
+        history: History,
+        *,
+        wanted: int,
+        now: float,
+    ) -> Update | None:
+        """Keep the file in force once the pool is wholly ready with it; return the update's state.
+
+        Raises:
+            StateError: It cannot be kept.
+        """
+        good = self._store.good()
+        if not trial.fault and spec is not good and spec != good:
+            settle_s = rollout.SETTLE_S if good is not None else 0.0
+            if rollout.is_whole(
+                spec, health, history, wanted=wanted, now=now, settle_s=settle_s
+            ) and self._store.keep_good(spec):
+                log.info("file_good file=%s", trial.file)
+                good = spec
+        return rollout.describe(spec, good, trial, health, wanted)

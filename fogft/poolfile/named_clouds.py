@@ -1,0 +1,88 @@
+"""Which cloud a pool file asks for, and where in the file its resources say so.
+
+Owns: the clouds that `resources` name, and the line that a cloud's complaint is about.
+Not here: the clouds themselves (`fogft.cloud`) and what they sell (`preview`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fogft.errors import SpecError
+from fogft.model.spec import PoolSpec
+from fogft.poolfile import yaml_tree
+from fogft.poolfile.tree import nearest
+
+
+def located(error: SpecError, source: str, file: Path) -> SpecError:
+    """Return a cloud's complaint about a key with the file and the line that it is about."""
+    key, colon, _ = error.message.partition(": ")
+    node = yaml_tree.tree(source, str(file))
+    for part in re.findall(r"[^.\[\]]+", key) if colon else ():
+        value = node.value
+        if isinstance(value, tuple) and part.isdigit() and int(part) < len(value):
+            node = value[int(part)]
+        elif isinstance(value, Mapping) and part in value:
+            node = value[part]
+        else:
+            break
+    return SpecError(f"{file}:{node.key_line}: {error.message}", error.hint)
+
+
+def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) -> str | None:
+    """Return the cloud adapter that a pool file's resources ask for; None where they name no cloud.
+
+    Args:
+        spec: The pool file.
+        names: Each name that it may use -> the adapter that it stands for.
+        source: The file's text.
+        file: Where it is.
+
+    Raises:
+        SpecError: They name a cloud that there is not, or clouds of two adapters.
+    """
+    named = dict(_named_in(spec))
+    for cloud, key in named.items():
+        if cloud not in names:
+            problem = SpecError(f"{key}: there is no cloud `{cloud}`", nearest(cloud, names))
+            raise located(problem, source, file)
+    by_adapter = {names[cloud]: cloud for cloud in sorted(named)}
+    if len(by_adapter) > 1:
+        listed = " and ".join(f"`{cloud}`" for cloud in sorted(by_adapter.values()))
+        problem = SpecError(
+            f"resources: {listed} cannot be in one pool",
+            "name real clouds only; `--cloud local` tries their regions on this machine",
+        )
+        raise located(problem, source, file)
+    return next(iter(by_adapter), None)
+
+
+def clouds_named(spec: PoolSpec) -> list[str]:
+    """Return the clouds that a pool file's resources name, sorted; none where any will do."""
+    return sorted({cloud for cloud, _ in _named_in(spec)})
+
+
+def _named_in(spec: PoolSpec) -> Iterator[tuple[str, str]]:
+    """Yield each cloud that the file names, or that one of its groups names."""
+    for index, group in enumerate(spec.groups):
+        yield from _named(group.resources, f"fogft.groups[{index}].resources")
+    if not spec.groups:
+        yield from _named(spec.task.get("resources") or {}, "resources")
+
+
+def _named(resources: Any, key: str) -> Iterator[tuple[str, str]]:
+    """Yield each cloud that is named, with the key that names it."""
+    if not isinstance(resources, Mapping):
+        return
+    for name in ("infra", "cloud"):
+        if isinstance(resources.get(name), str):
+            cloud = resources[name].split("/")[0].strip().lower()
+            if cloud not in ("", "*"):
+                yield cloud, f"{key}.{name}"
+    for name in ("any_of", "ordered"):
+        choices = resources.get(name)
+        for index, choice in enumerate(choices if isinstance(choices, list) else ()):
+            yield from _named(choice, f"{key}.{name}[{index}]")

@@ -1,0 +1,155 @@
+"""A service's policy as parameters, and what setting one makes of it. Pure.
+
+A value is judged by the pool file's own reader, so a parameter can bring about nothing that a
+pool file could not.
+
+Owns: names and values of the parameters, and how they lie over the pool file's policies.
+Not here: ROS (`fogft.ros.visible`), following a policy (`fogft.proxy.robot.dispatcher`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+from fogft.errors import SpecError
+from fogft.model.spec import HedgingMode, OnTimeout, Part, ServiceSpec
+from fogft.poolfile.service_form import LONGEST_S, to_plain
+from fogft.poolfile.services import read_service
+from fogft.poolfile.tree import Section, tree
+
+Value: TypeAlias = "bool | float | str"
+FieldCheck: TypeAlias = "Callable[[str, str], str | None]"  # of a type and a boolean response field
+
+KEYS = ("timeout_s", "on_timeout", "hedging", "hedging_budget", "ok_field", "trace", "advertise")
+_NOT_WITH_STATE = frozenset({"hedging", "hedging_budget", "ok_field", "trace"})
+_NOT_WITH_QUORUM = frozenset({"hedging", "hedging_budget", "ok_field"})
+
+
+def prefix(service: str) -> str:
+    """Return what a service's parameters begin with: ``/arm/plan`` has ``arm.plan``."""
+    return service.strip("/").replace("/", ".")
+
+
+def shown(spec: ServiceSpec) -> dict[str, Value]:
+    """Return a service's policy by key, as parameters show it."""
+    if spec.part is not Part.NONE:
+        return {"timeout_s": spec.timeout_s}
+    unfit: frozenset[str] = _NOT_WITH_QUORUM if spec.quorum > 1 else frozenset()
+    if spec.state is not None:
+        unfit = _NOT_WITH_STATE
+    values = {
+        "timeout_s": spec.timeout_s,
+        "on_timeout": spec.on_timeout.value,
+        "hedging": spec.hedging.value,
+        "hedging_budget": spec.hedging_budget,
+        "ok_field": spec.ok_field,
+        "trace": spec.trace,
+        "advertise": spec.advertised.value,
+    }
+    return {key: value for key, value in values.items() if key not in unfit}
+
+
+def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
+    """Return a service's policy with other values for some keys.
+
+    What only has a meaning beside another value (`hedging_budget`, `fallback`) is left out where
+    that value is gone.
+
+    Raises:
+        ValueError: The pool file's reader would refuse it, or it has no such parameter; with why.
+    """
+    now = shown(spec)
+    news = {key: value for key, value in values.items() if now.get(key) != value}
+    unknown = sorted(news.keys() - now.keys())
+    if unknown:
+        raise ValueError(f"`{spec.name}` has no parameter `{unknown[0]}`")
+    if not news:
+        return spec
+    if spec.part is not Part.NONE:
+        return replace(spec, timeout_s=_timeout(spec, news["timeout_s"]))
+    raw: dict[str, Any] = {**to_plain(spec), **news}
+    if raw.get("hedging") != HedgingMode.ADAPTIVE.value and "hedging_budget" not in news:
+        raw.pop("hedging_budget", None)
+    if raw.get("on_timeout") != OnTimeout.FALLBACK.value:
+        raw.pop("fallback", None)
+    if raw.get("ok_field") == "":
+        del raw["ok_field"]
+    try:
+        read = read_service(Section("parameter", spec.name, tree(raw)))
+    except SpecError as error:
+        reason = error.message.partition(f"{spec.name}.")[2] or error.message
+        raise ValueError(f"{reason}; {error.hint}" if error.hint else reason) from None
+    return replace(read, replicas=spec.replicas, traffic=spec.traffic)
+
+
+def _timeout(spec: ServiceSpec, value: Value) -> float:
+    if isinstance(value, (bool, str)) or not 0 < value <= LONGEST_S:
+        raise ValueError(f"timeout_s: must be a number above 0 and at most {LONGEST_S:g}")
+    return float(value)
+
+
+class Policies:
+    """The pool file's services, with what was set by parameters over them.
+
+    A value that was set holds until the pool file has another value for that key.
+
+    Args:
+        check_field: Says why a type's response has no boolean field of that name.
+    """
+
+    def __init__(self, check_field: FieldCheck = lambda kind, field: None) -> None:
+        self._check_field = check_field
+        self._file: dict[str, ServiceSpec] = {}
+        self._set: dict[str, dict[str, Value]] = {}
+
+    def follow(self, specs: Iterable[ServiceSpec]) -> None:
+        """Take the pool file's services."""
+        new = {spec.name: spec for spec in specs}
+        for name, values in list(self._set.items()):
+            if name not in new:
+                del self._set[name]
+                continue
+            before, after = shown(self._file[name]), shown(new[name])
+            for key in [k for k in values if k not in after or before.get(k) != after[k]]:
+                del values[key]
+            try:
+                changed(new[name], values)
+            except ValueError:  # what was set does not go with what the file says now
+                values.clear()
+        self._file = new
+
+    def set(self, values: Mapping[str, Value]) -> None:
+        """Set parameters by their full names: all of them, or none.
+
+        Raises:
+            ValueError: One of them is unknown, or its value is refused; with why.
+        """
+        by_prefix = {prefix(name): name for name in self._file}
+        wanted: dict[str, dict[str, Value]] = {}
+        for full, value in values.items():
+            head, _, key = full.rpartition(".")
+            if head not in by_prefix or key not in KEYS:
+                raise ValueError(f"there is no parameter `{full}`")
+            wanted.setdefault(by_prefix[head], {})[key] = value
+        merged = {name: {**self._set.get(name, {}), **news} for name, news in wanted.items()}
+        for name, news in merged.items():
+            spec = changed(self._file[name], news)
+            if spec.ok_field and spec.ok_field != self._file[name].ok_field:
+                reason = self._check_field(spec.type, spec.ok_field)
+                if reason:
+                    raise ValueError(f"{prefix(name)}.ok_field: {reason}")
+        self._set.update(merged)
+
+    def services(self) -> tuple[ServiceSpec, ...]:
+        """Return the services as they are to be proxied."""
+        return tuple(changed(s, self._set.get(name, {})) for name, s in self._file.items())
+
+    def parameters(self) -> dict[str, Value]:
+        """Return every parameter by its full name, with its value."""
+        return {
+            f"{prefix(spec.name)}.{key}": value
+            for spec in self.services()
+            for key, value in shown(spec).items()
+        }

@@ -1,0 +1,57 @@
+"""Judge the SkyPilot part of a pool file. Ours to check: names of keys, and what no pool can do.
+
+Not here: what stands in SkyPilot's own keys (SkyPilot judges that).
+"""
+
+from __future__ import annotations
+
+import re
+
+from fogft.poolfile.keys import LATER_KEYS, REFUSED_TASK_KEYS, TASK_KEYS, places
+from fogft.poolfile.tree import Section, plain, shown
+
+_ENV_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+def check_task(top: Section) -> None:
+    """Check the top level of a pool file.
+
+    Raises:
+        SpecError: The first mistake.
+    """
+    for key, reason in REFUSED_TASK_KEYS.items():
+        if key in top.children:
+            raise top.error(key, "cannot stand in a pool file", reason, at_key=True)
+    top.only((*TASK_KEYS, "fogft"), later=LATER_KEYS, elsewhere=places(TASK_KEYS))
+    if "fogft" not in top.children:
+        raise top.error("fogft", "is missing", "add `fogft:` with `services:` below it")
+    top.text("run", "write the command that starts your service, such as `run: exec python3 x.py`")
+    if top.has("num_nodes"):
+        nodes = top.children["num_nodes"].value
+        if isinstance(nodes, bool) or nodes != 1:
+            raise top.error(
+                "num_nodes",
+                f"must be 1, not {shown(plain(top.children['num_nodes']))}: "
+                "a replica is one machine",
+                "remove it, and set `fogft.replicas` for more replicas",
+            )
+    for key in ("resources", "file_mounts", "envs", "config", "volumes"):
+        if top.has(key):
+            top.section(key)
+    if top.has("setup"):
+        top.text("setup", "write the commands that install what `run` needs, or remove it")
+    if top.has("envs"):
+        _envs(top.section("envs"))
+
+
+def _envs(envs: Section) -> None:
+    for key, node in envs.children.items():
+        if not _ENV_NAME.fullmatch(key):
+            raise envs.error(
+                key,
+                "is not the name of an environment variable",
+                "use letters, digits and `_`, and begin with no digit",
+                at_key=True,
+            )
+        if node.value is None or isinstance(node.value, (tuple, dict)):
+            raise envs.error(key, "must have a text for a value", f'write `{key}: "..."`')

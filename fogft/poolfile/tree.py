@@ -1,0 +1,236 @@
+"""A pool file as a tree that remembers its lines, and typed access to it.
+
+`fogft.poolfile.yaml_tree` makes the tree; `spec_reader` says what must be in it. Every
+complaint is one `SpecError` that begins with ``file:line: key:`` and is one line long,
+whatever the file holds; its hint says what would be right.
+
+Owns: values with their lines, types, ranges, unknown keys.
+Not here: YAML, and what any key means.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, TypeVar
+
+from fogft.errors import SpecError
+
+Choice = TypeVar("Choice", bound=Enum)
+
+
+@dataclass(frozen=True)
+class Node:
+    """A value with its place.
+
+    Attributes:
+        value: Text, a number, a truth value or None; a tuple of nodes for a list; a
+            mapping from text to nodes.
+        line: Where the value begins, from 1.
+        key_line: Where the key stands that leads to it; `line` if none does.
+    """
+
+    value: str | int | float | bool | tuple[Node, ...] | Mapping[str, Node] | None
+    line: int
+    key_line: int
+
+
+def plain(node: Node) -> Any:
+    """Return the value without lines, as fresh lists and dictionaries."""
+    if isinstance(node.value, Mapping):
+        return {key: plain(child) for key, child in node.value.items()}
+    if isinstance(node.value, tuple):
+        return [plain(child) for child in node.value]
+    return node.value
+
+
+def tree(value: Any, line: int = 1) -> Node:
+    """Return plain lists and dictionaries as a tree: the way back of `plain`, all in one line."""
+    if isinstance(value, Mapping):
+        below: Any = {str(key): tree(child, line) for key, child in value.items()}
+    elif isinstance(value, (list, tuple)):
+        below = tuple(tree(child, line) for child in value)
+    else:
+        below = value
+    return Node(below, line, line)
+
+
+def shown(value: object, limit: int = 60) -> str:
+    """Return text in backquotes that is safe to print: one line, no control characters."""
+    text = str(value)
+    text = text if len(text) <= limit else text[: limit - 3] + "..."
+    return "`" + "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text) + "`"
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return the hint for a word that is not one of those known."""
+    words = sorted(known)
+    close = difflib.get_close_matches(word[:60], words, n=1)
+    if close:
+        return f"did you mean `{close[0]}`?"
+    return "known here: " + ", ".join(f"`{w}`" for w in words)
+
+
+class Section:
+    """A map in a pool file, read key by key.
+
+    Args:
+        file: Its name, as the user wrote it.
+        path: The key that leads here, such as ``fogft.services[0]``; empty at the top.
+        node: The map itself.
+
+    Raises:
+        SpecError: It is not a map.
+    """
+
+    def __init__(self, file: str, path: str, node: Node, hint: str = "") -> None:
+        if not isinstance(node.value, Mapping):
+            raise SpecError(
+                f"{file}:{node.line}: {path or 'file'}: must be a map of keys, not {_got(node)}",
+                hint or "write `key: value` lines here",
+            )
+        self.file = file
+        self.path = path
+        self.node = node
+        self.children: Mapping[str, Node] = node.value
+
+    def error(self, key: str, what: str, hint: str = "", *, at_key: bool = False) -> SpecError:
+        """Return the error that a key of this section deserves, at its line or at ours."""
+        node = self.children.get(key)
+        line = self.node.key_line if node is None else node.key_line if at_key else node.line
+        word = key if key and key == key.strip() else f'"{key}"'
+        full = f"{self.path}.{word}" if self.path else word
+        return SpecError(f"{self.file}:{line}: {shown(full, 80)[1:-1]}: {what}", hint)
+
+    def only(
+        self,
+        known: Iterable[str],
+        *,
+        later: Mapping[str, str] | None = None,
+        elsewhere: Mapping[str, str] | None = None,
+    ) -> None:
+        """Refuse every key that is not known.
+
+        Args:
+            known: The keys that may stand here.
+            later: Keys that are planned, each with what to do today.
+            elsewhere: Keys that have their place in another section, with that place.
+        """
+        allowed = set(known)
+        for key in self.children:
+            if key in allowed:
+                continue
+            if later and key in later:
+                raise self.error(key, "is not supported yet", later[key], at_key=True)
+            if elsewhere and key in elsewhere:
+                hint = f"`{key}` belongs {elsewhere[key]}"
+            else:
+                hint = nearest(key, allowed)
+            raise self.error(key, "unknown key", hint, at_key=True)
+
+    def has(self, key: str) -> bool:
+        """Whether the key is there with a value."""
+        return key in self.children and self.children[key].value is not None
+
+    def text(self, key: str, hint: str, default: str | None = None) -> str:
+        """Return a text that is not blank; without a default it is required."""
+        if key not in self.children:
+            if default is not None:
+                return default
+            raise self.error(key, "is missing", hint)
+        node = self.children[key]
+        if not isinstance(node.value, str):
+            quoted = "; put it in quotes" if isinstance(node.value, (bool, int, float)) else ""
+            raise self.error(key, f"must be text, not {_got(node)}", hint + quoted)
+        if not node.value.strip():
+            raise self.error(key, "is empty", hint)
+        return node.value
+
+    def whole(self, key: str, default: int, low: int, high: int) -> int:
+        """Return a whole number from `low` to `high`."""
+        if key not in self.children:
+            return default
+        node = self.children[key]
+        hint = f"write a whole number from {low} to {high}"
+        hint += f"; the default is {default}" if low <= default <= high else ""
+        if isinstance(node.value, bool) or not isinstance(node.value, int):
+            raise self.error(key, f"must be a whole number, not {_got(node)}", hint)
+        if not low <= node.value <= high:
+            raise self.error(key, f"must be from {low} to {high}, not {shown(node.value)}", hint)
+        return node.value
+
+    def flag(self, key: str, default: bool) -> bool:
+        """Return a truth value."""
+        if key not in self.children:
+            return default
+        node = self.children[key]
+        if not isinstance(node.value, bool):
+            hint = f"write `{key}: true` or `{key}: false`"
+            raise self.error(key, f"must be true or false, not {_got(node)}", hint)
+        return node.value
+
+    def number(
+        self, key: str, high: float, unit: str, default: float | None = None, *, zero: bool = False
+    ) -> float:
+        """Return a number above 0 (with `zero`: or 0) and at most `high`.
+
+        Without a default it is required.
+        """
+        if key not in self.children and default is not None:
+            return default
+        node = self.children[key]
+        limits = f"{'from' if zero else 'above'} 0 {'to' if zero else 'and at most'} {high:g}"
+        hint = f"write a number of {unit} {limits}, such as `{key}: {min(2.5, high):g}`"
+        if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
+            raise self.error(key, f"must be a number, not {_got(node)}", hint)
+        if not math.isfinite(node.value):
+            raise self.error(key, f"must be finite, not {shown(node.value)}", hint)
+        if not 0 <= node.value <= high or not (node.value or zero):
+            raise self.error(key, f"must be {limits}, not {shown(node.value)}", hint)
+        return float(node.value)
+
+    def choice(self, key: str, default: Choice) -> Choice:
+        """Return one of an enumeration's values, the default's own."""
+        values = [str(member.value) for member in type(default)]
+        allowed = " or ".join(f"`{value}`" for value in values)
+        text = self.text(key, f"write {allowed}", default=str(default.value))
+        if text not in values:
+            raise self.error(key, f"must be {allowed}, not {shown(text)}", nearest(text, values))
+        return type(default)(text)
+
+    def section(self, key: str, hint: str = "") -> Section:
+        """Return a map below; an empty one if the key is absent."""
+        node = self.children.get(key) or Node({}, self.node.line, self.node.key_line)
+        return Section(self.file, f"{self.path}.{key}" if self.path else key, node, hint)
+
+    def sections(self, key: str, hint: str) -> Sequence[Section]:
+        """Return a list of maps below, which must be there and not empty."""
+        if key not in self.children:
+            raise self.error(key, "is missing", hint)
+        node = self.children[key]
+        if not isinstance(node.value, tuple):
+            raise self.error(key, f"must be a list, not {_got(node)}", hint)
+        if not node.value:
+            raise self.error(key, "is empty", hint)
+        path = f"{self.path}.{key}" if self.path else key
+        return [
+            Section(self.file, f"{path}[{index}]", child, hint)
+            for index, child in enumerate(node.value)
+        ]
+
+
+def _got(node: Node) -> str:
+    """Say what stands there, with its type."""
+    value = node.value
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return f"the truth value `{str(value).lower()}`"
+    if isinstance(value, (int, float)):
+        return f"the number {shown(value)}"
+    if isinstance(value, str):
+        return f"the text {shown(value)}"
+    return "a list" if isinstance(value, tuple) else "a map"

@@ -1,0 +1,254 @@
+"""``fogft gateway --config FILE``: a gateway as a process. It needs no ROS.
+
+It follows its membership as a client proxy does, and listens as a replica does. Started
+again with a new certificate it is the same gateway, under its next generation.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.errors import CredentialError, FogftError, PoolBusy
+from fogft.link.port import Listener, Probe, ProbeAnswer
+from fogft.metrics import proxies
+from fogft.metrics.scrape import Scrape
+from fogft.model import names
+from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.replica import ReplicaId
+from fogft.model.spec import OnTimeout, ServiceSpec
+from fogft.proxy.config import GatewayConfig, read_gateway
+from fogft.proxy.gateway.gateway import Forwarder, NoRos, numbers
+from fogft.proxy.process import Watched, start_log, stop_on_signal
+from fogft.proxy.robot.client import ClientProxy
+from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.following import Following
+from fogft.proxy.robot.process import make_dialer
+from fogft.records.signing import Signer, common_name
+from fogft.requests.hedging import NEVER
+
+log = logging.getLogger(__name__)
+
+_REPORT_EVERY_S = 0.5
+
+
+def run(config_path: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
+    """Run until a signal ends it.
+
+    Args:
+        config_path: A `gateway.yaml`.
+        listen: ``host:port`` instead of the file's.
+        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
+
+    Raises:
+        PoolBusy: This gateway runs already.
+        FogftError: The configuration or the credentials cannot be used, or the port is taken.
+    """
+    start_log()
+    stop = stop_on_signal()
+    config = read_gateway(config_path, listen, metrics)
+    lock = disk.Lock(config.client.lock)
+    if not lock.acquire(wait=False):
+        name, pool = config.client.robot, config.client.pool
+        raise PoolBusy(f"gateway `{name}` of pool `{pool}` runs already")
+    gateway = _Gateway(config)
+    try:
+        gateway.run(stop)
+    finally:
+        gateway.close()
+        lock.release()
+        log.info("gateway_stopped gateway=%s", config.client.robot)
+
+
+class _Gateway:
+    """The parts of a gateway, and its loop."""
+
+    def __init__(self, config: GatewayConfig) -> None:
+        from fogft.link.zenoh.handshakes import HandshakeLog
+
+        self._handshakes = HandshakeLog()
+        self._config = config
+        client = config.client
+        self._incarnation = secrets.token_hex(8)
+        self._manager_seen = -NEVER
+        self._draining = False
+        self._forwarder = Forwarder()
+        dialer = make_dialer(client, self._manager_age_s)
+        self._proxy = ClientProxy(client.pool_uid, NoRos(), dialer, self._make_dispatcher)
+        self._services = tuple(_passed_on(service) for service in client.services)
+        self._proxy.serve(self._services)
+        self._following = Following(client)
+        self._revoked: frozenset[str] = frozenset()
+        self._listener: Listener | None = None
+        self._holder = self._own_holder()
+        self._certificate = Watched(client.credentials.certificate)
+        self._certificate.changed()
+        self._scrape = Scrape(lambda: proxies.of_gateway(self._told()))
+
+    def _own_holder(self) -> Holder:
+        ours = self._config.client.credentials
+        holder = holder_of(common_name(Signer(ours.certificate, ours.key).certificate))
+        if holder.role is not Role.GATEWAY:
+            raise CredentialError(
+                f"`{holder.common_name}` is no gateway's certificate",
+                "`fogft credentials issue gateway NAME` makes one",
+            )
+        return holder
+
+    def _make_dispatcher(
+        self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
+    ) -> Dispatcher:
+        dispatcher = Dispatcher(spec, self._forwarder.respond, ok_of=_ok_of(spec.type), wake=wake)
+        self._forwarder.use(spec.name, dispatcher)
+        return dispatcher
+
+    # -- the listener ---------------------------------------------------------------------
+
+    def _listen(self) -> None:
+        from fogft.link.zenoh.replica.listener import ZenohListener
+
+        uid, slot = self._config.client.pool_uid, names.gateway_slot(self._holder.name)
+        listener = ZenohListener(
+            self._config.listen,
+            self._config.client.credentials,
+            ReplicaId(uid, slot, self._holder.generation),
+            handshakes=self._handshakes,
+            certificate_name=self._holder.common_name,
+        )
+        keys = {s.name: names.service_key(uid, slot, s.name, s.type) for s in self._services}
+        listener.revoke(self._revoked)
+        listener.serve(keys, self._forwarder.request, self._probed, self._forwarder.cancel)
+        self._listener = listener
+        log.info("gateway_listening gateway=%s endpoint=%s", self._holder.short, listener.endpoint)
+
+    def _probed(self, probe: Probe) -> ProbeAnswer:
+        if probe.manager_age_s is not None:
+            seen = time.monotonic() - probe.manager_age_s
+            self._manager_seen = max(self._manager_seen, seen)
+        behind = self._proxy.behind()
+        ready = self._proxy.ready
+        return ProbeAnswer(
+            slot=names.gateway_slot(self._holder.name),
+            generation=self._holder.generation,
+            incarnation=self._incarnation,
+            ready=ready,
+            draining=self._draining,
+            in_flight=self._forwarder.in_flight,
+            work=numbers(self._forwarder.report()),
+            detail="" if ready else "no replica behind it answers",
+            behind=behind,
+            types=self._proxy.types_behind() if probe.describe else {},
+        )
+
+    def _manager_age_s(self) -> float | None:
+        age_s = time.monotonic() - self._manager_seen
+        return age_s if age_s < NEVER else None
+
+    # -- the loop -------------------------------------------------------------------------
+
+    def run(self, stop: threading.Event) -> None:
+        """Pass requests on until told to stop."""
+        self._forwarder.start()
+        self._listen()
+        self._scrape.at(self._config.client.metrics)
+        reported = time.monotonic()
+        while not stop.is_set():
+            self._proxy.run_once()
+            self._forwarder.tick(self._proxy.ready)
+            self._follow()
+            if self._certificate.changed():
+                self._renew()
+            if time.monotonic() - reported > _REPORT_EVERY_S:
+                reported = time.monotonic()
+                self._report()
+
+    def _follow(self) -> None:
+        try:
+            membership = self._following.look()
+        except FogftError as error:
+            log.error(
+                "file_failed path=%s reason=%r", self._config.client.membership, error.message
+            )
+            return
+        if membership is not None:
+            self._proxy.follow(membership)
+            self._revoke(membership.revoked)
+
+    def _revoke(self, revoked: frozenset[str]) -> None:
+        self._revoked |= revoked
+        if self._listener is not None:
+            self._listener.revoke(self._revoked)
+
+    def _renew(self) -> None:
+        """Go on under a new certificate: links one by one, the listener at once."""
+        try:
+            self._holder = self._own_holder()
+            if self._listener is not None:
+                self._listener.close()
+            self._listen()
+        except FogftError as error:
+            log.error("certificate_not_usable reason=%r", error.message)
+            return
+        self._proxy.renew()
+        self._following.renew()
+
+    def _told(self) -> dict[str, Any]:
+        return {
+            "forwarded": self._forwarder.report(),
+            "listener": dict(self._listener.counters()) if self._listener else {},
+            **self._proxy.report(),
+        }
+
+    def _report(self) -> None:
+        report = {
+            "pid": os.getpid(),
+            "written_at": time.time(),
+            "gateway": self._holder.short,
+            "endpoint": self._listener.endpoint if self._listener else "",
+            **self._told(),
+            **self._following.report(),
+        }
+        try:
+            disk.write_json(self._config.client.status, report, durable=False)
+        except FogftError as error:
+            log.error("file_failed path=%s reason=%r", self._config.client.status, error.message)
+
+    def close(self) -> None:
+        """Refuse what is under way, and leave."""
+        self._scrape.close()
+        self._forwarder.close()
+        if self._listener is not None:
+            self._listener.close()
+        self._following.close()
+        self._proxy.close()
+
+
+def _passed_on(service: ServiceSpec) -> ServiceSpec:
+    """Return a service's policy as a gateway follows it: what its caller gets is the robot's."""
+    return replace(service, on_timeout=OnTimeout.SILENT, fallback=None)
+
+
+def _ok_of(type_name: str) -> Callable[[str], Callable[[bytes], bool]]:
+    """Return what finds whether a response is ok; all are where the type is not known here."""
+
+    def ok_of(field: str) -> Callable[[bytes], bool]:
+        try:
+            from fogft.ros import types
+
+            return types.bool_field(type_name, field)
+        except (FogftError, ImportError) as error:
+            log.warning(
+                "ok_field_not_judged type=%s reason=%r effect='the first response is returned'",
+                type_name, str(error),
+            )  # fmt: skip
+            return lambda payload: True
+
+    return ok_of

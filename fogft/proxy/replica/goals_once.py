@@ -1,0 +1,285 @@
+"""At a replica: an action server gets each goal once, however often robots send it.
+
+A robot gives a goal again to whom may not have it: a replica that came later, was too slow, whose
+link was lost, or whose command crashed. To be asked twice for one goal harms some action servers
+(rclcpp's ends its process when it accepts a goal that it has). So copies of a goal wait for the
+answer to the first, for as long as each may; the first is waited for until the action server dies,
+and who comes after it was accepted gets the same answer.
+
+Like any service, an action server is given no more at once than its queue holds.
+
+Owns: `send_goal` requests, from the wire to the answer, and which goals the present action server
+has. Not here: the action's other services (`responder`).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
+
+from fogft.errors import RosError, Unreadable
+from fogft.link.port import Incoming, Refusal
+from fogft.model.spec import Part
+from fogft.proxy.replica.responder import OUTSTANDING
+from fogft.ros.port import RosClient
+from fogft.topics import goals
+
+log = logging.getLogger(__name__)
+
+_ACCEPTED_KEPT = 16_384  # of each action, 200 bytes each
+_LINE_LIMIT = 512
+_COPIES_LIMIT = 64
+_BYTES_LIMIT = 64 << 20  # of all goals that have no answer
+# An action server that has not answered for so long is given others beside it.
+_PATIENCE_S = 60.0
+# The parts of an action server that dies are seen to be gone one after the other.
+_ONE_DEATH_S = 1.0
+
+
+class _Open:
+    """A goal that has no answer yet."""
+
+    __slots__ = ("begun_at", "holds", "payload", "size", "ticket", "unheard", "waiting")
+
+    def __init__(self, payload: bytes) -> None:
+        self.payload = payload
+        self.size = len(payload)
+        self.begun_at: float | None = None  # when the action server was given it
+        self.holds = False  # it counts among those that the action server has to look at
+        self.unheard = False  # we would not hear its answer
+        self.ticket: int | None = None
+        self.waiting: list[tuple[float, Incoming]] = []  # copies, each with its deadline
+
+
+class _ActionServer:
+    """What is known of one `send_goal` service, in its present life."""
+
+    def __init__(self) -> None:
+        self.life = 0
+        self.death = "", -math.inf  # what part was seen to be gone, and when
+        self.line: deque[bytes] = deque()  # goals that it was not given yet
+        self.open: dict[bytes, _Open] = {}
+        self.accepted: OrderedDict[bytes, bytes] = OrderedDict()
+
+    @property
+    def at_work(self) -> int:
+        return sum(goal.holds for goal in self.open.values())
+
+    @property
+    def held_bytes(self) -> int:
+        return sum(goal.size * max(len(goal.waiting), 1) for goal in self.open.values())
+
+
+class GoalsOnce:
+    """Passes on the goals that are new.
+
+    Args:
+        services: The `send_goal` services.
+        is_ready: Whether a service can answer now.
+        outstanding: Goals that an action server is given at once.
+        accepted_kept: Accepted goals that are known at once, for each; the oldest go first.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        services: Collection[str],
+        is_ready: Callable[[str], bool],
+        *,
+        outstanding: int = OUTSTANDING,
+        accepted_kept: int = _ACCEPTED_KEPT,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._servers = {service: _ActionServer() for service in services}
+        self._is_ready = is_ready
+        self._outstanding = outstanding
+        self._accepted_kept = accepted_kept
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._clients: Mapping[str, RosClient] = {}
+
+    def __contains__(self, service: object) -> bool:
+        return service in self._servers
+
+    def __bool__(self) -> bool:
+        return bool(self._servers)
+
+    @property
+    def in_flight(self) -> int:
+        """Goals that wait or were given and have no answer yet."""
+        with self._lock:
+            return sum(len(server.open) for server in self._servers.values())
+
+    def use(self, clients: Mapping[str, RosClient]) -> None:
+        """Set the clients of the local services."""
+        self._clients = clients
+
+    # -- from the wire --------------------------------------------------------------------
+
+    def request(self, incoming: Incoming) -> None:
+        """Take a goal from the wire. Never blocks."""
+        service, goal = incoming.service, goals.goal_of(incoming.payload)
+        server = self._servers[service]
+        with self._lock:
+            answer = server.accepted.get(goal)
+            reason = "" if answer is not None else self._reason_to_refuse(server, incoming, goal)
+            if answer is None and not reason:
+                known = server.open.get(goal)
+                if known is None:
+                    known = server.open[goal] = _Open(incoming.payload)
+                    server.line.append(goal)
+                known.waiting.append((self._clock() + incoming.remaining_s, incoming))
+        if answer is not None:
+            incoming.reply(answer)
+        elif reason:
+            incoming.refuse(reason)
+        else:
+            self._pass_on(service)
+
+    def _reason_to_refuse(self, server: _ActionServer, incoming: Incoming, goal: bytes) -> str:
+        if incoming.remaining_s <= 0:
+            return Refusal.EXPIRED
+        if not self._is_ready(incoming.service) or incoming.service not in self._clients:
+            return Refusal.NOT_READY
+        held_bytes = sum(server.held_bytes for server in self._servers.values())
+        if held_bytes and held_bytes + len(incoming.payload) > _BYTES_LIMIT:
+            return Refusal.OVERLOADED
+        known = server.open.get(goal)
+        if known is None:
+            return Refusal.OVERLOADED if len(server.line) >= _LINE_LIMIT else ""
+        return Refusal.OVERLOADED if len(known.waiting) >= _COPIES_LIMIT else ""
+
+    # -- to the action server -------------------------------------------------------------
+
+    def _pass_on(self, service: str) -> None:
+        """Give an action server as much of what waits as it may have."""
+        server = self._servers[service]
+        while True:
+            with self._lock:
+                if not server.line or server.at_work >= self._outstanding:
+                    return
+                goal, life = server.line.popleft(), server.life
+                known = server.open[goal]
+                known.begun_at, known.holds = self._clock(), True
+                payload, known.payload = known.payload, b""
+            client = self._clients.get(service)
+            if client is None:
+                self._drop(server, goal, known, Refusal.NOT_READY)
+                continue
+            try:
+                answered = partial(self._answered, service, goal, life)
+                known.ticket = client.call(payload, answered)
+            except RosError as error:
+                log.warning("goal_not_passed_on service=%s reason=%r", service, str(error))
+                hopeless = isinstance(error, Unreadable)
+                reason = Refusal.MALFORMED if hopeless else Refusal.OVERLOADED
+                self._drop(server, goal, known, reason)
+
+    def _drop(self, server: _ActionServer, goal: bytes, known: _Open, reason: str) -> None:
+        """Forget a goal that the action server was not given after all."""
+        with self._lock:
+            if server.open.get(goal) is known:
+                del server.open[goal]
+            waiting, known.waiting = known.waiting, []
+        for _, incoming in waiting:
+            incoming.refuse(reason)
+
+    def _answered(self, service: str, goal: bytes, life: int, answer: bytes) -> None:
+        server = self._servers[service]
+        with self._lock:
+            known = server.open.pop(goal, None) if life == server.life else None
+            if known is None:
+                return
+            lost = self._overtaken(server, known)
+            if goals.is_success(Part.GOAL, answer):
+                server.accepted[goal] = answer
+                if len(server.accepted) > self._accepted_kept:
+                    server.accepted.popitem(last=False)
+        try:
+            for _, incoming in known.waiting:
+                incoming.reply(answer)
+        finally:
+            self._refuse(service, lost, Refusal.LOST)
+            self._pass_on(service)
+
+    def _overtaken(self, server: _ActionServer, by: _Open) -> list[_Open]:
+        """Take out what an action server will not answer any more. Under the lock.
+
+        One that was silent for long was given more than its queue holds, which then loses the
+        oldest. It answers in order: what it was given before that, it has lost.
+        """
+        lost = [
+            goal
+            for goal, known in server.open.items()
+            if known.begun_at is not None
+            and by.begun_at is not None
+            and known.begun_at < by.begun_at
+            and not known.holds
+            and not known.unheard
+        ]
+        return [server.open.pop(goal) for goal in lost]
+
+    # -- time and ends --------------------------------------------------------------------
+
+    def tick(self) -> None:
+        """Refuse the copies whose deadline has come. Call at about 10 Hz."""
+        now = self._clock()
+        late: list[Incoming] = []
+        with self._lock:
+            for server in self._servers.values():
+                for goal, known in list(server.open.items()):
+                    late += [one for deadline, one in known.waiting if deadline <= now]
+                    known.waiting = [entry for entry in known.waiting if entry[0] > now]
+                    if known.begun_at is None:
+                        if not known.waiting:  # never begun: nobody wants it any more
+                            del server.open[goal]
+                            server.line.remove(goal)
+                    elif now - known.begun_at > _PATIENCE_S:
+                        known.holds = False
+        for incoming in late:
+            incoming.refuse(Refusal.EXPIRED)
+        for service in self._servers:
+            self._pass_on(service)
+
+    def crashed(self, service: str = "") -> None:
+        """A service, or all with the user's command, has died: its action has lost all goals."""
+        action, now = service.rpartition("/")[0], self._clock()
+        for name, server in self._servers.items():
+            if not service or name.rpartition("/")[0] == action:
+                with self._lock:
+                    part, at = server.death
+                    if service and service != part and now - at < _ONE_DEATH_S:
+                        continue
+                    server.death = service, now
+                    server.life += 1
+                    server.accepted.clear()
+                    ended, server.open = server.open, {}
+                    server.line.clear()
+                self._refuse(name, ended.values(), Refusal.CRASHED)
+
+    def left_ros(self) -> None:
+        """We have lost our own node: answers that are under way never come.
+
+        What the action servers were given they have, as far as is known: they are not given it
+        again.
+        """
+        for name, server in self._servers.items():
+            with self._lock:
+                unbegun = [server.open.pop(goal) for goal in server.line]
+                server.line.clear()
+                for known in server.open.values():
+                    known.holds, known.unheard = False, True
+            self._refuse(name, unbegun, Refusal.NOT_READY)
+
+    def _refuse(self, service: str, ended: Collection[_Open], reason: str) -> None:
+        client = self._clients.get(service)
+        for known in ended:
+            if client is not None and known.ticket is not None:
+                client.forget(known.ticket)
+            for _, incoming in known.waiting:
+                incoming.refuse(reason if known.begun_at is not None else Refusal.NOT_READY)

@@ -1,0 +1,101 @@
+"""What a replica offers: the services that its configuration lists, or whatever `run` advertises.
+
+Where the configuration lists none, the ROS graph of the replica is looked at, and every service
+that an application offers there is taken up, under the name that ROS gives it: namespaces and
+remappings have done their work by then.
+
+Owns: which services there are, since when, and the definitions of their types.
+Not here: whether they answer (`server`), which the robot proxies (`fogft.pool.folder.discovered`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from fogft.model.spec import ServiceSpec
+from fogft.model.type_definition import Definition
+from fogft.ros.port import RosNode
+
+LOOK_EVERY_S = 0.25
+SETTLED_S = 1.0  # unchanged for so long: what starts is not told piece by piece
+_TOLD = 8  # names in a sentence
+
+
+class Offering:
+    """The services of one replica.
+
+    Args:
+        services: Those of the configuration; none to find them out.
+        define: Returns a type's definition here.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        services: tuple[ServiceSpec, ...],
+        define: Callable[[str], Definition] | None,
+        clock: Callable[[], float],
+    ) -> None:
+        self.services = services
+        self._finds_out = not services
+        self._define = define
+        self._clock = clock
+        self._definitions: dict[str, Definition] = {}
+        self._seen: Mapping[str, str] = {}
+        self._seen_since = self._looked_at = float("-inf")
+
+    def look(self, node: RosNode, *, complete: bool) -> tuple[ServiceSpec, ...]:
+        """Look at the graph; return services that are new here, to be taken up.
+
+        Args:
+            node: The replica's node.
+            complete: All services answer: where they are listed there is nothing to look for.
+        """
+        now = self._clock()
+        if now < self._looked_at + LOOK_EVERY_S or (complete and not self._finds_out):
+            return ()
+        self._looked_at = now
+        seen = node.offered()
+        if seen != self._seen:
+            self._seen, self._seen_since = seen, now
+        if not self._finds_out:
+            return ()
+        known = {service.name for service in self.services}
+        new = tuple(ServiceSpec(n, t) for n, t in sorted(seen.items()) if n not in known)
+        self.services += new
+        return new
+
+    def reset(self) -> None:
+        """Forget what was seen: `run` has ended."""
+        self._seen, self._seen_since = {}, self._clock()
+
+    @property
+    def told(self) -> dict[str, str]:
+        """Return name -> type of what was found out, once it has settled; else nothing."""
+        if not self._finds_out or self._clock() < self._seen_since + SETTLED_S:
+            return {}
+        return dict(self._seen)
+
+    def types(self) -> dict[str, Definition]:
+        """Return the definitions of all types here; nothing until each is known."""
+        if self._define is not None:
+            for service in self.services:
+                found = self._definitions.get(service.type)
+                if found is None or not found.known:
+                    self._definitions[service.type] = self._define(service.type)
+        told = dict(self._definitions)
+        return told if all(definition.known for definition in told.values()) else {}
+
+    def missing(self, ready: frozenset[str]) -> str:
+        """Return in words what is missing, and what `run` offers instead; empty if nothing is."""
+        if self._finds_out and not self.services:
+            return "`run` offers no service yet"
+        missing = sorted({service.name for service in self.services} - ready)
+        if not missing:
+            return ""
+        listed = {service.name: service.type for service in self.services}
+        others = [f"{n} ({t})" for n, t in sorted(self._seen.items()) if listed.get(n) != t]
+        more = "; it offers " + ", ".join(others[:_TOLD]) if others else ""
+        if len(others) > _TOLD:
+            more += f" and {len(others) - _TOLD} more"
+        return f"`run` does not offer {', '.join(missing)} yet{more}"

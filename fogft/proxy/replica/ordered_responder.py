@@ -1,0 +1,219 @@
+"""The replica's side of one stateful service: carry out what `OrderedReplica` decides.
+
+Orders come from the wire's threads, responses from the ROS thread. The lock is held while a
+decision is made, never while something is sent.
+
+Owns: the calls of the service, of its snapshot and of its restore.
+Not here: decisions (`fogft.ordering.replica`), what the bytes of a state service mean
+(`fogft.ros.state_bytes`).
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from fogft.core.shared_replica import SharedReplica
+from fogft.errors import RosError, Unreadable
+from fogft.link.port import Incoming, Refusal
+from fogft.ordering import orders
+from fogft.ordering.orders import Op, OrderError
+from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
+from fogft.ros.port import RosClient
+
+log = logging.getLogger(__name__)
+
+_SNAPSHOT_LIMIT_S = 30.0
+
+
+class StateBytes(Protocol):
+    """How a state travels through the two services of the pool file."""
+
+    def snapshot_request(self) -> bytes:
+        """Return the serialised request of the snapshot service."""
+
+    def read_snapshot(self, response: bytes) -> bytes:
+        """Return the state in a response of the snapshot service. Raises RosError."""
+
+    def restore_request(self, state: bytes) -> bytes:
+        """Return the serialised request that restores a state. Raises RosError."""
+
+    def check_restored(self, response: bytes) -> None:
+        """Raise RosError where a response of the restore service says that it failed."""
+
+
+class Clients:
+    """The three local services: the one itself, its snapshot and its restore."""
+
+    def __init__(self, service: RosClient, snapshot: RosClient, restore: RosClient) -> None:
+        self.service = service
+        self.snapshot = snapshot
+        self.restore = restore
+
+    def available(self) -> bool:
+        """Whether discovery has found all three."""
+        all_three = (self.service, self.snapshot, self.restore)
+        return all(client.available() for client in all_three)
+
+
+class OrderedResponder:
+    """Applies the requests of one stateful service, in their order.
+
+    Args:
+        name: The service's name.
+        state: How its state travels.
+        clock: Monotonic seconds.
+        shared: Whether several robots may order it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        state: StateBytes,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        shared: bool = False,
+    ) -> None:
+        self._name = name
+        self._state = state
+        self._clock = clock
+        self._lock = threading.Lock()
+        # Another process is another member: it knows nothing of what this one promised.
+        self._machine: OrderedReplica[Incoming] = (
+            SharedReplica(secrets.randbits(64)) if shared else OrderedReplica()
+        )
+        self._clients: Clients | None = None
+        self._begun: Begin | None = None
+        self._begun_at = 0.0
+        self._again: Begin | None = None  # ROS did not take it: it is tried again
+        self.detail = ""
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has the present state and applies what comes."""
+        return self._machine.current
+
+    @property
+    def in_flight(self) -> int:
+        """Requests that are held and not yet answered."""
+        return self._machine.in_flight
+
+    @property
+    def used(self) -> bool:
+        """Whether the service's state may be any other than its first."""
+        return self._machine.busy or self._machine.position != orders.START
+
+    def use(self, clients: Clients | None) -> None:
+        """Set the clients of the local services; None while ROS is left."""
+        with self._lock:
+            self._clients = clients
+            self._machine.serving = False
+
+    def request(self, incoming: Incoming) -> None:
+        """Take an order from the wire. Never blocks."""
+        try:
+            op, epoch, index = orders.decode(incoming.request_id)
+        except OrderError:
+            incoming.refuse(Refusal.MALFORMED)
+            return
+        with self._lock:
+            try:
+                effects = self._machine.order(
+                    op, epoch, index, incoming.payload, robot=incoming.robot, to=incoming
+                )
+            except OrderError:
+                effects = [Refuse(incoming, Refusal.MALFORMED)]
+        self._perform(effects)
+
+    def _perform(self, effects: list[Any]) -> None:
+        for effect in effects:
+            if isinstance(effect, Reply):
+                effect.to.reply(effect.payload)
+            elif isinstance(effect, Refuse):
+                effect.to.refuse(effect.reason)
+            else:
+                self._begin(effect)
+
+    def _begin(self, begin: Begin) -> None:
+        self._begun, self._begun_at = begin, self._clock()
+        clients = self._clients
+        try:
+            if clients is None:
+                raise RosError("ROS was left")
+            if begin.op is Op.APPLY:
+                clients.service.call(begin.payload, lambda answer: self._done(begin, answer))
+            elif begin.op is Op.SNAPSHOT:
+                request = self._state.snapshot_request()
+                clients.snapshot.call(request, lambda answer: self._snapshot(begin, answer))
+            else:
+                request = self._state.restore_request(begin.payload)
+                clients.restore.call(request, lambda answer: self._restored(begin, answer))
+        except Unreadable as error:
+            log.warning("request_unreadable service=%s reason=%r", self._name, error.message)
+            self._done(begin, None)
+        except RosError as error:
+            if begin.op is Op.APPLY:
+                log.warning("request_not_passed_on service=%s reason=%r", self._name, error.message)
+                self._again = begin
+            else:
+                self._failed(begin, error)
+
+    def _snapshot(self, begin: Begin, response: bytes) -> None:
+        try:
+            state = self._state.read_snapshot(response)
+        except RosError as error:
+            self._failed(begin, error)
+        else:
+            self._done(begin, state)
+
+    def _restored(self, begin: Begin, response: bytes) -> None:
+        try:
+            self._state.check_restored(response)
+        except RosError as error:
+            self._failed(begin, error)
+        else:
+            log.info("state_restored service=%s bytes=%d", self._name, len(begin.payload))
+            self._done(begin, b"")
+
+    def _failed(self, begin: Begin, error: RosError) -> None:
+        what = begin.op.name.lower()
+        self.detail = f"the {what} of `{self._name}` failed: {error.message}"
+        log.error("state_%s_failed service=%s reason=%r", what, self._name, error.message)
+        self._done(begin, None)
+
+    def _done(self, begin: Begin, answer: bytes | None) -> None:
+        with self._lock:
+            if self._begun is begin:
+                self._begun = None
+            if answer is not None:
+                self.detail = ""
+            effects = self._machine.done(begin.serial, answer)
+        self._perform(effects)
+
+    def crashed(self) -> None:
+        """The service has died, with its state."""
+        with self._lock:
+            self._again = None
+            effects = self._machine.lost()
+        self._perform(effects)
+
+    def tick(self, alive: bool) -> None:
+        """Look for the services, and try again what ROS did not take. Call at about 10 Hz.
+
+        Args:
+            alive: Whether the user's command lives.
+        """
+        with self._lock:
+            clients = self._clients
+            self._machine.serving = alive and clients is not None and clients.available()
+            again, self._again = self._again, None
+            begun = self._begun
+            waited_s = self._clock() - self._begun_at
+        if again is not None:
+            self._begin(again)
+        elif begun is not None and begun.op is Op.SNAPSHOT and waited_s > _SNAPSHOT_LIMIT_S:
+            self._failed(begun, RosError(f"no answer for {_SNAPSHOT_LIMIT_S:.0f} s"))

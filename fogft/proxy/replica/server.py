@@ -1,0 +1,378 @@
+"""The server proxy: the replica's side. Takes requests off the wire to the local services.
+
+It supervises the user's command, says "ready" for a service only while the command lives
+and discovery finds the service, and answers probes at once whatever the services do.
+
+When the command dies, the proxy leaves ROS and joins it anew: discovery would go on
+listing the dead service until its lease ends (20 s with Fast DDS), and requests sent to it
+would be lost. A new node knows only the living. When a service goes and the command lives (it may
+restart its own nodes), what was passed on to that service is refused, to be sent again.
+
+Owns: the replica's state as probes tell it. Not here: requests (`responder`), the command
+(`supervisor`), files and signals (`server_process`).
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from collections.abc import Callable
+from typing import Any, cast
+
+from fogft.cloud.notice_formats import Notice, NoticeKind
+from fogft.errors import RosError
+from fogft.link.port import Incoming, Listener, Probe, ProbeAnswer
+from fogft.model import names
+from fogft.model.choices import Freshness
+from fogft.model.replica import ReplicaId
+from fogft.model.spec import Part, ServiceSpec
+from fogft.model.topic import TopicSpec
+from fogft.model.type_definition import Definition
+from fogft.poolfile.state import StateSpec
+from fogft.proxy.replica.goals_once import GoalsOnce
+from fogft.proxy.replica.interruption import CANCEL_TYPE
+from fogft.proxy.replica.offering import Offering
+from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder, StateBytes
+from fogft.proxy.replica.responder import Responder
+from fogft.proxy.replica.supervisor import Supervisor
+from fogft.proxy.replica.topics import TopicsOnReplica
+from fogft.ros.port import RosClient, RosNode, RosTopics
+from fogft.topics import goals
+
+log = logging.getLogger(__name__)
+
+
+class ServerProxy:
+    """Answers for one replica.
+
+    Args:
+        id: Which replica this is.
+        services: What it answers; none for whatever the command offers.
+        listener: Its end of the wire; `serve` is called here.
+        make_node: Joins ROS; called again after each death of the command.
+        supervisor: The user's command.
+        make_state: Says how the state of a stateful service travels.
+        define: Returns the definition of a service type here, for the robot to compare.
+        topics: What passes besides services; then nodes publish and subscribe, too.
+        max_in_flight: Requests held at once.
+        orphan_after_s: With no sign of the pool's manager for so long, `orphaned` is true.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        id: ReplicaId,
+        services: tuple[ServiceSpec, ...],
+        listener: Listener,
+        make_node: Callable[[], RosNode],
+        supervisor: Supervisor,
+        *,
+        make_state: Callable[[StateSpec], StateBytes] | None = None,
+        define: Callable[[str], Definition] | None = None,
+        topics: tuple[TopicSpec, ...] = (),
+        max_in_flight: int = 512,
+        orphan_after_s: float = 3600.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._id = id
+        self._offering = Offering(services, define, clock)
+        self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
+        self._listener = listener
+        self._make_node = make_node
+        self._supervisor = supervisor
+        self._orphan_after_s = orphan_after_s
+        self._clock = clock
+        self._topics = TopicsOnReplica(topics, clock)
+        self._incarnation = secrets.token_hex(8)
+        self._ready: frozenset[str] = frozenset()
+        self._manager_seen = clock()
+        self._node: RosNode | None = None
+        self._clients: dict[str, RosClient] = {}
+        self._revoked: frozenset[str] = frozenset()
+        self._servers: dict[str, int] = {}
+        self._ordered: dict[str, OrderedResponder] = {}
+        for service in services:
+            if service.state is not None and make_state is not None:
+                state = make_state(service.state)
+                self._ordered[service.name] = OrderedResponder(
+                    service.name, state, clock, shared=service.state.shared
+                )
+        self._draining = False
+        self._at_risk = False
+        self.responder = Responder(
+            lambda name: name in self._ready,
+            max_in_flight=max_in_flight,
+            limits=_limits(services),
+            latest=[s.name for s in services if s.freshness is Freshness.LATEST],
+            passing=_for_the_moment(services),
+            clock=clock,
+        )
+        self._goals = GoalsOnce(
+            [s.name for s in services if s.part is Part.GOAL],
+            lambda name: name in self._ready,
+            clock=clock,
+        )
+
+    def start(self) -> None:
+        """Begin to listen and start the user's command."""
+        keys = self._keys(self._offering.services) | self._topic_keys()
+        self._join_ros()
+        # Where no service is stateful there is nothing to choose, and nothing to pay.
+        chosen = self._ordered or self._topics or self._goals
+        request = self._request if chosen else self.responder.request
+        self._listener.serve(keys, request, self._probe, self.responder.cancel)
+        self._supervisor.poll()
+        log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
+
+    def _keys(self, services: tuple[ServiceSpec, ...]) -> dict[str, str]:
+        id = self._id
+        return {s.name: names.service_key(id.pool_uid, id.slot, s.name, s.type) for s in services}
+
+    def _topic_keys(self) -> dict[str, str]:
+        id, topics = self._id, self._topics.topics
+        return {t.key_name: names.service_key(id.pool_uid, id.slot, t.key_name, t.type)
+                for t in topics}  # fmt: skip
+
+    def run_once(self) -> None:
+        """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
+        died = self._supervisor.poll()
+        if died or self._node is None or not self._node.alive:
+            self._ready = frozenset()
+            if died:
+                self._goals.crashed()
+            self._crashed()
+            self._leave_ros()
+            self._join_ros()
+        self._take_up_new()
+        self._look_for_services()
+        self.responder.tick()
+        self._goals.tick()
+        self._topics.tick()
+        for ordered in self._ordered.values():
+            ordered.tick(self._supervisor.alive)
+
+    def _take_up_new(self) -> None:
+        if self._node is None or not self._supervisor.alive:
+            self._offering.reset()
+            return
+        complete = len(self._ready) == len(self._offering.services)
+        for service in self._offering.look(self._node, complete=complete):
+            log.info("service_found replica=%s service=%s type=%s", self._id, service.name,
+                     service.type)  # fmt: skip
+            self._make_client(service)
+            self._listener.add(self._keys((service,)))
+
+    def _crashed(self) -> None:
+        self.responder.crashed()
+        for ordered in self._ordered.values():
+            ordered.crashed()
+
+    def _look_for_services(self) -> None:
+        ready = frozenset(
+            name
+            for name, client in self._clients.items()
+            if self._supervisor.alive and client.available()
+        )
+        gone = self._ready - ready
+        if ready != self._ready:
+            log.info("services_ready replica=%s ready=%s", self._id, sorted(ready))
+            self._ready = ready
+        for name in gone | self._replaced():
+            log.warning("service_lost replica=%s service=%s", self._id, name)
+            if name in self._ordered and self._supervisor.alive:
+                self._supervisor.restart()  # what state it is in, nobody knows
+            else:
+                self._goals.crashed(name)
+                self.responder.crashed(name)
+
+    def _replaced(self) -> set[str]:
+        """Return the services that have one more server than before.
+
+        It took the place of one that died: discovery lists the dead one beside it for long.
+        """
+        before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
+        return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that can answer now."""
+        return self._ready
+
+    @property
+    def draining(self) -> bool:
+        """Whether it asked to be left alone."""
+        return self._draining
+
+    @property
+    def endpoint(self) -> str:
+        """``host:port`` at which it listens."""
+        return self._listener.endpoint
+
+    def revoke(self, names: frozenset[str]) -> None:
+        """Let these holders of certificates in no more."""
+        if names - self._revoked:
+            self._revoked |= names
+            self._listener.revoke(self._revoked)
+
+    @property
+    def orphaned(self) -> bool:
+        """Whether nothing was heard of a manager for `orphan_after_s`."""
+        return self._clock() - self._manager_seen > self._orphan_after_s
+
+    def noticed(self, notice: Notice) -> None:
+        """Pass on what the machine was told by its cloud. From any thread; never taken back.
+
+        A preemption asks the robot to prefer the others, and the manager to replace this
+        replica; a rebalance is a hint, and the replica serves on as before.
+        """
+        if notice.kind is NoticeKind.PREEMPTION:
+            self._draining = True
+        else:
+            self._at_risk = True
+
+    def report(self) -> dict[str, Any]:
+        """Return what became of requests here, for metrics."""
+        answering = self._answering()
+        return {
+            "work": self.responder.report(),
+            "refused": dict(self.responder.refused),
+            "services": {s.name: s.name in answering for s in self._offering.services},
+            "draining": self._draining,
+            "restarts": max(self._supervisor.restarts, 0),
+            "wire": dict(self._listener.counters()),
+        }
+
+    def _join_ros(self) -> None:
+        node = self._node = self._make_node()
+        self._clients = {}
+        self._servers = {}
+        if self._topics:
+            self._topics.use(cast(RosTopics, node))
+        services = self._offering.services
+        for service in services:
+            self._make_client(service)
+        cancels = {s.name: node.client(s.cancel, CANCEL_TYPE) for s in services if s.cancel}
+        self.responder.use(self._clients, cancels)
+        self._goals.use(self._clients)
+        for service in services:
+            if service.name not in self._clients:
+                continue
+            if service.name in self._ordered and service.state is not None:
+                ends = (service.state.snapshot, service.state.restore)
+                snapshot, restore = (node.client(end.name, end.type) for end in ends)
+                clients = Clients(self._clients[service.name], snapshot, restore)
+                self._ordered[service.name].use(clients)
+
+    def _make_client(self, service: ServiceSpec) -> None:
+        """Make a service's client. Without its type the replica goes on, and says why."""
+        if self._node is None:
+            return
+        try:
+            self._clients[service.name] = self._node.client(service.name, service.type)
+        except RosError as error:
+            if self._not_usable.get(service.name) != error.message:
+                log.error("service_not_usable replica=%s service=%s reason=%r", self._id,
+                          service.name, error.message)  # fmt: skip
+            self._not_usable[service.name] = error.message
+        else:
+            self._not_usable.pop(service.name, None)
+
+    def _leave_ros(self) -> None:
+        node, self._node, self._clients = self._node, None, {}
+        self.responder.use({})
+        self._goals.left_ros()
+        self._goals.use({})
+        self._topics.use(None)
+        for ordered in self._ordered.values():
+            ordered.use(None)
+        if node is not None:
+            node.close()
+
+    def _request(self, incoming: Incoming) -> None:
+        if incoming.service in self._topics:
+            self._topics.request(incoming)
+            return
+        if incoming.service in self._goals:
+            self._goals.request(incoming)
+            return
+        (self._ordered.get(incoming.service) or self.responder).request(incoming)
+
+    def _answering(self) -> frozenset[str]:
+        """Return the services that can answer: found, and in the present state."""
+        if not self._ordered:
+            return self._ready
+        behind = {name for name, ordered in self._ordered.items() if not ordered.ready}
+        return self._ready - behind
+
+    def _passing(self) -> frozenset[str]:
+        """Return the topics that pass now, by their names on the wire."""
+        return self._topics.ready() if self._topics and self._supervisor.alive else frozenset()
+
+    def _probe(self, probe: Probe) -> ProbeAnswer:
+        if probe.manager_age_s is not None:
+            seen = self._clock() - probe.manager_age_s
+            self._manager_seen = max(self._manager_seen, seen)
+        return ProbeAnswer(
+            slot=self._id.slot,
+            generation=self._id.generation,
+            incarnation=self._incarnation,
+            ready=self._answering() | self._passing(),
+            draining=self._draining,
+            at_risk=self._at_risk,
+            restarts=max(self._supervisor.restarts, 0),
+            in_flight=self.responder.in_flight
+            + self._goals.in_flight
+            + sum(ordered.in_flight for ordered in self._ordered.values()),
+            detail=self._detail(),
+            work=self.responder.report(),
+            offered=self._offering.told,
+            types=self._offering.types() if probe.describe else {},
+        )
+
+    def _detail(self) -> str:
+        services = self._offering.services
+        if services and len(self._ready) == len(services):
+            return self._state_detail() or self._topics.trouble
+        for why in self._not_usable.values():
+            return why
+        if self._topics.trouble:
+            return self._topics.trouble
+        if not self._supervisor.alive:
+            if not self._supervisor.last_exit:
+                return "`run` has not started"
+            return f"`run` {self._supervisor.last_exit}: see `fogft logs {self._id.slot}`"
+        return self._offering.missing(self._ready)
+
+    def _state_detail(self) -> str:
+        for name, ordered in self._ordered.items():
+            if not ordered.ready:
+                return ordered.detail or f"`{name}` does not have the present state yet"
+        return ""
+
+    def close(self) -> None:
+        """Stop the command, leave the wire and ROS."""
+        self._ready = frozenset()
+        self._supervisor.stop()
+        self._goals.crashed()
+        self._crashed()
+        self._listener.close()
+        self._leave_ros()
+        self._topics.close()
+
+
+def _limits(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
+    """Return how many requests a service may have at once, where that is not to be learned."""
+    # A cancel service names no request, so it must be clear which one is meant.
+    limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
+    return {name: limit for name, limit in limits.items() if limit}
+
+
+def _for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool]:
+    """Return what says whether an answer holds for the moment only.
+
+    A replica that comes later is asked for a result as soon as it is given the goal: it may answer
+    that before it knows the goal.
+    """
+    results = {s.name for s in services if s.part is Part.RESULT}
+    return lambda service, answer: service in results and goals.is_unknown(answer)

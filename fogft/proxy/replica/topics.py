@@ -1,0 +1,222 @@
+"""Topics at a replica: publish what robots send, and hold what its nodes publish until it is asked.
+
+Messages travel as requests and answers, so links, credentials and windows are those of services.
+A robot's message is a request that is answered when it was published. What nodes here publish
+waits in a ring; a robot pulls what comes after the last number that it has, and its pull is held
+until there is something.
+
+Owns: this replica's publishers and subscriptions, its rings, and the pulls that are held.
+Not here: which message a robot passes on (`topics_robot`), bytes (`topics.frames`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable
+from queue import SimpleQueue
+
+from fogft.errors import RosError, Unreadable
+from fogft.link.frame import FrameError
+from fogft.link.port import Incoming, Refusal
+from fogft.model.topic import Origin, TopicSpec
+from fogft.ros.port import Quality, RosPublisher, RosSubscription, RosTopics
+from fogft.topics import frames
+from fogft.topics.queues import Ring, Seen
+
+log = logging.getLogger(__name__)
+
+HOLD_S = 2.0
+LOOK_EVERY_S = 2.0  # whether publishers are heard
+_HELD_LIMIT = 64  # pulls of one topic; beyond it the oldest is answered with nothing
+_BATCH_BYTES = 8 << 20
+
+
+def quality(topic: TopicSpec) -> Quality:
+    """Return a topic's quality of service, the same at both ends."""
+    return Quality(topic.depth, topic.reliable, topic.latched)
+
+
+class _Pull:
+    def __init__(self, incoming: Incoming, after: int, until: float) -> None:
+        self.incoming, self.after, self.until = incoming, after, until
+
+
+class _Outgoing:
+    """A topic that nodes here publish."""
+
+    def __init__(self, topic: TopicSpec, session: bytes, clock: Callable[[], float]) -> None:
+        self._ring = Ring(topic.depth, latched=topic.latched)
+        self._session = session
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._held: list[_Pull] = []
+
+    def heard(self, message: bytes) -> None:
+        """Take a message from ROS, and answer who waits for one."""
+        with self._lock:
+            self._ring.put(message)
+            held, self._held = self._held, []
+        for pull in held:
+            self._answer(pull.incoming, pull.after)
+
+    def pulled(self, incoming: Incoming) -> None:
+        """Answer a pull, or hold it."""
+        session, after = frames.decode_pull(incoming.payload)
+        excess = None
+        with self._lock:
+            if session != self._session:
+                after = self._ring.begin()
+                incoming.reply(frames.encode_batch(self._session, after, ()))
+                return
+            if self._ring.last <= after:
+                hold_s = min(HOLD_S, incoming.remaining_s / 2)
+                self._held.append(_Pull(incoming, after, self._clock() + hold_s))
+                excess = self._held.pop(0) if len(self._held) > _HELD_LIMIT else None
+                incoming = None  # type: ignore[assignment]
+        if incoming is not None:
+            self._answer(incoming, after)
+        if excess is not None:
+            self._answer(excess.incoming, excess.after)
+
+    def tick(self, now: float) -> None:
+        """Answer those with nothing that have waited long enough."""
+        with self._lock:
+            over = [pull for pull in self._held if pull.until <= now]
+            self._held = [pull for pull in self._held if pull.until > now]
+        for pull in over:
+            self._answer(pull.incoming, pull.after)
+
+    def _answer(self, incoming: Incoming, after: int) -> None:
+        with self._lock:
+            found = self._ring.after(after, _BATCH_BYTES)[: frames.BATCH_LIMIT]
+        last = found[-1][0] if found else after
+        incoming.reply(frames.encode_batch(self._session, last, found))
+
+
+class TopicsOnReplica:
+    """The topics of one replica.
+
+    Args:
+        topics: What passes.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self, topics: Iterable[TopicSpec], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._topics = {topic.key_name: topic for topic in topics}
+        self._clock = clock
+        session = os.urandom(frames.SESSION_BYTES)
+        self._outgoing = {
+            name: _Outgoing(topic, session, clock)
+            for name, topic in self._topics.items()
+            if topic.origin is Origin.REPLICAS
+        }
+        self._publishers: dict[str, RosPublisher] = {}
+        self._subscriptions: dict[str, RosSubscription] = {}
+        self._looked_at = clock()
+        self._seen = {name: Seen() for name in self._topics}
+        self._trouble: dict[str, str] = {}
+        # Publishing may block for a moment, and the wire's threads must not.
+        self._queue: SimpleQueue[Incoming | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self._topics)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._topics
+
+    @property
+    def topics(self) -> tuple[TopicSpec, ...]:
+        """What passes."""
+        return tuple(self._topics.values())
+
+    @property
+    def trouble(self) -> str:
+        """Why one of them cannot pass; empty when all can."""
+        return next(iter(self._trouble.values()), "")
+
+    def use(self, node: RosTopics | None) -> None:
+        """Publish and subscribe with this node from now on; the one before is gone."""
+        self._publishers, self._subscriptions = {}, {}
+        if node is None:
+            return
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._publish, name="fogft-topics", daemon=True)
+            self._thread.start()
+        for name, topic in self._topics.items():
+            try:
+                if topic.origin is Origin.ROBOT:
+                    self._publishers[name] = node.publisher(topic.name, topic.type, quality(topic))
+                else:
+                    heard = self._outgoing[name].heard
+                    self._subscriptions[name] = node.subscribe(
+                        topic.name, topic.type, quality(topic), heard
+                    )
+            except RosError as error:
+                self._note(name, error.message)
+            else:
+                self._note(name, "")
+
+    def _note(self, name: str, trouble: str) -> None:
+        if trouble and self._trouble.get(name) != trouble:
+            log.error("topic_not_usable topic=%s reason=%r", self._topics[name].name, trouble)
+        if trouble:
+            self._trouble[name] = trouble
+        else:
+            self._trouble.pop(name, None)
+
+    def ready(self) -> frozenset[str]:
+        """Return the names of those that pass now: somebody here listens, or may speak."""
+        heard = {name for name, one in self._publishers.items() if one.subscribers()}
+        return frozenset(self._subscriptions) | heard
+
+    def request(self, incoming: Incoming) -> None:
+        """Take a message or a pull from the wire. Never blocks."""
+        outgoing = self._outgoing.get(incoming.service)
+        if outgoing is None:
+            self._queue.put(incoming)
+            return
+        try:
+            outgoing.pulled(incoming)
+        except FrameError:
+            incoming.refuse(Refusal.MALFORMED)
+
+    def tick(self) -> None:
+        """Answer pulls that have waited long enough. Call at about 10 Hz."""
+        now = self._clock()
+        for outgoing in self._outgoing.values():
+            outgoing.tick(now)
+        if now - self._looked_at > LOOK_EVERY_S:
+            self._looked_at = now
+            for name, subscription in self._subscriptions.items():
+                self._note(name, subscription.mismatch())
+
+    def _publish(self) -> None:
+        while (incoming := self._queue.get()) is not None:
+            try:
+                self._publish_one(incoming)
+            except (FrameError, Unreadable) as error:
+                log.warning("message_refused topic=%s reason=%r", incoming.service, str(error))
+                incoming.refuse(Refusal.MALFORMED)
+            except Exception:
+                log.exception("message_not_published topic=%s", incoming.service)
+                incoming.refuse(Refusal.NOT_READY)
+
+    def _publish_one(self, incoming: Incoming) -> None:
+        session, number, message = frames.decode_message(incoming.payload)
+        publisher = self._publishers.get(incoming.service)
+        if publisher is None:
+            incoming.refuse(Refusal.NOT_READY)
+            return
+        if self._seen[incoming.service].is_new(session, number):
+            publisher.publish(message)
+        incoming.reply(b"")
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._queue.put(None)

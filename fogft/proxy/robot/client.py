@@ -1,0 +1,461 @@
+"""The client proxy: the robot's side of every proxied service.
+
+It follows the membership (one link a member), advertises each service as if it were local
+once a replica can answer it, and hands requests to that service's `Dispatcher`.
+
+Owns: which links exist, and which of them each service uses now.
+Not here: files and signals (`client_process`), requests (`dispatcher`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+from fogft.errors import RosError
+from fogft.link.port import Answer, Behind, Dialer, Link, Peer
+from fogft.link.uplinks import UplinksLink
+from fogft.model import names
+from fogft.model.replica import LinkState, Member, Membership, ReplicaId
+from fogft.model.spec import HedgingMode, Part, ServiceSpec
+from fogft.model.topic import TopicSpec
+from fogft.model.type_definition import Definition
+from fogft.proxy.robot.dispatcher import Dispatcher, key_of
+from fogft.proxy.robot.ordered_dispatcher import OrderedDispatcher
+from fogft.proxy.robot.proxied_service import ProxiedService
+from fogft.proxy.robot.through_gateways import best_of, seen_through
+from fogft.proxy.robot.topics import Merge, TopicsOnRobot
+from fogft.proxy.robot.type_check import Define, Sameness
+from fogft.proxy.robot.voting import VotingDispatcher
+from fogft.records.record import SignedRecord
+from fogft.requests.hedging import NEVER
+from fogft.ros.port import RosNode, RosTopics
+
+log = logging.getLogger(__name__)
+
+_TICK_S = 0.02
+
+
+class MakeDispatcher(Protocol):
+    """Makes the dispatcher of a service."""
+
+    def __call__(
+        self,
+        spec: ServiceSpec,
+        respond: Callable[[Any, bytes], None],
+        wake: Callable[[], None],
+    ) -> Dispatcher | OrderedDispatcher:
+        """Make it, given how to respond and how to have `tick` called soon."""
+
+
+class ClientProxy:
+    """Sends each request to all replicas and returns the first success.
+
+    Args:
+        pool_uid: The pool's uid, part of every key.
+        node: The robot's side of ROS.
+        dialer: Makes links.
+        make_dispatcher: Makes the dispatcher of a service, given how to respond.
+        define: Returns the definition of a service type here; None to compare none.
+        merge: Makes one status of an action of what its replicas say.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        pool_uid: str,
+        node: RosNode,
+        dialer: Dialer,
+        make_dispatcher: MakeDispatcher,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        define: Define | None = None,
+        merge: Merge = lambda said: None,
+    ) -> None:
+        self._sameness = Sameness(define)
+        self._pool_uid = pool_uid
+        self._node = node
+        self._dialer = dialer
+        self._make_dispatcher = make_dispatcher
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._services: dict[str, ProxiedService] = {}
+        self._links: dict[ReplicaId, Link] = {}
+        self._members: dict[ReplicaId, Member] = {}
+        self._version = (0, 0)
+        self._membership: Membership | None = None
+        self._through_gateways = False
+        self._wake = threading.Event()
+        self._topics = TopicsOnRobot(self._wake.set, merge, clock)
+        self._next_look = NEVER
+        self._changed = False  # set before the event, so that it is not missed
+
+    # -- configuration --------------------------------------------------------------------
+
+    def serve(self, specs: Iterable[ServiceSpec]) -> None:
+        """Proxy these services and no others. Unchanged ones go on undisturbed.
+
+        A service whose policy changed keeps its ROS server and the requests under way, with
+        their deadlines.
+        """
+        with self._lock:
+            wanted = {spec.name: spec for spec in specs}
+            for name in [n for n in self._services if n not in wanted]:
+                self._services.pop(name).close()
+            keys_changed = False
+            for spec in wanted.values():
+                old = self._services.get(spec.name)
+                if old is not None and _same_kind(old.spec, spec):
+                    old.spec = spec
+                    self._adopt(old)
+                    continue
+                if old is not None:
+                    old.close()
+                self._services[spec.name] = self._new_service(spec)
+                keys_changed = True
+            if keys_changed:
+                for id in list(self._links):
+                    self._redial(id)
+        self._change()
+
+    def pass_topics(self, topics: Iterable[TopicSpec], node: RosTopics) -> None:
+        """Pass these topics and no others; `node` publishes and subscribes on the robot's side."""
+        with self._lock:
+            if self._topics.serve(topics, node):
+                for id in list(self._links):
+                    self._redial(id)
+        self._change()
+
+    def _new_service(self, spec: ServiceSpec) -> ProxiedService:
+        service: ProxiedService
+
+        def respond(handle: Any, payload: bytes) -> None:
+            if service.server is not None:
+                service.server.respond(handle, payload)
+
+        make = self._make_dispatcher
+        service = ProxiedService(spec, make(self._here(spec), respond, self._wake.set))
+        if spec.fallback is not None:
+            self._adopt(service)
+        return service
+
+    def _adopt(self, service: ProxiedService) -> None:
+        """Have the dispatcher follow its service's spec, with a client of the fallback."""
+        spec, dispatcher = self._here(service.spec), service.dispatcher
+        if isinstance(dispatcher, OrderedDispatcher):
+            dispatcher.adopt(spec)
+            return
+        name = spec.fallback.service if spec.fallback is not None else ""
+        if name != service.fallback_name:
+            old, service.fallback, service.fallback_name = service.fallback, None, name
+            if name:
+                try:
+                    service.fallback = self._node.client(name, spec.type)
+                except RosError as error:
+                    log.error("fallback_not_usable service=%s reason=%r", spec.name, error.message)
+            if old is not None:
+                old.close()
+        dispatcher.adopt(spec, service.fallback)
+
+    def _here(self, spec: ServiceSpec) -> ServiceSpec:
+        """Return a service's policy as it is here: a request goes to one gateway, not to all.
+
+        The gateway sends it to all replicas. Another gateway is asked where the first is late.
+        """
+        if self._through_gateways and spec.hedging is HedgingMode.ALL:
+            return replace(spec, hedging=HedgingMode.ADAPTIVE)
+        return spec
+
+    # -- membership -----------------------------------------------------------------------
+
+    def follow(self, membership: Membership) -> bool:
+        """Hold one link to each member. An older membership, or another pool's, is refused."""
+        version = (membership.epoch, membership.version)
+        with self._lock:
+            if membership.pool_uid != self._pool_uid or version < self._version:
+                log.warning("membership_refused version=%s have=%s", version, self._version)
+                return False
+            self._version = version
+            self._membership = membership
+            members = {} if self._shut_out(membership) else _good_members(membership)
+            through = any(member.gateway for member in members.values())
+            if through != self._through_gateways:
+                self._through_gateways = through
+                for service in self._services.values():
+                    self._adopt(service)
+            for id in [id for id in self._links if id not in members]:
+                self._drop(id)
+            for id, member in members.items():
+                old = self._members.get(id)
+                self._members[id] = member
+                if old is None or old.endpoint != member.endpoint:
+                    self._redial(id)
+        self._change()
+        return True
+
+    def tell(self, records: Sequence[SignedRecord]) -> None:
+        """Pass signed records on to every replica: revocations, where no rendezvous does."""
+        self._dialer.tell(records)
+
+    def renew(self) -> None:
+        """Take new credentials into use, link by link; no request is lost by it."""
+        self._dialer.renew()
+        if self._membership is not None:
+            self.follow(self._membership)  # who was shut out under the old ones may be in again
+        log.info("credentials_renewed")
+
+    def _shut_out(self, membership: Membership) -> bool:
+        """Whether our own certificate was taken back: then nobody is to be talked to."""
+        own = self._dialer.certificate()
+        if own not in membership.revoked:
+            return False
+        log.error("robot_revoked certificate=%s", own)
+        return True
+
+    def types_changed(self) -> None:
+        """Have routes worked out anew: a type may be known here that was not. Any thread."""
+        self._change()
+
+    def redial(self) -> None:
+        """Dial everybody anew, by other uplinks; what is in flight is sent again."""
+        with self._lock:
+            for id in list(self._links):
+                self._redial(id)
+        self._change()
+
+    def _redial(self, id: ReplicaId) -> None:
+        member = self._members[id]
+        old = self._links.get(id)
+        peer = Peer(id, member.endpoint, names.member_certificate_name(member))
+        keys = {
+            s.spec.name: names.service_key(self._pool_uid, id.slot, s.spec.name, s.spec.type)
+            for s in self._services.values()
+        } | self._topics.keys(self._pool_uid, id.slot)
+        self._links[id] = self._dialer.dial(peer, keys, self)
+        who = f"gateway={member.gateway}" if member.gateway else f"replica={id.short}"
+        log.info("link_dialled %s endpoint=%s", who, member.endpoint)
+        if old is not None:
+            old.close()
+
+    def _drop(self, id: ReplicaId) -> None:
+        self._members.pop(id, None)
+        link = self._links.pop(id)
+        self._sameness.forget(id)
+        self._route()  # first out of every route, then closed: what was open there is LOST
+        link.close()
+        log.info("link_dropped replica=%s", id.short)
+
+    # -- events of links (their threads) --------------------------------------------------
+
+    def answered(self, link: Link, answer: Answer) -> None:
+        """Pass the end of an attempt to its service: the one that knows the request."""
+        if answer.service in self._topics:
+            self._topics.answered(key_of(link), answer)
+            return
+        service = self._services.get(answer.service)
+        if service is not None:
+            service.dispatcher.answered(link, answer)
+
+    def changed(self, link: Link) -> None:
+        """Wake `run_once`: routes are worked out there, not on a link's thread."""
+        self._change()
+
+    def late(self, link: Link, service: str, request_id: bytes) -> None:
+        """Pass on that an answer came which nobody awaits."""
+        found = self._services.get(service)
+        if found is not None:
+            found.dispatcher.late(link, request_id)
+
+    def _change(self) -> None:
+        self._changed = True
+        self._wake.set()
+
+    # -- the proxy's own thread -----------------------------------------------------------
+
+    def run_once(self, timeout_s: float = _TICK_S) -> bool:
+        """Wait for a change or a moment, then route, advertise and tick.
+
+        The moment is at most `timeout_s`, and less where a dispatcher wants its tick earlier.
+
+        Returns:
+            Whether something had changed.
+
+        Raises:
+            RosError: The node's thread has ended: nothing would be taken any more.
+        """
+        if not self._node.alive:
+            raise RosError("ROS does not go on; the log says why", "start the proxy again")
+        self._wake.wait(max(0.0, min(timeout_s, self._next_look - self._clock())))
+        self._wake.clear()
+        changed, self._changed = self._changed, False
+        with self._lock:
+            if changed:
+                self._route()
+            for link in self._links.values():
+                link.flush()
+            self._topics.tick()
+            looks = [service.dispatcher.tick() for service in self._services.values()]
+            now = self._clock()
+            for service in self._services.values():
+                service.advertise(self._node, now)
+        self._next_look = min(looks, default=NEVER)
+        return changed
+
+    def _differences(self, link: Link) -> Mapping[str, str]:
+        return self._sameness.differences(link, [s.spec for s in self._services.values()])
+
+    def _route(self) -> None:
+        self._topics.route({key_of(link): link for link in self._links.values()})
+        differ = {id: self._differences(link) for id, link in self._links.items()}
+        for service in self._services.values():
+            name = service.spec.name
+            if isinstance(service.dispatcher, OrderedDispatcher):
+                # It brings replicas to readiness itself, and needs those that are not.
+                usable = [
+                    x for x in self._links.values() if x.usable and name not in differ[x.peer.id]
+                ]
+                service.dispatcher.route(usable, self._versions(), self._leaving(usable))
+                continue
+            able = [
+                link
+                for id, link in self._links.items()
+                if name in link.ready and name not in differ[id]
+            ]
+            fresh = [link for link in able if not self._draining(link)]
+            service.able = bool(able)
+            # Who is asked to work is not asked of one that leaves; who is told to stop is.
+            told = service.spec.part is Part.CANCEL
+            service.dispatcher.route(able if told else fresh or able)
+
+    def _versions(self) -> dict[ReplicaId, str]:
+        return {id: member.version for id, member in self._members.items()}
+
+    def _leaving(self, links: Iterable[Link]) -> frozenset[ReplicaId]:
+        return frozenset(link.peer.id for link in links if self._draining(link))
+
+    def _draining(self, link: Link) -> bool:
+        member = self._members.get(link.peer.id)
+        return link.draining or (member is not None and member.draining)
+
+    # -- what people see ------------------------------------------------------------------
+
+    @property
+    def uplink_suspected(self) -> bool:
+        """Whether all links that ever answered (two at least) have fallen silent together."""
+        states = [link.status() for link in self._links.values()]
+        heard = [status for status in states if status.heard_age_s is not None]
+        return len(heard) > 1 and all(status.state is not LinkState.UP for status in heard)
+
+    def report(self) -> dict[str, Any]:
+        """Return links and services as `proxy-status.json` has them."""
+        with self._lock:
+            links, gateways = self._link_reports()
+            services: Mapping[str, Any] = {
+                name: service.dispatcher.report() for name, service in self._services.items()
+            }
+        return {
+            "links": links,
+            "gateways": gateways,
+            "services": services,
+            "topics": self._topics.report(),
+            "uplink_suspected": self.uplink_suspected,
+            "certificate": self._dialer.certificate(),
+        }
+
+    def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """Return the links to replicas, those behind gateways included, and those to gateways."""
+        replicas, gateways, behind = [], [], []
+        for id, link in sorted(self._links.items()):
+            member = self._members.get(id)
+            report = self._link_report(link)
+            if member is None or not member.gateway:
+                replicas.append(report)
+                continue
+            gateways.append({"name": member.gateway, "endpoint": member.endpoint, **report})
+            behind += seen_through(link.status(), member.gateway)
+        return [*replicas, *best_of(behind)], gateways
+
+    def behind(self) -> tuple[Behind, ...]:
+        """Return what is seen of each replica, as a gateway tells its robots."""
+        with self._lock:
+            links, _ = self._link_reports()
+        return tuple(Behind.of(report) for report in links)
+
+    def types_behind(self) -> dict[str, Definition]:
+        """Return the definitions of types as replicas told them, as a gateway passes them on."""
+        answers = [link.status().probe_answer for link in list(self._links.values())]
+        return {name: told for a in answers if a is not None for name, told in a.types.items()}
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Services that at least one link calls ready."""
+        return frozenset(name for link in list(self._links.values()) for name in link.ready)
+
+    def _link_report(self, link: Link) -> dict[str, Any]:
+        status = link.status()
+        answer = status.probe_answer
+        differ = self._differences(link)
+        ours = next(iter(differ.values()), "") if link.usable else ""
+        id = link.peer.id
+        ended = [s.dispatcher.by(id) for s in self._services.values()]
+        return {
+            "slot": id.slot,
+            "generation": id.generation,
+            "state": status.state.value,
+            "ready": sorted(link.ready - differ.keys()),
+            "differs": bool(ours),
+            "offered": dict(answer.offered) if answer and link.usable else {},
+            "draining": self._draining(link),
+            "at_risk": bool(answer and answer.at_risk),
+            "disagrees": any(
+                isinstance(s.dispatcher, VotingDispatcher) and s.dispatcher.disagrees(key_of(link))
+                for s in self._services.values()
+            ),
+            "heard_age_s": status.heard_age_s,
+            "silent_for_s": status.silent_for_s,
+            "rtt_s": status.rtt_s,
+            "in_flight": status.in_flight,
+            "reopened": status.reopened,
+            "won": sum(s.dispatcher.won(id) for s in self._services.values()),
+            "restarts": answer.restarts if answer else 0,
+            "answered": sum(well for well, _ in ended),
+            "failed": sum(ill for _, ill in ended),
+            "work": dict(answer.work) if answer else {},
+            **({"uplinks": link.uplinks()} if isinstance(link, UplinksLink) else {}),
+            "detail": status.detail or ours or (answer.detail if answer else ""),
+        }
+
+    def trace(self) -> list[dict[str, Any]]:
+        """Return how requests ended since the last call, of the services that are traced."""
+        with self._lock:
+            return [
+                {"service": name, **line}
+                for name, service in self._services.items()
+                if isinstance(service.dispatcher, Dispatcher)
+                for line in service.dispatcher.trace()
+            ]
+
+    def close(self) -> None:
+        """Close every link. The ROS node is its owner's to close."""
+        with self._lock:
+            for id in list(self._links):
+                self._drop(id)
+            self._topics.close()
+
+
+def _good_members(membership: Membership) -> dict[ReplicaId, Member]:
+    return {
+        member.id: member
+        for member in membership.members
+        if names.member_certificate_name(member) not in membership.revoked
+    }
+
+
+def _same_kind(one: ServiceSpec, other: ServiceSpec) -> bool:
+    """Whether one dispatcher can follow both policies, so that nothing under way is lost."""
+    kinds = [(s.type, s.state, s.quorum, s.tolerance) for s in (one, other)]
+    return kinds[0] == kinds[1]

@@ -1,0 +1,167 @@
+"""What ``/diagnostics`` says of a pool, of each service, topic and replica. Pure.
+
+Made of the client proxy's report. Requests that got no answer are worth a warning for a while,
+so the counters of the last half minute are remembered.
+
+Owns: levels, sentences, and the values below them. Not here: publishing (`fogft.ros.visible`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from fogft.model.topic import PREFIX
+from fogft.ros.port import Level, Status
+
+WINDOW_S = 30.0
+# Ends of requests that somebody should hear of, and how they are called.
+_TROUBLES = {
+    "silent": "got no answer",
+    "empty": "got an empty answer",
+    "turned_away": "were turned away",
+    "fallback": "were answered by the fallback",
+}
+_COUNTS = (
+    *("received", "sent", "answered", "fallback", "empty", "silent", "turned_away"),
+    *("late", "rejected", "fallback_failed", "undelivered", "pending"),
+)
+
+
+class Diagnosis:
+    """Turns reports into statuses.
+
+    Args:
+        pool: The pool's name.
+        robot: The robot's; it is the hardware that the pool's and the services' statuses name.
+    """
+
+    def __init__(self, pool: str, robot: str) -> None:
+        self._pool = pool
+        self._robot = robot
+        self._before: deque[tuple[float, dict[str, dict[str, int]]]] = deque()
+
+    def of(self, report: Mapping[str, Any], now: float) -> list[Status]:
+        """Return the statuses of a report.
+
+        Args:
+            report: Of the client proxy.
+            now: Monotonic seconds.
+        """
+        services: Mapping[str, Mapping[str, Any]] = report["services"]
+        links = report["links"]
+        lately = self._lately(services, now)
+        of_services = [self._service(n, s, links, lately[n]) for n, s in services.items()]
+        of_replicas = [self._replica(link, len(services)) for link in links]
+        of_topics = [self._topic(n, t, links) for n, t in report.get("topics", {}).items()]
+        return [self._overall(report, of_services), *of_services, *of_topics, *of_replicas]
+
+    def _lately(
+        self, services: Mapping[str, Mapping[str, Any]], now: float
+    ) -> dict[str, dict[str, int]]:
+        """Return how often each trouble befell each service in the last `WINDOW_S`."""
+        counts = {n: {k: int(s.get(k, 0)) for k in _TROUBLES} for n, s in services.items()}
+        self._before.append((now, counts))
+        while len(self._before) > 1 and self._before[1][0] <= now - WINDOW_S:
+            self._before.popleft()
+        then = self._before[0][1]
+        return {
+            name: {k: max(0, n - then.get(name, {}).get(k, 0)) for k, n in found.items()}
+            for name, found in counts.items()
+        }
+
+    def _overall(self, report: Mapping[str, Any], services: list[Status]) -> Status:
+        links = report["links"]
+        up = sum(link["state"] == "up" for link in links)
+        worst = max((status.level for status in services), default=Level.WARN)
+        if report["uplink_suspected"]:
+            message = "all replicas fell silent together: the robot's uplink is suspected"
+            worst = Level.ERROR
+        elif not links:
+            message, worst = "there is no replica", Level.ERROR
+        else:
+            message = f"{up} of {len(links)} replicas are reached"
+            worst = max(worst, Level.OK if up == len(links) else Level.WARN)
+        values = {
+            "replicas": len(links),
+            "replicas reached": up,
+            "services": len(services),
+            "uplink suspected": report["uplink_suspected"],
+        }
+        return self._status(worst, "pool", message, values, self._robot)
+
+    def _service(
+        self,
+        name: str,
+        report: Mapping[str, Any],
+        links: list[Mapping[str, Any]],
+        lately: Mapping[str, int],
+    ) -> Status:
+        ready = sum(name in link["ready"] for link in links)
+        troubles = [f"{n} {_TROUBLES[key]}" for key, n in lately.items() if n]
+        if not ready:
+            level, message = Level.ERROR, "no replica can answer"
+        elif troubles:
+            level, message = Level.WARN, f"in the last {WINDOW_S:.0f} s {', '.join(troubles)}"
+        else:
+            level = Level.OK if ready == len(links) else Level.WARN
+            message = f"{ready} of {len(links)} replicas can answer"
+        values: dict[str, Any] = {"ready replicas": ready}
+        values |= {key: report[key] for key in _COUNTS if key in report}
+        values |= {key[:-1] + "ms": _ms(report.get(key)) for key in ("p50_s", "p99_s")}
+        values |= {f"won by {replica}": n for replica, n in report.get("won", {}).items()}
+        values |= {f"refused: {reason}": n for reason, n in report.get("refused", {}).items()}
+        return self._status(level, f"service {name}", message, values, self._robot)
+
+    def _topic(
+        self, name: str, report: Mapping[str, Any], links: list[Mapping[str, Any]]
+    ) -> Status:
+        passing = sum(PREFIX + name in link["ready"] for link in links)
+        message = str(report.get("trouble") or f"{passing} of {len(links)} replicas pass it")
+        level = Level.ERROR if "trouble" in report or not passing else Level.OK
+        if level is Level.OK and passing < len(links):
+            level = Level.WARN
+        values = {key: value for key, value in report.items() if key != "trouble"}
+        return self._status(level, f"topic {name}", message, values, self._robot)
+
+    def _replica(self, link: Mapping[str, Any], services: int) -> Status:
+        state, ready = link["state"], len(link["ready"])
+        detail = link.get("detail") or ""
+        if state == "suspect":
+            level, message = Level.ERROR, detail or "it does not answer"
+        elif state != "up" or ready < services:
+            level, message = Level.WARN, detail or "not all services can answer"
+        elif link.get("draining"):
+            level, message = Level.WARN, "its machine will be taken"
+        elif link.get("disagrees"):
+            level, message = Level.WARN, "its answers differ from the others'"
+        else:
+            level, message = Level.OK, "it answers"
+        values = {
+            "link": state,
+            "ready services": ready,
+            "rtt_ms": _ms(link.get("rtt_s")),
+            "silent_for_s": link.get("silent_for_s"),
+            **{key: link.get(key) for key in ("in_flight", "won", "restarts", "reopened")},
+            "draining": link.get("draining"),
+            "at risk": link.get("at_risk"),
+        }
+        who = f"{link['slot']}.{link['generation']}"
+        return self._status(level, f"replica {who}", message, values, who)
+
+    def _status(
+        self, level: Level, what: str, message: str, values: Mapping[str, Any], hardware: str
+    ) -> Status:
+        told = {key: _told(value) for key, value in values.items() if value is not None}
+        return Status(level, f"fogft {self._pool}: {what}", message, hardware, told)
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else round(seconds * 1000, 3)
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,187 @@
+"""Whom a client proxy shall talk to: from the manager's file, from records, or from both.
+
+The manager of this machine writes a file; further robots learn the same from records. The
+later one counts. Where replicas are is corrected by what they say of themselves, and those
+that dial in are reached through the door.
+
+Owns: the record client and the door of a client proxy.
+Not here: links (`client`), files and signals (`client_process`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from fogft import disk
+from fogft.link.dial_out.robot import DialIn
+from fogft.model import membership as memberships
+from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.replica import Member, Membership
+from fogft.proxy.config import ClientProxyConfig
+from fogft.proxy.process import Watched
+from fogft.records import roster
+from fogft.records.client import Known, RendezvousClient
+from fogft.records.record import RecordKind
+from fogft.records.signing import Signer, Verifier, common_name
+
+log = logging.getLogger(__name__)
+
+
+class Following:
+    """The membership of one pool as a client proxy sees it.
+
+    Args:
+        config: The client proxy's.
+
+    Raises:
+        WireError: The door's port cannot be had.
+        CredentialError: The credentials cannot be used.
+    """
+
+    def __init__(self, config: ClientProxyConfig) -> None:
+        self._config = config
+        self._file = Watched(config.membership)
+        self._from_file: Membership | None = None
+        self._changed = threading.Event()
+        self._client: RendezvousClient | None = None
+        self.door: DialIn | None = None
+        self._open_door()
+        self._call()
+
+    def apply(self, config: ClientProxyConfig) -> None:
+        """Take a changed configuration into use; what did not change goes on undisturbed.
+
+        Raises:
+            WireError: The new door's port cannot be had; there is none then.
+        """
+        old, self._config = self._config, config
+        if (old.dial_in, old.dial_in_listen) != (config.dial_in, config.dial_in_listen):
+            if self.door is not None:
+                self.door.close()
+                self.door = None
+            self._open_door()
+        if (old.rendezvous, old.dial_in) != (config.rendezvous, config.dial_in):
+            if self._client is not None:
+                self._client.close()
+                self._client = None
+            self._call()
+
+    def _open_door(self) -> None:
+        config = self._config
+        if config.dial_in:
+            self.door = DialIn(
+                config.dial_in_listen or "0.0.0.0:" + config.dial_in.rpartition(":")[2],
+                config.pool_uid,
+                Verifier(config.credentials.ca),
+                revoked=self._revoked,
+            )
+        self._changed.set()
+
+    def _call(self) -> None:
+        config = self._config
+        if config.rendezvous:
+            self._client = RendezvousClient(
+                config.rendezvous,
+                config.credentials,
+                config.pool_uid,
+                cache=config.records,
+                changed=self._changed.set,
+            )
+            self._client.start()
+            self._announce(self._client)
+        self._changed.set()
+
+    def _announce(self, client: RendezvousClient) -> None:
+        holder = self._holder()
+        kind = RecordKind.GATEWAY if holder.role is Role.GATEWAY else RecordKind.ROBOT
+        content = {"dial_in": self._config.dial_in}
+        client.publish(kind, holder.name, holder.generation, content)
+
+    def renew(self) -> None:
+        """Speak under the certificate that now stands in its file."""
+        if self._client is not None:
+            self._announce(self._client)
+
+    def look(self) -> Membership | None:
+        """Return the membership to follow if it may have changed, else None.
+
+        Raises:
+            StateError: The file is damaged.
+        """
+        changed = self._changed.is_set()
+        self._changed.clear()
+        if self._file.changed():
+            changed = True
+            self._read()
+        if not changed:
+            return None
+        known = self._known()
+        latest = _latest(self._from_file, known)
+        if latest is None:
+            return None
+        slots = known.of(RecordKind.SLOT)
+        located = roster.located(latest, slots) if slots else latest
+        gateways = roster.gateways_of(latest, self._holder())
+        members = self._reached(located) if gateways is None else gateways
+        return replace(located, members=members, revoked=located.revoked | known.revoked)
+
+    def _holder(self) -> Holder:
+        ours = self._config.credentials
+        return holder_of(common_name(Signer(ours.certificate, ours.key).certificate))
+
+    def _read(self) -> None:
+        raw = disk.read_json(self._config.membership)
+        if raw is not None:
+            read = memberships.from_dict(raw)
+            if read.pool_uid == self._config.pool_uid and memberships.is_newer(
+                read, self._from_file
+            ):
+                self._from_file = read
+
+    def _reached(self, membership: Membership) -> tuple[Member, ...]:
+        """Return the members that can be reached, with the door in place of no endpoint."""
+        door = self.door
+        dialling = [m for m in membership.members if not m.endpoint]
+        if door is None:
+            return tuple(m for m in membership.members if m.endpoint)
+        door.keep([m.id for m in dialling])
+        return tuple(
+            m if m.endpoint else replace(m, endpoint=door.local(m.id)) for m in membership.members
+        )
+
+    def _known(self) -> Known:
+        return self._client.known if self._client is not None else Known()
+
+    def _revoked(self) -> frozenset[str]:
+        named = self._from_file.revoked if self._from_file is not None else frozenset()
+        return named | self._known().revoked
+
+    def report(self) -> Mapping[str, Any]:
+        """Return what people should know: each rendezvous, and the door."""
+        found: dict[str, Any] = {}
+        if self._client is not None:
+            found["records"] = self._client.status()
+        if self.door is not None:
+            waiting = {id.short: count for id, count in self.door.waiting().items()}
+            found["door"] = {"waiting": waiting, **self.door.counters()}
+        return found
+
+    def close(self) -> None:
+        """Leave each rendezvous and shut the door."""
+        if self._client is not None:
+            self._client.close()
+        if self.door is not None:
+            self.door.close()
+
+
+def _latest(from_file: Membership | None, known: Known) -> Membership | None:
+    latest = from_file
+    for record in known.of(RecordKind.ADMISSION):
+        admitted = roster.admission(record)
+        if memberships.is_newer(admitted, latest):
+            latest = admitted
+    return latest

@@ -1,0 +1,302 @@
+"""Topics on the robot: what it publishes goes to every replica, what they publish comes here.
+
+Owns: subscriptions and publishers of the robot's side, what each replica still has to get, and
+the pulls that are out. Not here: links (`client`), which message passes (`topics.select`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Protocol
+
+from fogft.errors import RosError
+from fogft.link.frame import FrameError
+from fogft.link.port import Answer, Link, Refusal
+from fogft.model import names
+from fogft.model.names import REQUEST_ID_BYTES
+from fogft.model.topic import Origin, Select, TopicSpec
+from fogft.proxy.replica.topics import LOOK_EVERY_S, quality
+from fogft.ros.port import RosPublisher, RosSubscription, RosTopics
+from fogft.topics import frames
+from fogft.topics.queues import Numbered, Outbox
+from fogft.topics.select import Selection
+
+log = logging.getLogger(__name__)
+
+_MESSAGE_S = 10.0  # a message that is not confirmed in this time goes again
+_PULL_S = 10.0
+_AGAIN_S = 0.2  # after a refusal
+
+
+class Merge(Protocol):
+    """Makes one message of what several replicas say."""
+
+    def __call__(self, said: Mapping[int, bytes]) -> bytes | None:
+        """Return it, or None where there is nothing to say (replica -> its last message)."""
+
+
+class _Way:
+    """A topic and one replica."""
+
+    def __init__(self, topic: TopicSpec) -> None:
+        self.outbox = Outbox(topic.depth)
+        self.session, self.after = frames.NO_SESSION, 0
+        self.rest_until = 0.0
+        self.out: dict[bytes, int] = {}  # request id -> a message's number; 0 for a pull
+
+
+class RobotTopic:
+    """One topic of the robot's."""
+
+    def __init__(
+        self, topic: TopicSpec, clock: Callable[[], float], wake: Callable[[], None], merge: Merge
+    ) -> None:
+        self.topic = topic
+        self._clock = clock
+        self._wake = wake
+        self._merge = merge
+        self._lock = threading.RLock()
+        self._session = os.urandom(frames.SESSION_BYTES)
+        self._number = 0
+        self._kept: deque[Numbered] = deque(maxlen=topic.depth if topic.latched else 0)
+        self._ways: dict[int, _Way] = {}
+        self._links: dict[int, Link] = {}
+        self._selection = Selection(topic.select)
+        self._said: dict[int, bytes] = {}
+        self._told: bytes | None = None
+        self._publisher: RosPublisher | None = None
+        self._subscription: RosSubscription | None = None
+        self._looked_at = clock()
+        self.trouble = ""
+        self.count = dict.fromkeys(("messages", "passed", "dropped", "refused"), 0)
+
+    def open(self, node: RosTopics) -> None:
+        """Publish or subscribe here. Raises RosError."""
+        topic = self.topic
+        if topic.origin is Origin.ROBOT:
+            self._subscription = node.subscribe(topic.name, topic.type, quality(topic), self.heard)
+        else:
+            self._publisher = node.publisher(topic.name, topic.type, quality(topic))
+
+    def close(self) -> None:
+        """Leave ROS."""
+        for end in (self._publisher, self._subscription):
+            if end is not None:
+                end.close()
+
+    # -- the robot's own messages ---------------------------------------------------------
+
+    def heard(self, message: bytes) -> None:
+        """Take a message from ROS, for every replica."""
+        with self._lock:
+            self._number += 1
+            self.count["messages"] += 1
+            self._kept.append((self._number, message))
+            for way in self._ways.values():
+                self.count["dropped"] += way.outbox.put(self._number, message)
+            self._send()
+
+    def route(self, links: Mapping[int, Link], members: Iterable[int]) -> None:
+        """Set the links over which it passes now, and which replicas there are."""
+        with self._lock:
+            known = set(members)
+            for key in self._ways.keys() - known:
+                del self._ways[key]
+                self._said.pop(key, None)
+            for key in known - self._ways.keys():
+                way = self._ways[key] = _Way(self.topic)
+                for number, message in self._kept:
+                    way.outbox.put(number, message)
+            for key in self._links.keys() - links.keys():
+                self._selection.left(key)
+                self._said.pop(key, None)
+            self._links = dict(links)
+
+    def tick(self) -> None:
+        """Send what is due: messages, and pulls. Not from a link's thread."""
+        with self._lock:
+            self._send()
+        now = self._clock()
+        if self._subscription is not None and now - self._looked_at > LOOK_EVERY_S:
+            self._looked_at = now
+            before, self.trouble = self.trouble, self._subscription.mismatch()
+            if self.trouble not in ("", before):
+                log.error("topic_not_heard topic=%s reason=%r", self.topic.name, self.trouble)
+
+    def _send(self) -> None:
+        now = self._clock()
+        for key, link in self._links.items():
+            way = self._ways.get(key)
+            if way is None or now < way.rest_until:
+                continue
+            if self.topic.origin is Origin.ROBOT:
+                self._send_messages(way, link)
+            elif not way.out:
+                pull = frames.encode_pull(way.session, way.after)
+                self._offer(way, link, 0, pull, _PULL_S)
+
+    def _send_messages(self, way: _Way, link: Link) -> None:
+        while (one := way.outbox.next()) is not None:
+            frame = frames.encode_message(self._session, *one)
+            if not self._offer(way, link, one[0], frame, _MESSAGE_S):
+                way.outbox.returned([one[0]])
+                return
+
+    def _offer(self, way: _Way, link: Link, number: int, frame: bytes, limit_s: float) -> bool:
+        id = os.urandom(REQUEST_ID_BYTES)
+        way.out[id] = number  # first: the answer may come before `offer` returns
+        if link.offer(self.topic.key_name, id, frame, limit_s):
+            return True
+        way.out.pop(id, None)
+        return False
+
+    # -- answers (the links' threads) -----------------------------------------------------
+
+    def answered(self, key: int, answer: Answer) -> None:
+        """Take the end of an attempt: a message was confirmed, or a pull answered, or neither."""
+        with self._lock:
+            way = self._ways.get(key)
+            number = None if way is None else way.out.pop(answer.request_id, None)
+            if way is None or number is None:
+                return
+            if answer.payload is None:
+                self._refused(way, number, answer.refusal)
+            elif number:
+                way.outbox.confirmed(number)
+            else:
+                self._take(key, way, answer.payload)
+            due = not number or way.outbox.waiting
+        if due:
+            self._wake()
+
+    def _refused(self, way: _Way, number: int, reason: str) -> None:
+        self.count["refused"] += 1
+        if reason != Refusal.LOST:
+            way.rest_until = self._clock() + _AGAIN_S
+        if reason == Refusal.MALFORMED or not self.topic.reliable:
+            way.outbox.confirmed(number)  # sending it again cannot help, or is not asked for
+        elif number:
+            way.outbox.returned([number])
+
+    def _take(self, key: int, way: _Way, frame: bytes) -> None:
+        try:
+            session, after, messages = frames.decode_batch(frame)
+        except FrameError as error:
+            log.warning("batch_malformed topic=%s reason=%r", self.topic.name, str(error))
+            way.rest_until = self._clock() + _AGAIN_S
+            return
+        first = way.after if session == way.session else after
+        way.session, way.after = session, after
+        now = self._clock()
+        for number, message in messages:
+            if number > first:
+                self.count["messages"] += 1
+                self._pass(key, message, now)
+
+    def _pass(self, key: int, message: bytes, now: float) -> None:
+        if self.topic.select is Select.STATUS:
+            self._said[key] = message
+            merged = self._merge(self._said)
+            if merged is None or merged == self._told:
+                return
+            self._told = message = merged
+        elif not self._selection.passes(key, message, now):
+            self.count["dropped"] += 1
+            return
+        if self._publisher is None:
+            return
+        try:
+            self._publisher.publish(message)
+            self.count["passed"] += 1
+        except RosError as error:
+            self.count["refused"] += 1
+            log.warning("message_not_published topic=%s reason=%r", self.topic.name, error.message)
+
+
+class TopicsOnRobot:
+    """The topics of one client proxy.
+
+    Args:
+        wake: Has `tick` called soon. Any thread.
+        merge: Makes one status of an action of what its replicas say.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        wake: Callable[[], None],
+        merge: Merge = lambda said: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._wake = wake
+        self._merge = merge
+        self._clock = clock
+        self._topics: dict[str, RobotTopic] = {}
+        self._trouble: dict[str, str] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._topics
+
+    def serve(self, topics: Iterable[TopicSpec], node: RosTopics) -> bool:
+        """Pass these topics and no others; return whether they have changed."""
+        wanted = {topic.key_name: topic for topic in topics}
+        changed = False
+        for name, old in list(self._topics.items()):
+            if wanted.get(name) != old.topic:
+                old.close()
+                del self._topics[name]
+                changed = True
+        for name, topic in wanted.items():
+            if name in self._topics:
+                continue
+            one = RobotTopic(topic, self._clock, self._wake, self._merge)
+            try:
+                one.open(node)
+            except RosError as error:
+                log.error("topic_not_passed topic=%s reason=%r", topic.name, error.message)
+                self._trouble[topic.name] = error.message
+                continue
+            self._trouble.pop(topic.name, None)
+            self._topics[name] = one
+            changed = True
+            log.info("topic_passed topic=%s origin=%s", topic.name, topic.origin.value)
+        return changed
+
+    def keys(self, pool_uid: str, slot: int) -> dict[str, str]:
+        """Return the keys of a replica's topics, by their names on the wire."""
+        return {
+            name: names.service_key(pool_uid, slot, name, one.topic.type)
+            for name, one in self._topics.items()
+        }
+
+    def route(self, links: Mapping[int, Link]) -> None:
+        """Set the links to all replicas, by the dispatcher's numbers."""
+        for name, one in self._topics.items():
+            one.route({k: link for k, link in links.items() if name in link.ready}, links)
+
+    def answered(self, key: int, answer: Answer) -> None:
+        """Pass the end of an attempt to its topic."""
+        self._topics[answer.service].answered(key, answer)
+
+    def tick(self) -> None:
+        """Send what is due."""
+        for one in self._topics.values():
+            one.tick()
+
+    def report(self) -> dict[str, Any]:
+        """Return counters by topic, and why some cannot pass."""
+        counts: dict[str, Any] = {
+            one.topic.name: {**one.count, **({"trouble": one.trouble} if one.trouble else {})}
+            for one in self._topics.values()
+        }
+        return {**counts, **{name: {"trouble": why} for name, why in self._trouble.items()}}
+
+    def close(self) -> None:
+        """Leave ROS."""
+        for one in self._topics.values():
+            one.close()

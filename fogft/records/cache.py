@@ -1,0 +1,56 @@
+"""The last records on disk, so that a process can start while nobody can be reached.
+
+The file is written whole, has a version and a checksum, and each record in it keeps its
+signature, which is checked again. A damaged file is told and costs only itself.
+
+Owns: the file. Not here: when it is written, and what stands in a record.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.errors import StateError
+from fogft.records.record import RecordError, SignedRecord, from_plain, to_plain
+
+VERSION = 1
+
+
+def write(path: Path, records: Sequence[SignedRecord], *, durable: bool = True) -> None:
+    """Replace the file.
+
+    Raises:
+        StateError: It cannot be written; the old one is as it was.
+    """
+    content = [to_plain(one) for one in records]
+    whole = {"version": VERSION, "checksum": _checksum(content), "records": content}
+    disk.write_json(path, whole, durable=durable)
+
+
+def read(path: Path) -> list[SignedRecord]:
+    """Return the records of the file, none where there is no file.
+
+    Raises:
+        StateError: It is damaged, or of another version.
+    """
+    raw = disk.read_json(path)
+    if raw is None:
+        return []
+    try:
+        if raw["version"] != VERSION:
+            raise StateError(f"`{path}` is of version {raw['version']!r:.20}, not {VERSION}")
+        if raw["checksum"] != _checksum(raw["records"]):
+            raise StateError(f"`{path}` is damaged: its checksum is wrong")
+        return [from_plain(one) for one in raw["records"]]
+    except (KeyError, TypeError, RecursionError, RecordError) as error:
+        raise StateError(f"`{path}` is damaged: {error}") from error
+
+
+def _checksum(content: Any) -> str:
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()

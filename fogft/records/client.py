@@ -1,0 +1,319 @@
+"""A process's membership records: kept on disk, exchanged with every rendezvous it can reach.
+
+It dials all endpoints and keeps on dialling; nothing waits for it. What it publishes is its
+own to say; what it passes on from others is signed by them. So a process goes on with what
+it knows, and knows everything again moments after one rendezvous is back.
+
+Owns: one thread with its event loop, the connections, own sequence numbers, the cache.
+Not here: what records mean (`fogft.records.roster`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fogft.errors import StateError, WireError
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model.membership import is_endpoint
+from fogft.records import cache as record_cache
+from fogft.records.dialling import Caller
+from fogft.records.exchange import Exchange
+from fogft.records.record import Record, RecordError, RecordKind, sign_record
+from fogft.records.record_set import RecordSet, Verdict
+from fogft.records.signing import Signer, Verifier
+
+log = logging.getLogger(__name__)
+
+CACHE_AFTER_S = 0.2
+_LOOK_AFTER_OWN_EVERY_S = 5.0
+_BACKOFF_S = 0.25
+_END_WAIT_S = 2.0
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known at one moment. Immutable, so any thread may read it.
+
+    Attributes:
+        connected: How many rendezvous are connected.
+        seen_host: Our own address, as a rendezvous saw it; empty if none did.
+        revoked: Common names of certificates that are good no more.
+    """
+
+    records: tuple[Record, ...] = ()
+    revoked: frozenset[str] = frozenset()
+    connected: int = 0
+    seen_host: str = ""
+
+    def of(self, kind: RecordKind) -> list[Record]:
+        """Return the records of a kind."""
+        return [record for record in self.records if record.kind is kind]
+
+
+class RendezvousClient:
+    """The records of one process.
+
+    Args:
+        endpoints: ``host:port`` of each rendezvous; none is fine.
+        credentials: The process's certificate and key, and the pool's CA.
+        pool_uid: The pool.
+        cache: File that the records are kept in; None for nowhere.
+        changed: Called on the client's thread after anything changed; must not block.
+
+    Raises:
+        CredentialError: The credentials cannot be used.
+        WireError: An endpoint is none.
+    """
+
+    def __init__(
+        self,
+        endpoints: Sequence[str],
+        credentials: CredentialPaths,
+        pool_uid: str,
+        *,
+        cache: Path | None = None,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        for endpoint in endpoints:
+            if not is_endpoint(endpoint):
+                raise WireError(f"`{endpoint}` is not the `host:port` of a rendezvous")
+        self._endpoints = tuple(endpoints)
+        self._credentials = credentials
+        self._signer = Signer(credentials.certificate, credentials.key)
+        self._cache = cache
+        self._told = changed
+        self._records = RecordSet(pool_uid, Verifier(credentials.ca))
+        self._exchange = Exchange(self._records, self._news)
+        self._own: dict[tuple[RecordKind, str], _Own] = {}
+        self._details: dict[str, str] = dict.fromkeys(self._endpoints, "not reached yet")
+        self._seen_host = ""
+        self._cached = False
+        self.known = Known()
+        self._restore()
+        self._loop = asyncio.new_event_loop()
+        self._main: asyncio.Task[None] | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="fogft-rendezvous", daemon=True)
+
+    def start(self) -> None:
+        """Begin to dial; return at once."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End all connections and write the cache. Repeatable."""
+        if self._closing or not self._thread.is_alive():
+            return
+        self._closing = True
+        self._loop.call_soon_threadsafe(self._end)
+        self._thread.join(_END_WAIT_S)
+
+    def publish(
+        self,
+        kind: RecordKind,
+        subject: str,
+        generation: int,
+        content: Mapping[str, Any],
+        *,
+        sequence: int | None = None,
+    ) -> None:
+        """Say something of our own, to everybody, from now on. From any thread.
+
+        Args:
+            kind: What it is about.
+            subject: Whom.
+            generation: See `Record`.
+            content: JSON data.
+            sequence: Its number; None for one above all that were said before.
+        """
+        own = _Own(generation, dict(content), sequence)
+        self._loop.call_soon_threadsafe(self._say, kind, subject, own)
+
+    def status(self) -> dict[str, Any]:
+        """Return for people: each rendezvous with what is wrong, and what was counted."""
+        return {
+            "rendezvous": [
+                {"endpoint": endpoint, "connected": not detail, "detail": detail}
+                for endpoint, detail in dict(self._details).items()
+            ],
+            "records": len(self.known.records),
+            "offered": dict(self._records.counts),
+        }
+
+    # -- the client's thread ------------------------------------------------------------------
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._main = self._loop.create_task(self._live())
+        if self._closing:
+            self._main.cancel()
+        try:
+            self._loop.run_until_complete(self._main)
+        except asyncio.CancelledError:
+            pass
+        except Exception:
+            log.exception("rendezvous_client_ended")
+        finally:
+            self._save()
+            self._loop.close()
+
+    def _end(self) -> None:
+        if self._main is not None:
+            self._main.cancel()
+
+    async def _live(self) -> None:
+        tasks = [asyncio.ensure_future(self._call(endpoint)) for endpoint in self._endpoints]
+        tasks += [
+            asyncio.ensure_future(self._keep_cache()),
+            asyncio.ensure_future(self._keep_own()),
+        ]
+        try:
+            await asyncio.gather(*tasks)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            self._exchange.abort()
+
+    async def _call(self, endpoint: str) -> None:
+        """Keep one rendezvous connected for ever."""
+        caller = Caller(endpoint, self._credentials, self._signer, self._records.pool_uid)
+        while True:
+            began = time.monotonic()
+            try:
+                connection, seen_host = await caller.connect()
+            except (WireError, RecordError, OSError, EOFError, asyncio.TimeoutError) as error:
+                words = error.message if isinstance(error, WireError) else str(error)
+                self._detail(endpoint, words or "it does not answer")
+            else:
+                self._seen_host = seen_host
+                self._detail(endpoint, "")
+                await self._exchange.keep(connection)
+                self._detail(endpoint, "the connection was lost")
+            await asyncio.sleep(max(0.0, began + _BACKOFF_S - time.monotonic()))
+
+    def _detail(self, endpoint: str, detail: str) -> None:
+        if self._details[endpoint] != detail:
+            self._details[endpoint] = detail
+            log.info("rendezvous_%s endpoint=%s reason=%r",
+                     "lost" if detail else "connected", endpoint, detail)  # fmt: skip
+            self._refresh()
+
+    # -- own records ---------------------------------------------------------------------------
+
+    def _say(self, kind: RecordKind, subject: str, own: _Own) -> None:
+        self._own[kind, subject] = own
+        try:
+            self._assert_own(kind, subject, own)
+        except (ValueError, StateError) as error:
+            log.error("record_not_published kind=%s reason=%r", kind.value, str(error))
+
+    def _assert_own(self, kind: RecordKind, subject: str, own: _Own) -> None:
+        """See that what stands for us is what we say now, signed by our present certificate."""
+        held = self._records.get(kind, subject)
+        signed = self._records.signed(kind, subject)
+        if held is not None and signed is not None and held.content == own.content:
+            if own.sequence is not None:
+                stands = held.order == (own.generation, own.sequence)
+            else:
+                renewed = signed.certificate != self._signer.certificate
+                stands = held.generation == own.generation and not renewed
+            if stands:
+                return
+        sequence = own.sequence
+        if sequence is None:
+            # A former self may have said more than we remember: go on above it.
+            said = held is not None and held.generation == own.generation
+            sequence = held.sequence + 1 if held is not None and said else 1
+        record = Record(
+            self._records.pool_uid, kind, subject, own.generation, sequence, own.content
+        )
+        if held is not None and held.order > record.order:
+            if not own.superseded:
+                own.superseded = True
+                log.error(
+                    "record_superseded kind=%s subject=%s order=%s standing=%s",
+                    kind.value, subject, record.order, held.order,
+                )  # fmt: skip
+            return
+        one = sign_record(record, self._signer)
+        if not self._exchange.take([one]) and self._records.offer(one) is Verdict.REFUSED:
+            log.error("record_refused kind=%s reason=%r", kind.value, self._records.last_refusal)
+
+    async def _keep_own(self) -> None:
+        while True:
+            await asyncio.sleep(_LOOK_AFTER_OWN_EVERY_S)
+            self._look_after_own()
+
+    def _look_after_own(self) -> None:
+        for (kind, subject), own in list(self._own.items()):
+            try:
+                self._assert_own(kind, subject, own)
+            except ValueError as error:
+                log.error("record_not_published kind=%s reason=%r", kind.value, str(error))
+
+    # -- what changed --------------------------------------------------------------------------
+
+    def _news(self) -> None:
+        self._cached = False
+        self._loop.call_soon(self._look_after_own)
+        self._refresh()
+
+    def _refresh(self) -> None:
+        kinds = (self._records.of(kind) for kind in RecordKind)
+        self.known = Known(
+            records=tuple(record for kind in kinds for record in kind),
+            revoked=self._records.revoked,
+            connected=sum(not detail for detail in self._details.values()),
+            seen_host=self._seen_host,
+        )
+        try:
+            self._told()
+        except Exception:
+            log.exception("change_not_taken")
+
+    # -- the cache -----------------------------------------------------------------------------
+
+    def _restore(self) -> None:
+        """Take in what is on disk, certificates that have expired since included."""
+        if self._cache is None:
+            return
+        try:
+            records = record_cache.read(self._cache)
+        except StateError as error:
+            log.error("cache_damaged reason=%r", error.message)
+            return
+        any_time = Verifier(self._credentials.ca, any_time=True)
+        for one in records:
+            self._records.restore(one, any_time)
+        self._cached = True
+        self._refresh()
+
+    async def _keep_cache(self) -> None:
+        while True:
+            await asyncio.sleep(CACHE_AFTER_S)
+            if not self._cached:
+                await asyncio.get_running_loop().run_in_executor(None, self._save)
+
+    def _save(self) -> None:
+        if self._cache is None or self._cached:
+            return
+        self._cached = True
+        try:
+            record_cache.write(self._cache, self._records.lacking({}))
+        except StateError as error:
+            log.error("cache_not_written reason=%r", error.message)
+
+
+@dataclass
+class _Own:
+    generation: int
+    content: dict[str, Any]
+    sequence: int | None
+    superseded: bool = False

@@ -1,0 +1,152 @@
+"""Open a connection to a rendezvous: soon after it can be reached, and to nobody else.
+
+A new attempt begins every 0.4 s while earlier ones are still under way. One that was sent
+into a black hole would be repeated by TCP after 1, 3, 7 seconds; one that crosses a slow
+link needs seconds. Overlapping attempts serve both.
+
+Owns: TCP, TLS and the greeting. Not here: what is exchanged then (`record_exchange`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import ssl
+from typing import Any
+
+from fogft.errors import CredentialError, WireError
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.records import frames
+from fogft.records.exchange import SILENCE_S, Connection
+from fogft.records.record import RecordError
+from fogft.records.server import PURPOSE, binding_of
+from fogft.records.signing import Signer
+
+ATTEMPT_EVERY_S = 0.25
+_ATTEMPT_TIMEOUT_S = 3.0
+_GREETING_TIMEOUT_S = 5.0
+
+
+class Caller:
+    """Connects one process to one rendezvous.
+
+    Args:
+        endpoint: ``host:port``; a name is looked up with each attempt.
+        credentials: The pool's CA is what counts here.
+        signer: Proves who we are.
+        pool_uid: The pool that the rendezvous must belong to.
+    """
+
+    def __init__(
+        self, endpoint: str, credentials: CredentialPaths, signer: Signer, pool_uid: str
+    ) -> None:
+        host, _, port = endpoint.rpartition(":")
+        self._endpoint = endpoint
+        self._address = (host.strip("[]"), int(port))
+        self._credentials = credentials
+        self._signer = signer
+        self._pool_uid = pool_uid
+
+    async def connect(self) -> tuple[Connection, str]:
+        """Return a connection on which both sides know each other, and our host as seen there.
+
+        Raises:
+            WireError: Somebody else is there, or it does not let us in.
+            RecordError: What it says is no greeting.
+            OSError: It cannot be reached, or TLS fails.
+        """
+        raw = await self._reach()
+        try:
+            return await asyncio.wait_for(self._greet(raw), _GREETING_TIMEOUT_S)
+        except BaseException:
+            raw.close()
+            raise
+
+    async def _reach(self) -> socket.socket:
+        """Return the first of several overlapping attempts that gets through."""
+        attempts: set[asyncio.Task[socket.socket]] = set()
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                attempts.add(loop.create_task(self._attempt()))
+                tick = loop.create_task(asyncio.sleep(ATTEMPT_EVERY_S))
+                try:
+                    await asyncio.wait({*attempts, tick}, return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    tick.cancel()
+                for attempt in [a for a in attempts if a.done()]:
+                    attempts.discard(attempt)
+                    return attempt.result()  # an error, too: it is told, then tried again
+        finally:
+            for attempt in attempts:
+                attempt.cancel()
+            for late in await asyncio.gather(*attempts, return_exceptions=True):
+                if isinstance(late, socket.socket):
+                    late.close()
+
+    async def _attempt(self) -> socket.socket:
+        loop = asyncio.get_running_loop()
+        host, port = self._address
+        found = await asyncio.wait_for(
+            loop.getaddrinfo(host, port, type=socket.SOCK_STREAM), _ATTEMPT_TIMEOUT_S
+        )
+        family, kind, protocol, _, address = found[0]
+        raw = socket.socket(family, kind, protocol)
+        try:
+            raw.setblocking(False)
+            raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            await asyncio.wait_for(loop.sock_connect(raw, address), _ATTEMPT_TIMEOUT_S)
+        except asyncio.TimeoutError:
+            raw.close()
+            raise WireError(f"`{self._endpoint}` does not answer") from None
+        except OSError as error:
+            raw.close()
+            words = os.strerror(error.errno).lower() if error.errno else str(error)
+            raise WireError(f"`{self._endpoint}`: {words}") from error
+        except BaseException:
+            raw.close()
+            raise
+        return raw
+
+    async def _greet(self, raw: socket.socket) -> tuple[Connection, str]:
+        reader, writer = await asyncio.open_connection(
+            sock=raw, ssl=self._context(), server_hostname=""
+        )
+        try:
+            binding = self._check(writer.get_extra_info("ssl_object"))
+            unframer = frames.Unframer()
+            nonce, seen_host = frames.read_challenge(await _first_message(reader, unframer))
+            proof = frames.proof_bytes(PURPOSE, nonce, binding)
+            writer.write(frames.greeting(*self._signer(proof)))
+        except BaseException:
+            writer.transport.abort()
+            raise
+        return Connection(reader, writer, unframer, self._endpoint), seen_host
+
+    def _context(self) -> ssl.SSLContext:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.check_hostname = False  # its role and pool are what must be right, not its host
+        try:
+            context.load_verify_locations(self._credentials.ca)
+        except (OSError, ssl.SSLError):
+            raise CredentialError(f"the CA `{self._credentials.ca}` cannot be used") from None
+        return context
+
+    def _check(self, link: Any) -> bytes:
+        """See that a rendezvous of our pool is there; return what ties our greeting to it."""
+        subject = dict(entry for part in link.getpeercert()["subject"] for entry in part)
+        name, role = subject.get("commonName", ""), subject.get("organizationalUnitName", "")
+        if role != "rendezvous" or not name.endswith(f".{self._pool_uid}"):
+            raise WireError(
+                f"`{self._endpoint}` has the certificate of `{name}`, not of a rendezvous"
+            )
+        return binding_of(link.getpeercert(binary_form=True))
+
+
+async def _first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
+    while data := await asyncio.wait_for(reader.read(4 << 10), SILENCE_S):
+        for message in unframer.feed(data):
+            return message
+    raise RecordError("malformed", "it left without a challenge")

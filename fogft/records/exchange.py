@@ -1,0 +1,144 @@
+"""Keep one set of records the same as everybody's who is connected. On one event loop.
+
+Both ends of a connection do the same: tell what they have, send what the other lacks, pass
+on at once what is new. So a rendezvous that comes back empty is filled by whoever connects.
+
+Owns: the record set, and the connections that it is exchanged over.
+Not here: making connections (`rendezvous_server`, `rendezvous_client`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from fogft.records import frames
+from fogft.records.record import RecordError, SignedRecord
+from fogft.records.record_set import RecordSet, Verdict
+
+log = logging.getLogger(__name__)
+
+SILENCE_S = 3.0  # TCP alone would wait for minutes behind a black hole
+PING_EVERY_S = 1.0
+HAVE_EVERY = 5  # pings: heals whatever was missed
+_WAITING_LIMIT = 4 << 20
+_READ_BYTES = 64 << 10
+
+
+class Connection:
+    """One open connection whose other end is known."""
+
+    def __init__(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        unframer: frames.Unframer,
+        name: str,
+    ) -> None:
+        self.name = name
+        self._reader = reader
+        self._writer = writer
+        self._unframer = unframer
+
+    def send(self, data: bytes) -> None:
+        """Queue bytes; who takes nothing for long is let go."""
+        if self._writer.transport.get_write_buffer_size() > _WAITING_LIMIT:
+            self.abort()
+            return
+        self._writer.write(data)
+
+    async def messages(self) -> list[dict[str, Any]]:
+        """Return the next messages; an empty list at the end of the stream.
+
+        Raises:
+            RecordError: Something else came.
+            asyncio.TimeoutError: Nothing came for `SILENCE_S`.
+        """
+        found = list(self._unframer.feed(b""))  # what came along with a greeting
+        while not found:
+            data = await asyncio.wait_for(self._reader.read(_READ_BYTES), SILENCE_S)
+            if not data:
+                return []
+            found = list(self._unframer.feed(data))
+        return found
+
+    def abort(self) -> None:
+        """End it at once."""
+        self._writer.transport.abort()
+
+
+class Exchange:
+    """A record set and the connections over which it is kept the same.
+
+    Args:
+        records: The set; used on this loop only, unless its owner guards it.
+        changed: Called after records were accepted.
+    """
+
+    def __init__(self, records: RecordSet, changed: Callable[[], None] = lambda: None) -> None:
+        self.records = records
+        self.counts: Counter[str] = Counter()
+        self._changed = changed
+        self._connections: set[Connection] = set()
+
+    def __len__(self) -> int:
+        return len(self._connections)
+
+    def take(self, offered: list[SignedRecord], source: Connection | None = None) -> int:
+        """Offer records to the set and pass on what was accepted; return how many were."""
+        accepted = [one for one in offered if self.records.offer(one) is Verdict.ACCEPTED]
+        if accepted:
+            for message in frames.records(accepted):
+                for connection in self._connections - {source}:
+                    connection.send(message)
+            self._changed()
+        return len(accepted)
+
+    async def keep(self, connection: Connection) -> None:
+        """Exchange records over a connection until it ends. Raises nothing but cancellation."""
+        self._connections.add(connection)
+        pings = asyncio.get_running_loop().create_task(self._ping(connection))
+        try:
+            while messages := await connection.messages():
+                for message in messages:
+                    self._heard(connection, message)
+        except asyncio.TimeoutError:
+            self.counts["silent"] += 1
+            log.info("connection_silent peer=%s silent_for_s=%.0f", connection.name, SILENCE_S)
+        except RecordError as error:
+            self.counts[f"message_{error.reason}"] += 1
+            log.warning("message_refused peer=%s reason=%r", connection.name, str(error))
+        except OSError as error:
+            log.info("connection_lost peer=%s reason=%r", connection.name, str(error))
+        finally:
+            pings.cancel()
+            self._connections.discard(connection)
+            connection.abort()
+
+    async def _ping(self, connection: Connection) -> None:
+        count = 0
+        while True:
+            if count % HAVE_EVERY == 0:
+                connection.send(frames.have(self.records.digest()))
+            else:
+                connection.send(frames.ping())
+            count += 1
+            await asyncio.sleep(PING_EVERY_S)
+
+    def _heard(self, connection: Connection, message: dict[str, Any]) -> None:
+        kind = message.get("type")
+        if kind == "have":
+            for answer in frames.records(self.records.lacking(frames.read_have(message))):
+                connection.send(answer)
+        elif kind == "records":
+            self.take(frames.read_records(message), connection)
+        elif kind != "ping":
+            raise RecordError("malformed", "a message of an unknown kind")
+
+    def abort(self) -> None:
+        """End all connections."""
+        for connection in list(self._connections):
+            connection.abort()

@@ -1,0 +1,221 @@
+"""What a rendezvous and its callers say to each other, as bytes. Pure.
+
+Each message is a JSON object behind its length. Whatever bytes come in, and however they are
+cut, a reader gives messages or raises `RecordError`, and holds no more than one frame.
+
+Owns: the bytes and the shape of messages. Not here: records (`fogft.records.record`), sockets.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from fogft.records.record import (
+    COUNT_LIMIT,
+    Key,
+    Order,
+    RecordError,
+    SignedRecord,
+    from_plain,
+    read_json,
+    to_plain,
+)
+from fogft.records.record_set import Digest
+
+VERSION = 1
+FRAME_LIMIT = 256 << 10
+NONCE_BYTES = 32
+_LENGTH = struct.Struct(">I")
+_BATCH_BYTES = 64 << 10
+_DIGEST_LIMIT = 4096
+_GREETING_PREFIX = b"fogft caller 1\n"  # so that no other signature is good for this
+
+
+class Unframer:
+    """Cuts a stream of bytes into messages.
+
+    Attributes:
+        limit: The longest message that is read, in bytes.
+    """
+
+    def __init__(self, limit: int = FRAME_LIMIT) -> None:
+        self.limit = limit
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[dict[str, Any]]:
+        """Yield the messages that are complete now; what is not taken stays for the next call.
+
+        Raises:
+            RecordError: The stream is no such stream; it cannot go on.
+        """
+        self._buffer += data
+        while len(self._buffer) >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(self._buffer)
+            if length > self.limit:
+                raise RecordError("malformed", f"a frame of {length} bytes")
+            end = _LENGTH.size + length
+            if len(self._buffer) < end:
+                return
+            content = bytes(self._buffer[_LENGTH.size : end])
+            del self._buffer[:end]
+            yield read_json(content, self.limit)
+
+
+def frame(message: dict[str, Any]) -> bytes:
+    """Return a message as bytes."""
+    content = json.dumps(message, separators=(",", ":")).encode()
+    return _LENGTH.pack(len(content)) + content
+
+
+# -- greeting -------------------------------------------------------------------------------
+
+
+def challenge(nonce: bytes, seen_host: str) -> bytes:
+    """Return the first message of who is called: what to sign, and where the caller is seen."""
+    return frame({"type": "challenge", "v": VERSION, "nonce": nonce.hex(), "seen": seen_host})
+
+
+def read_challenge(message: dict[str, Any]) -> tuple[bytes, str]:
+    """Return nonce and the caller's host as seen.
+
+    Raises:
+        RecordError: It is no challenge.
+    """
+    _expect(message, "challenge")
+    nonce, seen = message.get("nonce"), message.get("seen")
+    if not isinstance(nonce, str) or not isinstance(seen, str) or len(seen) > 64:
+        raise RecordError("malformed", "a challenge without nonce")
+    return _hex(nonce, NONCE_BYTES), seen if seen.isprintable() else ""
+
+
+def proof_bytes(purpose: str, nonce: bytes, binding: bytes) -> bytes:
+    """Return what a caller signs.
+
+    Args:
+        purpose: What the greeting is for: it is good for nothing else.
+        nonce: From the challenge: it is good only once.
+        binding: Whom it is for: it cannot be passed on to another.
+    """
+    return _GREETING_PREFIX + purpose.encode() + b"\n" + nonce + binding
+
+
+def greeting(certificate: bytes, signature: bytes) -> bytes:
+    """Return the caller's first message: who it is, and the proof."""
+    return frame(
+        {
+            "type": "greeting",
+            "v": VERSION,
+            "certificate": certificate.hex(),
+            "signature": signature.hex(),
+        }
+    )
+
+
+def read_greeting(message: dict[str, Any]) -> tuple[bytes, bytes]:
+    """Return certificate and signature.
+
+    Raises:
+        RecordError: It is no greeting.
+    """
+    _expect(message, "greeting")
+    certificate, signature = message.get("certificate"), message.get("signature")
+    if not isinstance(certificate, str) or not isinstance(signature, str):
+        raise RecordError("malformed", "a greeting without proof")
+    return _hex(certificate), _hex(signature)
+
+
+# -- records --------------------------------------------------------------------------------
+
+
+def ping() -> bytes:
+    """Return a sign of life."""
+    return frame({"type": "ping"})
+
+
+def have(digest: Digest) -> bytes:
+    """Return what is held, for the other side to send what is lacking."""
+    return frame({"type": "have", "digest": [[*key, *order] for key, order in digest.items()]})
+
+
+def read_have(message: dict[str, Any]) -> dict[Key, Order]:
+    """Return the other side's digest.
+
+    Raises:
+        RecordError: It is none.
+    """
+    rows = message.get("digest")
+    if not isinstance(rows, list) or len(rows) > _DIGEST_LIMIT:
+        raise RecordError("malformed", "a digest that is none")
+    found: dict[Key, Order] = {}
+    for row in rows:
+        if not isinstance(row, list) or [type(x) for x in row] != [str, str, int, int]:
+            raise RecordError("malformed", "a digest that is none")
+        if not all(0 <= number < COUNT_LIMIT for number in row[2:]):
+            raise RecordError("malformed", "a digest that is none")
+        found[row[0], row[1]] = (row[2], row[3])
+    return found
+
+
+def records(all: Sequence[SignedRecord]) -> Iterator[bytes]:
+    """Yield messages that carry these records, none of them large."""
+    batch: list[dict[str, str]] = []
+    size = 0
+    for one in all:
+        plain = to_plain(one)
+        length = sum(map(len, plain.values()))
+        if batch and size + length > _BATCH_BYTES:
+            yield frame({"type": "records", "records": batch})
+            batch, size = [], 0
+        batch.append(plain)
+        size += length
+    if batch:
+        yield frame({"type": "records", "records": batch})
+
+
+def read_records(message: dict[str, Any]) -> list[SignedRecord]:
+    """Return the records of a message, not yet judged.
+
+    Raises:
+        RecordError: They are none.
+    """
+    rows = message.get("records")
+    if not isinstance(rows, list):
+        raise RecordError("malformed", "records that are no list")
+    return [from_plain(row) for row in rows]
+
+
+def pack(all: Sequence[SignedRecord]) -> bytes:
+    """Return records as one message of its own, for a link."""
+    return json.dumps({"v": VERSION, "records": [to_plain(one) for one in all]}).encode()
+
+
+def unpack(data: bytes) -> list[SignedRecord]:
+    """Return the records of `pack`, not yet judged.
+
+    Raises:
+        RecordError: They are none.
+    """
+    message = read_json(data, FRAME_LIMIT)
+    if message.get("v") is True or message.get("v") != VERSION:
+        raise RecordError("version", f"version {message.get('v')!r:.20} is not spoken here")
+    return read_records(message)
+
+
+def _expect(message: dict[str, Any], kind: str) -> None:
+    if message.get("type") != kind:
+        raise RecordError("malformed", f"no {kind}")
+    if message.get("v") is True or message.get("v") != VERSION:
+        raise RecordError("version", f"version {message.get('v')!r:.20} is not spoken here")
+
+
+def _hex(text: str, length: int = 0) -> bytes:
+    try:
+        raw = bytes.fromhex(text)
+    except ValueError:
+        raise RecordError("malformed", "not hexadecimal") from None
+    if length and len(raw) != length:
+        raise RecordError("malformed", f"{len(raw)} bytes, where {length} belong")
+    return raw

@@ -1,0 +1,170 @@
+"""Records merged by (generation, sequence): the same set, whatever order they came in. Pure.
+
+Everybody holds such a set: robots, replicas, gateways, the manager and each rendezvous.
+Offering a record again, late or out of order changes nothing, so any two that meet can
+simply exchange what the other lacks.
+
+Owns: which record stands for a key, what is refused, and how often.
+Not here: a record's bytes (`records`), its meaning (`roster`), how it travels (`fogft.link`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from fogft.records.record import (
+    Key,
+    Order,
+    Record,
+    RecordError,
+    RecordKind,
+    SignedRecord,
+    Verify,
+    Writer,
+    read_body,
+    verified_writer,
+)
+from fogft.records.roster import check_content, revoked_names
+
+KEYS_LIMIT = 1024
+
+Digest = Mapping[Key, Order]
+
+
+class Verdict(str, Enum):
+    """What became of an offered record."""
+
+    ACCEPTED = "accepted"
+    KNOWN = "known"  # the very same stands already
+    OLDER = "older"  # a later one stands
+    REFUSED = "refused"  # no good; the counters say why
+
+
+@dataclass(frozen=True)
+class _Held:
+    record: Record
+    signed: SignedRecord
+    writer: Writer
+
+
+class RecordSet:
+    """The records of one pool. Not thread-safe: its owner sees to that.
+
+    Args:
+        pool_uid: Records of other pools are refused.
+        verify: Checks a signature and its certificate.
+        limit: The most keys that are kept; records for further ones are refused.
+    """
+
+    def __init__(self, pool_uid: str, verify: Verify, *, limit: int = KEYS_LIMIT) -> None:
+        self.pool_uid = pool_uid
+        self.counts: Counter[str] = Counter()
+        self.last_refusal = ""
+        self._verify = verify
+        self._limit = limit
+        self._held: dict[Key, _Held] = {}
+        self._revoked: frozenset[str] = frozenset()
+
+    # -- merging ----------------------------------------------------------------------------
+
+    def offer(self, signed: SignedRecord) -> Verdict:
+        """Take a record in if it is good and newer than what stands for its key."""
+        try:
+            verdict = self._judge(signed)
+        except RecordError as error:
+            verdict = self._refuse(error)
+        else:
+            self.counts[verdict.value] += 1
+        return verdict
+
+    def restore(self, signed: SignedRecord, verify: Verify) -> Verdict:
+        """Take in what was accepted once before, judged by another `verify`: time has passed."""
+        usual, self._verify = self._verify, verify
+        try:
+            return self.offer(signed)
+        finally:
+            self._verify = usual
+
+    def _refuse(self, error: RecordError) -> Verdict:
+        self.counts[f"refused_{error.reason}"] += 1
+        self.last_refusal = str(error)
+        return Verdict.REFUSED
+
+    def _judge(self, signed: SignedRecord) -> Verdict:
+        record = read_body(signed)
+        if record.pool_uid != self.pool_uid:
+            raise RecordError("pool", "a record of another pool")
+        held = self._held.get(record.key)
+        if held is not None and held.signed.body == signed.body:
+            return Verdict.KNOWN
+        if held is not None and not _replaces(record, signed, held):
+            return Verdict.OLDER
+        check_content(record)
+        if held is None and len(self._held) >= self._limit:
+            raise RecordError("full", f"a record beyond the {self._limit} that are kept")
+        # Last, being the costly step: a flood of old records costs no signature checks.
+        writer = verified_writer(record, signed, self._verify)
+        if writer.common_name in self._revoked:
+            raise RecordError("revoked", f"the certificate of `{writer.common_name}` is revoked")
+        self._held[record.key] = _Held(record, signed, writer)
+        if record.kind is RecordKind.REVOCATION:
+            self._revoke(revoked_names(record))
+        return Verdict.ACCEPTED
+
+    def _revoke(self, names: frozenset[str]) -> None:
+        """Forget what revoked certificates have signed, whatever its order."""
+        self._revoked = names
+        for key in [k for k, held in self._held.items() if held.writer.common_name in names]:
+            if key[0] != RecordKind.REVOCATION.value:
+                del self._held[key]
+
+    # -- exchange ---------------------------------------------------------------------------
+
+    def digest(self) -> dict[Key, Order]:
+        """Return the order that stands for each key."""
+        return {key: held.record.order for key, held in self._held.items()}
+
+    def lacking(self, digest: Digest) -> list[SignedRecord]:
+        """Return what somebody with that digest lacks; the manager's records first."""
+        return [
+            held.signed
+            for key, held in sorted(self._held.items(), key=lambda item: _urgency(item[0]))
+            if held.record.order > digest.get(key, (-1, -1))
+        ]
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def get(self, kind: RecordKind, subject: str = "") -> Record | None:
+        """Return the record that stands for a key."""
+        held = self._held.get((kind.value, subject))
+        return None if held is None else held.record
+
+    def signed(self, kind: RecordKind, subject: str = "") -> SignedRecord | None:
+        """Return the same as it travels."""
+        held = self._held.get((kind.value, subject))
+        return None if held is None else held.signed
+
+    def of(self, kind: RecordKind) -> list[Record]:
+        """Return all records of a kind, by subject."""
+        return [held.record for key, held in sorted(self._held.items()) if key[0] == kind.value]
+
+    @property
+    def revoked(self) -> frozenset[str]:
+        """Common names of the certificates that are good no more."""
+        return self._revoked
+
+
+def _replaces(record: Record, signed: SignedRecord, held: _Held) -> bool:
+    if record.order != held.record.order:
+        return record.order > held.record.order
+    # A writer that said two things under one number: all must settle on the same one.
+    return signed.body > held.signed.body
+
+
+def _urgency(key: Key) -> tuple[bool, bool, Key]:
+    # Revocations first, then admission: what follows is judged by them.
+    return (key[0] != RecordKind.REVOCATION.value, key[0] != RecordKind.ADMISSION.value, key)

@@ -1,0 +1,244 @@
+"""A rendezvous: a place that everybody of a pool can reach, which keeps and passes on records.
+
+TLS proves the rendezvous to its callers; a caller proves itself by signing a challenge. What
+comes from anybody else, or is no message, ends that connection, is counted by reason, and
+changes nothing.
+
+Owns: the port, the greeting and its limits. Not here: records (`record_exchange`), the
+process (`fogft.pool.commands.rendezvous`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import os
+import secrets
+import socket
+import ssl
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from fogft.errors import CredentialError, WireError
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.log_limits import worth_logging
+from fogft.records import frames
+from fogft.records.exchange import Connection, Exchange
+from fogft.records.record import RecordError, Verify, Writer
+
+log = logging.getLogger(__name__)
+
+CONNECTIONS_LIMIT = 512
+HANDSHAKES_LIMIT = 64
+GREETING_TIMEOUT_S = 10.0
+PURPOSE = "rendezvous"
+CALLERS = frozenset({"manager", "robot", "replica", "gateway"})
+
+
+class RendezvousServer:
+    """Listens for callers of one pool; all on the event loop that calls `serve`.
+
+    Args:
+        listen: ``host:port``; port 0 for any that is free.
+        credentials: The rendezvous's certificate and key, and the pool's CA.
+        verify: Tells who signed a greeting.
+        exchange: The records.
+    """
+
+    def __init__(
+        self, listen: str, credentials: CredentialPaths, verify: Verify, exchange: Exchange
+    ) -> None:
+        self._listen = listen
+        self._credentials = credentials
+        self._verify = verify
+        self._exchange = exchange
+        self.counts: Counter[str] = Counter()
+        self._context: ssl.SSLContext | None = None
+        self._mark: tuple[int, int] | None = None
+        self._binding = b""
+        self._socket: socket.socket | None = None
+        self._endpoint = listen
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._greeting = 0
+
+    @property
+    def endpoint(self) -> str:
+        """``host:port`` as bound."""
+        return self._endpoint
+
+    def bind(self) -> None:
+        """Take the port.
+
+        Raises:
+            WireError: It cannot be had.
+            CredentialError: The certificate or its key cannot be used.
+        """
+        self._renew_context()
+        host, _, port = self._listen.rpartition(":")
+        try:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            bound = socket.socket(family, socket.SOCK_STREAM)
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            bound.bind((host.strip("[]"), int(port)))
+            bound.listen(128)
+            bound.setblocking(False)
+        except (OSError, ValueError, OverflowError) as error:
+            words = getattr(error, "strerror", None) or str(error)
+            raise WireError(
+                f"cannot listen at `{self._listen}`: {words}",
+                "give `host:port` with a free port, for instance `0.0.0.0:7450`",
+            ) from error
+        self._socket = bound
+        bound_port = bound.getsockname()[1]
+        self._endpoint = f"{host}:{bound_port}"
+
+    async def serve(self) -> None:
+        """Accept callers until cancelled."""
+        assert self._socket is not None
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                try:
+                    raw, address = await loop.sock_accept(self._socket)
+                except OSError as error:  # out of descriptors: wait for some to come free
+                    self._count("accept_failed", str(error))
+                    await asyncio.sleep(0.1)
+                    continue
+                if self._greeting >= HANDSHAKES_LIMIT or len(self._exchange) >= CONNECTIONS_LIMIT:
+                    self._count("refused_full", str(address[0]))
+                    raw.close()
+                    continue
+                self._greeting += 1
+                task = loop.create_task(self._attend(raw, str(address[0])))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+        finally:
+            self.close()
+
+    async def _attend(self, raw: socket.socket, host: str) -> None:
+        try:
+            try:
+                connection = await asyncio.wait_for(self._greet(raw, host), GREETING_TIMEOUT_S)
+            finally:
+                self._greeting -= 1
+        except RecordError as error:
+            self._count(f"greeting_{error.reason}", f"{host}: {error}")
+        except asyncio.TimeoutError:
+            self._count("greeting_timeout", host)
+        except (OSError, EOFError) as error:  # TLS errors are OSErrors
+            self._count("tls_failed", f"{host}: {error}")
+        else:
+            self.counts["admitted"] += 1
+            log.info("caller_admitted name=%s host=%s", connection.name, host)
+            await self._exchange.keep(connection)
+            log.info("caller_left name=%s host=%s", connection.name, host)
+
+    async def _greet(self, raw: socket.socket, host: str) -> Connection:
+        """Shake hands; return the connection of a caller that has proved itself."""
+        loop = asyncio.get_running_loop()
+        self._renew_context()
+        binding = self._binding
+        reader = asyncio.StreamReader(loop=loop)
+        protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
+        raw.setblocking(False)
+        raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        try:
+            transport, _ = await loop.connect_accepted_socket(
+                lambda: protocol, raw, ssl=self._context, ssl_handshake_timeout=GREETING_TIMEOUT_S
+            )
+        except BaseException:
+            raw.close()
+            raise
+        try:
+            nonce = secrets.token_bytes(frames.NONCE_BYTES)
+            transport.write(frames.challenge(nonce, host))
+            unframer = frames.Unframer(limit=16 << 10)
+            message = await _first_message(reader, unframer)
+            certificate, signature = frames.read_greeting(message)
+            caller = self._verify(
+                certificate, signature, frames.proof_bytes(PURPOSE, nonce, binding)
+            )
+            self._check(caller)
+        except BaseException:
+            transport.abort()
+            raise
+        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
+        unframer.limit = frames.FRAME_LIMIT  # for one who has proved who he is
+        return Connection(reader, writer, unframer, caller.common_name)
+
+    def _check(self, caller: Writer) -> None:
+        if caller.role not in CALLERS or not caller.common_name.endswith(
+            f".{self._exchange.records.pool_uid}"
+        ):
+            raise RecordError("role", f"`{caller.common_name}` may not call")
+        if caller.common_name in self._exchange.records.revoked:
+            raise RecordError("revoked", f"the certificate of `{caller.common_name}` is revoked")
+
+    def _renew_context(self) -> None:
+        """Load certificate and key, again when they were replaced."""
+        ours = self._credentials
+        try:
+            stat = os.stat(ours.certificate)
+            if (stat.st_mtime_ns, stat.st_ino) == self._mark:
+                return
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.minimum_version = ssl.TLSVersion.TLSv1_3
+            context.num_tickets = 0
+            context.load_cert_chain(ours.certificate, ours.key)
+            der = ssl.PEM_cert_to_DER_cert(ours.certificate.read_text())
+        except (OSError, ValueError) as error:
+            if self._context is not None:
+                return  # being replaced: the old pair is as good as it was
+            raise CredentialError(
+                f"`{ours.certificate}` or its key cannot be used",
+                "issue the rendezvous a certificate of the pool's CA",
+            ) from error
+        self._mark, self._context = (stat.st_mtime_ns, stat.st_ino), context
+        self._binding = binding_of(der)
+
+    def _count(self, event: str, detail: str) -> None:
+        self.counts[event] += 1
+        count = self.counts[event]
+        if worth_logging(count):
+            log.warning("caller_refused event=%s count=%d detail=%r", event, count, detail[:200])
+
+    def report(self) -> Mapping[str, Any]:
+        """Return what was counted, for people."""
+        exchange = self._exchange
+        return {
+            "callers": len(exchange),
+            "records": len(exchange.records),
+            "port": dict(self.counts),
+            "messages": dict(exchange.counts),
+            "offered": dict(exchange.records.counts),
+        }
+
+    def close(self) -> None:
+        """Give the port back and end all connections."""
+        for task in list(self._tasks):
+            task.cancel()
+        self._exchange.abort()
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.close()
+
+
+def binding_of(certificate: bytes) -> bytes:
+    """Return what ties a greeting to the rendezvous that has this certificate (DER)."""
+    return hashlib.sha256(certificate).digest()
+
+
+async def _first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
+    """Return the first message; what came along with it stays in the unframer.
+
+    Raises:
+        RecordError: Something else came.
+        EOFError: Nothing came.
+    """
+    while data := await reader.read(16 << 10):
+        for message in unframer.feed(data):
+            return message
+    raise EOFError("the caller left without a greeting")

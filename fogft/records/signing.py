@@ -1,0 +1,227 @@
+"""Sign with a certificate's key, and tell who signed: for records and for greetings.
+
+Every process of a pool has a key and a certificate of the pool's CA for TLS; the same pair
+signs what it says of itself. So no further keys have to be handed out, and whoever may not
+open a link may not write a record either.
+
+Owns: signatures and the judgement of certificates (CA, time, role).
+Not here: what may be signed by whom (`fogft.records.record`), making keys (`fogft.pool`).
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fogft.errors import CredentialError
+from fogft.records.record import RecordError, Writer
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+_KNOWN_LIMIT = 4096
+
+
+class Signer:
+    """Signs with a key on disk; reads it again when its certificate was replaced.
+
+    Args:
+        certificate: Path of the certificate (PEM).
+        key: Path of its key (PEM), which is never shown.
+
+    Raises:
+        CredentialError: They cannot be used, or do not belong together.
+    """
+
+    def __init__(self, certificate: Path, key: Path) -> None:
+        self._certificate_path = certificate
+        self._key_path = key
+        self._mark: tuple[int, int] | None = None
+        self._der = b""
+        self._key: ec.EllipticCurvePrivateKey | None = None
+        self._load()
+
+    @property
+    def certificate(self) -> bytes:
+        """The present certificate (DER)."""
+        self._load()
+        return self._der
+
+    @property
+    def common_name(self) -> str:
+        """The certificate's common name."""
+        from cryptography import x509
+
+        self._load()
+        return _attribute(x509.load_der_x509_certificate(self._der), "CN")
+
+    def __call__(self, message: bytes) -> tuple[bytes, bytes]:
+        """Return certificate and signature (both DER)."""
+        from cryptography.hazmat.primitives import hashes
+        from cryptography.hazmat.primitives.asymmetric import ec
+
+        self._load()
+        assert self._key is not None
+        return self._der, self._key.sign(message, ec.ECDSA(hashes.SHA256()))
+
+    def _load(self) -> None:
+        from cryptography import x509
+        from cryptography.hazmat.primitives.asymmetric import ec
+        from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
+
+        try:
+            stat = os.stat(self._certificate_path)
+            mark = (stat.st_mtime_ns, stat.st_ino)
+            if mark == self._mark:
+                return
+            certificate = x509.load_pem_x509_certificate(self._certificate_path.read_bytes())
+            key = load_pem_private_key(self._key_path.read_bytes(), password=None)
+        except (OSError, ValueError, TypeError):
+            if self._key is not None:
+                return  # it is being replaced: the old pair is as good as it was
+            raise CredentialError(
+                f"`{self._certificate_path}` or its key cannot be used",
+                "`fogft up` writes the pool's certificates",
+            ) from None  # the cause could quote the key
+        same = isinstance(key, ec.EllipticCurvePrivateKey) and (
+            key.public_key() == certificate.public_key()
+        )
+        if not same or not isinstance(key, ec.EllipticCurvePrivateKey):
+            if self._key is not None:
+                return
+            raise CredentialError(f"`{self._key_path}` does not belong to its certificate")
+        self._mark, self._der, self._key = mark, certificate.public_bytes(Encoding.DER), key
+
+
+class Verifier:
+    """Tells who signed something: a certificate of the pool's CA, in its time, with its key.
+
+    Args:
+        ca: Path of the pool's CA (PEM; several certificates while it is being replaced).
+        now: The time in UTC.
+        any_time: Accept certificates out of their time: for what was verified before.
+
+    Raises:
+        CredentialError: The CA cannot be used.
+    """
+
+    def __init__(
+        self,
+        ca: Path,
+        *,
+        now: Callable[[], datetime.datetime] = lambda: datetime.datetime.now(datetime.timezone.utc),
+        any_time: bool = False,
+    ) -> None:
+        from cryptography import x509
+
+        try:
+            self._authorities = x509.load_pem_x509_certificates(ca.read_bytes())
+        except (OSError, ValueError):
+            raise CredentialError(f"the CA `{ca}` cannot be used") from None
+        self._now = now
+        self._any_time = any_time
+        self._known: dict[bytes, x509.Certificate] = {}
+
+    def __call__(self, certificate: bytes, signature: bytes, message: bytes) -> Writer:
+        """Return who signed `message`.
+
+        Raises:
+            RecordError: The signature or the certificate is no good.
+        """
+        from cryptography.exceptions import InvalidSignature
+        from cryptography.hazmat.primitives import hashes
+        from cryptography.hazmat.primitives.asymmetric import ec
+
+        known = self._known.get(certificate) or self._judged(certificate)
+        if not self._any_time:
+            self._check_time(known)
+        key = known.public_key()
+        assert isinstance(key, ec.EllipticCurvePublicKey)  # `_judged` saw to it
+        try:
+            key.verify(signature, message, ec.ECDSA(hashes.SHA256()))
+        except InvalidSignature:
+            raise RecordError("forged", "a signature that is wrong") from None
+        return Writer(
+            role=_attribute(known, "OU"),
+            common_name=_attribute(known, "CN"),
+            serial=f"{known.serial_number:x}",
+        )
+
+    def _judged(self, der: bytes) -> x509.Certificate:
+        from cryptography import x509
+        from cryptography.hazmat.primitives.asymmetric import ec
+
+        try:
+            certificate = x509.load_der_x509_certificate(der)
+            constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints)
+            leaf = not constraints.value.ca
+            ours = leaf and isinstance(certificate.public_key(), ec.EllipticCurvePublicKey)
+        except Exception as error:  # the parser may raise anything on hostile bytes
+            raise RecordError("malformed", "a certificate that cannot be read") from error
+        if not ours or not any(_issued(certificate, ca) for ca in self._authorities):
+            raise RecordError("authority", "a certificate of another CA")
+        if len(self._known) >= _KNOWN_LIMIT:
+            self._known.clear()
+        self._known[der] = certificate
+        return certificate
+
+    def _check_time(self, certificate: x509.Certificate) -> None:
+        now = self._now()
+        name = _attribute(certificate, "CN")
+        if now < certificate.not_valid_before_utc:
+            raise RecordError("expired", f"the certificate of `{name}` is not valid yet")
+        if now >= certificate.not_valid_after_utc:
+            raise RecordError("expired", f"the certificate of `{name}` has expired")
+
+
+class LazyVerifier:
+    """A `Verifier` that reads the CA when it is first asked: who never is loads nothing."""
+
+    def __init__(self, ca: Path) -> None:
+        self._ca = ca
+        self._verifier: Verifier | None = None
+
+    def __call__(self, certificate: bytes, signature: bytes, message: bytes) -> Writer:
+        """Return who signed `message`; see `Verifier`.
+
+        Raises:
+            RecordError: The signature, the certificate or our own CA is no good.
+        """
+        if self._verifier is None:
+            try:
+                self._verifier = Verifier(self._ca)
+            except CredentialError as error:
+                raise RecordError("authority", error.message) from error
+        return self._verifier(certificate, signature, message)
+
+
+def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    from cryptography.exceptions import InvalidSignature
+
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (InvalidSignature, ValueError, TypeError):
+        return False
+    return True
+
+
+def _attribute(certificate: x509.Certificate, which: str) -> str:
+    from cryptography import x509
+
+    oid = {
+        "CN": x509.NameOID.COMMON_NAME,
+        "OU": x509.NameOID.ORGANIZATIONAL_UNIT_NAME,
+    }[which]
+    attributes = certificate.subject.get_attributes_for_oid(oid)
+    return str(attributes[0].value) if len(attributes) == 1 else ""
+
+
+def common_name(certificate: bytes) -> str:
+    """Return whom a certificate (DER) names; nothing is verified."""
+    from cryptography import x509
+
+    return _attribute(x509.load_der_x509_certificate(certificate), "CN")

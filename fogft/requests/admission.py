@@ -1,0 +1,145 @@
+"""What waits at a replica: by deadline within a robot, in fair shares between robots. Pure.
+
+Each robot has a queue of its own, the earliest deadline first. Whose turn it is goes by a
+count of what each robot was given (start-time fair queueing): the one that was given least is
+next, and one that comes back after a pause begins where the others are, so it can neither
+save up turns nor lose them. With one robot this is earliest deadline first.
+
+When there is no room, the robot that has most waiting gives way: its latest deadline goes.
+
+Laws: what is put in comes out once, or is removed; a robot with something waiting is served
+at least every n-th time, with n robots waiting; of two requests of one robot the earlier
+deadline goes first.
+
+Owns: the order. Not here: how many may wait or run at once (`concurrency`,
+`proxy.replica.responder`).
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(order=True)
+class _Entry(Generic[T]):
+    rank: float
+    order: int
+    id: bytes = field(compare=False)
+    robot: str = field(compare=False)
+    item: T | None = field(compare=False)
+
+
+class _Robot(Generic[T]):
+    """One robot's queue."""
+
+    def __init__(self, given: float) -> None:
+        self.heap: list[_Entry[T]] = []  # entries that were removed stay until they come up
+        self.waiting = 0
+        self.given = given
+
+    def first(self) -> _Entry[T]:
+        while self.heap[0].item is None:
+            heapq.heappop(self.heap)
+        return self.heap[0]
+
+
+class AdmissionQueue(Generic[T]):
+    """What waits for one service of a replica, by request id.
+
+    Args:
+        latest: The newest request of a robot goes first, and the oldest gives way: with one
+            time-out a service, the latest deadline is the newest request's.
+    """
+
+    def __init__(self, *, latest: bool = False) -> None:
+        self._sign = -1.0 if latest else 1.0
+        self._robots: dict[str, _Robot[T]] = {}  # those that have something waiting
+        self._entries: dict[bytes, _Entry[T]] = {}
+        self._order = count()
+        self._turn = 0.0  # what the robot served last had been given
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def put(self, id: bytes, robot: str, deadline: float, item: T) -> None:
+        """Let an item wait. Its id must not be waiting already."""
+        entry = _Entry(self._sign * deadline, next(self._order), id, robot, item)
+        queue = self._robots.get(robot)
+        if queue is None:
+            queue = self._robots[robot] = _Robot(self._turn)
+        heapq.heappush(queue.heap, entry)
+        queue.waiting += 1
+        self._entries[id] = entry
+
+    def take(self) -> T | None:
+        """Return what is next, and take it out; None when nothing waits."""
+        if not self._robots:
+            return None
+        queue = min(self._robots.values(), key=_standing)
+        entry = queue.first()
+        self._turn = queue.given
+        queue.given += 1.0
+        item = entry.item
+        self._discard(entry)
+        return item
+
+    def remove(self, id: bytes) -> T | None:
+        """Take an item out; None when it does not wait."""
+        entry = self._entries.get(id)
+        if entry is None:
+            return None
+        item = entry.item
+        self._discard(entry)
+        return item
+
+    def _discard(self, entry: _Entry[T]) -> None:
+        del self._entries[entry.id]
+        entry.item = None
+        queue = self._robots[entry.robot]
+        queue.waiting -= 1
+        if not queue.waiting:
+            del self._robots[entry.robot]
+        elif len(queue.heap) > 2 * queue.waiting + 16:
+            queue.heap = [kept for kept in queue.heap if kept.item is not None]
+            heapq.heapify(queue.heap)
+
+    def give_way(self, robot: str, deadline: float) -> T | None:
+        """Take out what must go for a newcomer to fit in; None if the newcomer itself must.
+
+        Args:
+            robot: Whose request came.
+            deadline: Its deadline.
+        """
+        most = max(self._robots.values(), key=lambda queue: queue.waiting, default=None)
+        own = self._robots.get(robot)
+        if most is None:
+            return None
+        if own is not None and own.waiting >= most.waiting:
+            most = own
+        elif most.waiting <= (own.waiting if own is not None else 0) + 1:
+            return None  # equal shares: nobody has too much
+        last = max(entry for entry in most.heap if entry.item is not None)
+        if most is own and last.rank <= self._sign * deadline:
+            return None
+        item = last.item
+        self._discard(last)
+        return item
+
+    def ahead(self, robot: str, deadline: float) -> int:
+        """Return about how many will be served before a request that comes now."""
+        own = self._robots.get(robot)
+        before, rank = 0, self._sign * deadline
+        if own is not None:
+            before = sum(1 for e in own.heap if e.item is not None and e.rank <= rank)
+        others = (queue.waiting for name, queue in self._robots.items() if name != robot)
+        return before + sum(min(waiting, before + 1) for waiting in others)
+
+
+def _standing(queue: _Robot[T]) -> tuple[float, _Entry[T]]:
+    """Who was given least is next; among equals the earliest deadline."""
+    return queue.given, queue.first()

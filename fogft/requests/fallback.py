@@ -1,0 +1,95 @@
+"""When the fallback service is asked, and for how long its answer is awaited. Pure.
+
+A fallback is a service on the robot itself, cheaper than the replicas'. It is asked for a
+request once: at the deadline, or after a delay beside the replicas, or at once while no
+replica is ready. An answer that is there first is returned, whoever gave it. At the deadline
+the replicas are out, and the fallback's answer is awaited for its own time.
+
+Law: a request is handed to the fallback at most once, and ends exactly once.
+
+Owns: which requests are due. Not here: calling (`proxy.robot.dispatcher`), the replicas' answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Generic, TypeVar
+
+from fogft.model.choices import FallbackSpec
+from fogft.requests.hedging import NEVER
+
+T = TypeVar("T")
+
+
+class Rescues(Generic[T]):
+    """The requests of one service that the fallback may have to answer."""
+
+    def __init__(self, spec: FallbackSpec) -> None:
+        self.spec = spec
+        self._arrived: dict[bytes, float] = {}  # not handed over yet, oldest first
+        self._handed: set[bytes] = set()
+        self._awaited: dict[bytes, tuple[float, T]] = {}  # past the deadline: until when
+
+    def __len__(self) -> int:
+        """Count the requests past their deadline whose fallback is awaited."""
+        return len(self._awaited)
+
+    def submitted(self, request: bytes, now: float) -> None:
+        """Note a new request."""
+        self._arrived[request] = now
+
+    def look_at(self, *, able: bool) -> float:
+        """Return when `due` has something to say next; `able` if a replica is ready."""
+        for arrived in self._arrived.values():  # the oldest
+            if not able and self.spec.while_none_ready:
+                return arrived
+            return NEVER if self.spec.after_s is None else arrived + self.spec.after_s
+        return NEVER
+
+    def due(self, now: float, *, able: bool) -> list[bytes]:
+        """Return the requests that the fallback is to be asked for now, and hand them over."""
+        found = list(self._due(now, able=able))
+        for request in found:
+            del self._arrived[request]
+            self._handed.add(request)
+        return found
+
+    def _due(self, now: float, *, able: bool) -> Iterator[bytes]:
+        at_once = not able and self.spec.while_none_ready
+        after_s = 0.0 if at_once else self.spec.after_s
+        if after_s is None:
+            return
+        for request, arrived in self._arrived.items():
+            if now < arrived + after_s:
+                return
+            yield request
+
+    def failed(self, request: bytes) -> None:
+        """The fallback could not be asked; at the deadline it is tried once more."""
+        self._handed.discard(request)
+
+    def ended(self, request: bytes) -> None:
+        """The request was answered by a replica."""
+        self._arrived.pop(request, None)
+        self._handed.discard(request)
+
+    def expired(self, request: bytes, item: T, now: float) -> bool:
+        """The deadline came: await the fallback from now on; whether it must be asked first."""
+        must_ask = request not in self._handed
+        self._arrived.pop(request, None)
+        self._handed.discard(request)
+        self._awaited[request] = (now + self.spec.limit_s, item)
+        return must_ask
+
+    def answered(self, request: bytes) -> T | None:
+        """The fallback has answered; return the item of a request past its deadline, once."""
+        self._handed.discard(request)
+        found = self._awaited.pop(request, None)
+        return None if found is None else found[1]
+
+    def given_up(self, now: float) -> list[tuple[bytes, T]]:
+        """Return the requests whose fallback took too long as well; they are over."""
+        over = [(r, item) for r, (until, item) in self._awaited.items() if until <= now]
+        for request, _ in over:
+            del self._awaited[request]
+        return over

@@ -1,0 +1,242 @@
+"""First success wins: decide what each answer means. Pure: time comes in, a verdict goes out.
+
+One `FirstResponse` holds the requests of one service that still await an answer. Every
+request has the replicas that work on it (its open attempts). The first success takes the
+request out of the table, so that whatever comes later is LATE by construction: a late
+answer can never reach another request, and no request is answered twice.
+
+An attempt ends as a success, a failure (refusal, crash, lost link) or a rejection: a real
+response that the service itself marks as not ok. A rejection is kept, and is returned
+only when nothing better can come.
+
+A replica that declined a request, failed it or came after it may be asked (again) even while
+others work on it, because those others may be frozen. Whether it is, is the policy's to say.
+
+Owns: which answer is returned, who may be asked, and when a request has nobody working on it.
+Not here: whom to ask (`hedging`), sending, locks and clocks (`fogft.proxy.robot.dispatcher`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+RETRY_FIRST_S = 0.02
+RETRY_LIMIT_S = 0.32
+_NO_WAIT = (0.0, 0.0)
+
+
+class Verdict(Enum):
+    """What to do after an attempt has ended."""
+
+    WON = "won"  # return this answer; the request is closed
+    WAIT = "wait"  # another attempt is still open
+    IDLE = "idle"  # nobody works on it any more: try again, or return the rejection
+    LATE = "late"  # already answered, expired or never known: drop it
+
+
+@dataclass
+class Pending(Generic[T]):
+    """A request that awaits its answer.
+
+    Attributes:
+        deadline: On the caller's clock, seconds.
+        item: What the caller keeps with it (payload, handle).
+        open: Replicas that work on it now, each with the moment when it was asked.
+        barred: Replicas that must not be asked again.
+        failures: How often an attempt at each replica has failed, those that count.
+        waits: Until when a replica that failed it is left alone, and that wait, in seconds.
+        rejection: The last response that was real but not ok.
+    """
+
+    deadline: float
+    item: T
+    open: dict[int, float] = field(default_factory=dict)
+    barred: set[int] = field(default_factory=set)
+    failures: dict[int, int] = field(default_factory=dict)
+    waits: dict[int, tuple[float, float]] = field(default_factory=dict)
+    rejection: bytes | None = None
+
+
+class FirstResponse(Generic[T]):
+    """The requests of one service that await an answer, oldest first.
+
+    Args:
+        attempts: How often one replica may fail one request before it is barred from it.
+    """
+
+    def __init__(self, *, attempts: int = 3) -> None:
+        self._attempts = attempts
+        self._pending: dict[bytes, Pending[T]] = {}
+        # Those that some replica may have to be asked for, as far as is known.
+        self._short: dict[bytes, None] = {}
+
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def __contains__(self, request: bytes) -> bool:
+        return request in self._pending
+
+    def get(self, request: bytes) -> Pending[T] | None:
+        """Return a request that still awaits its answer."""
+        return self._pending.get(request)
+
+    def register(
+        self,
+        request: bytes,
+        *,
+        deadline: float,
+        item: T,
+        replicas: Iterable[int] = (),
+        now: float = 0.0,
+        complete: bool = True,
+    ) -> Pending[T]:
+        """Enter a request, with the replicas that are about to be asked.
+
+        Args:
+            request: Its id.
+            deadline: On the caller's clock, seconds.
+            item: What the caller keeps with it.
+            replicas: Who is about to be asked.
+            now: On the caller's clock, seconds.
+            complete: Whether these are all that there are: until something happens to it, the
+                request need not be looked at again.
+
+        Raises:
+            ValueError: The id is in the table already.
+        """
+        if request in self._pending:
+            raise ValueError("request id is registered already")
+        pending = Pending(deadline, item, dict.fromkeys(replicas, now))
+        self._pending[request] = pending
+        if not complete or not pending.open:
+            self._short[request] = None
+        return pending
+
+    def attempt(self, request: bytes, replica: int, now: float = 0.0) -> Pending[T] | None:
+        """Enter one more attempt; None where it is not wanted (closed, open or barred)."""
+        pending = self._pending.get(request)
+        if pending is None or replica in pending.open or replica in pending.barred:
+            return None
+        pending.open[replica] = now
+        return pending
+
+    def declined(self, request: bytes, replica: int) -> Verdict:
+        """Note that a replica did not take an attempt. It may be asked again."""
+        pending = self._pending.get(request)
+        if pending is None or replica not in pending.open:
+            return Verdict.LATE
+        self._ended(request, pending, replica)
+        return Verdict.WAIT if pending.open else Verdict.IDLE
+
+    def _ended(self, request: bytes, pending: Pending[T], replica: int) -> None:
+        pending.open.pop(replica, None)
+        self._short[request] = None
+
+    def succeeded(self, request: bytes, now: float) -> tuple[Verdict, Pending[T] | None]:
+        """Note a success. WON exactly once a request, and never after its deadline."""
+        pending = self._pending.get(request)
+        if pending is None or now >= pending.deadline:
+            return Verdict.LATE, None
+        del self._pending[request]
+        self._short.pop(request, None)
+        return Verdict.WON, pending
+
+    def rejected(self, request: bytes, replica: int, response: bytes) -> Verdict:
+        """Note a real response that is not ok: kept, and returned if nothing better comes."""
+        pending = self._pending.get(request)
+        if pending is None or replica not in pending.open:
+            return Verdict.LATE
+        pending.rejection = response
+        self._ended(request, pending, replica)
+        pending.barred.add(replica)
+        return Verdict.WAIT if pending.open else Verdict.IDLE
+
+    def failed(
+        self, request: bytes, replica: int, now: float, *, counts: bool, bar: bool = False
+    ) -> Verdict:
+        """Note a failed attempt. The replica is left alone for a moment, longer each time.
+
+        Args:
+            request: The request.
+            replica: Whose attempt ended.
+            now: On the caller's clock, seconds.
+            counts: Whether it counts towards the limit of attempts. A lost link does
+                not: the replica may never have seen the request.
+            bar: Never ask this replica for this request again.
+        """
+        pending = self._pending.get(request)
+        if pending is None or replica not in pending.open:
+            return Verdict.LATE
+        self._ended(request, pending, replica)
+        failures = pending.failures.get(replica, 0) + (1 if counts else 0)
+        pending.failures[replica] = failures
+        _, waited_s = pending.waits.get(replica, (0.0, RETRY_FIRST_S / 2))
+        wait_s = min(waited_s * 2, RETRY_LIMIT_S)
+        pending.waits[replica] = (now + wait_s, wait_s)
+        if bar or failures >= self._attempts:
+            pending.barred.add(replica)
+        return Verdict.WAIT if pending.open else Verdict.IDLE
+
+    def close(self, request: bytes) -> Pending[T] | None:
+        """Take a request out, whatever its state."""
+        self._short.pop(request, None)
+        return self._pending.pop(request, None)
+
+    def expire(self, now: float) -> list[tuple[bytes, Pending[T]]]:
+        """Take out every request whose deadline has come, oldest first."""
+        expired = [entry for entry in self._pending.items() if entry[1].deadline <= now]
+        for request, _ in expired:
+            self.close(request)
+        return expired
+
+    def idle(self) -> Iterator[tuple[bytes, Pending[T]]]:
+        """Go over the requests that nobody works on, in the order in which that began."""
+        return (
+            (request, self._pending[request])
+            for request in list(self._short)
+            if not self._pending[request].open
+        )
+
+    def short(self) -> list[tuple[bytes, Pending[T]]]:
+        """List requests for which a further replica may have to be asked."""
+        return [(request, self._pending[request]) for request in self._short]
+
+    def candidates(self, pending: Pending[T], able: Sequence[int], now: float) -> list[int]:
+        """Return who may be asked for a request now: not at work on it, barred, or waiting."""
+        return [
+            replica
+            for replica in able
+            if replica not in pending.open
+            and replica not in pending.barred
+            and pending.waits.get(replica, _NO_WAIT)[0] <= now
+        ]
+
+    def came(self, replica: int) -> None:
+        """A replica came (back): it may be asked at once for all that it does not work on.
+
+        Whoever works on those may be frozen, and a link that was reopened is to get again
+        what was in flight on it.
+        """
+        for request, pending in self._pending.items():
+            pending.waits.pop(replica, None)
+            if replica not in pending.open and replica not in pending.barred:
+                self._short[request] = None
+
+    def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
+        """A replica has begun anew what some requests are about: what it said before is void."""
+        for request, pending in self._pending.items():
+            if about(pending.item):
+                pending.barred.discard(replica)
+                pending.failures.pop(replica, None)
+                pending.waits.pop(replica, None)
+                if replica not in pending.open:
+                    self._short[request] = None
+
+    def reconsider(self) -> None:
+        """Put every request before the policy again: there is another one."""
+        self._short = dict.fromkeys(self._pending)

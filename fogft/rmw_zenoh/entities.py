@@ -1,0 +1,306 @@
+"""A service and a client among nodes of `rmw_zenoh`: bytes in, bytes out, no type loaded.
+
+Each has one thread that does what may block in Zenoh: asking, answering, declaring. Callbacks
+come from Zenoh's threads.
+
+Owns: queries under way, on either side. Not here: the session and the graph (`rmw_node`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+import zenoh
+from zenoh import handlers
+
+from fogft.errors import RosError, Unreadable
+from fogft.link.zenoh import threads
+from fogft.log_limits import worth_logging
+from fogft.rmw_zenoh import naming
+
+log = logging.getLogger(__name__)
+
+# `rmw_zenoh` waits for ever; nobody who asks here waits longer than a request may take.
+_TIMEOUT_S = 1e6
+_CLOSE_LIMIT_S = 10.0
+
+
+class Worker:
+    """A thread that does what it is given, in order."""
+
+    def __init__(self, name: str) -> None:
+        self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def do(self, work: Callable[[], None]) -> None:
+        """Have it done soon."""
+        self._queue.put(work)
+
+    def _run(self) -> None:
+        while (work := self._queue.get()) is not None:
+            try:
+                work()
+            except zenoh.ZError as error:  # the session is closed, or who asked is gone
+                log.debug("zenoh_refused reason=%r", str(error))
+            except Exception:
+                log.exception("the work of %s goes on without this", self._thread.name)
+            finally:
+                work = None  # an idle thread must not keep a query open
+
+    def close(self) -> None:
+        """End it after what is waiting; does not wait for itself."""
+        self._queue.put(None)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_CLOSE_LIMIT_S)
+
+
+class _Handle(NamedTuple):
+    query: Any
+    attachment: bytes
+
+
+class Server:
+    """A service that is offered (`fogft.ros.port.RosServer`).
+
+    It is offered under each hash that clients may have of its type: in `rmw_zenoh` the hash is
+    part of the key.
+
+    Args:
+        session: The Zenoh session.
+        token: How it is told, without a hash.
+        on_request: Gets the serialised request and a handle.
+    """
+
+    def __init__(
+        self, session: Any, token: Callable[[str], naming.Token], hash: str,
+        on_request: Callable[[bytes, Any], None],
+    ) -> None:  # fmt: skip
+        self._session = session
+        self._token = token
+        self._on_request = on_request
+        self._open = True
+        self._faces: dict[str, tuple[Any, Any]] = {}
+        self.name, self.type = token("").service, token("").type
+        self._worker = Worker(f"rmw{self.name}")
+        self._declare(hash)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is offered."""
+        return self._open
+
+    def clients_hash(self, hash: str) -> None:
+        """Offer it to a client whose type has this hash, too."""
+        self._worker.do(partial(self._declare, hash))
+
+    def _declare(self, hash: str) -> None:
+        if not self._open or hash in self._faces:
+            return
+        if not all(naming.may_be_same(hash, known) for known in self._faces):
+            log.error(
+                "type_differs service=%s type=%s here=%s client=%s",
+                self.name, self.type, next(iter(self._faces)), hash,
+            )  # fmt: skip
+            return
+        if self._faces:
+            log.warning("type_not_compared service=%s type=%s client=%s", self.name, self.type,
+                        hash)  # fmt: skip
+        token = self._token(hash)
+        key = naming.service_key(token.domain, token.service, token.type, hash)
+        heard = handlers.Callback(self._heard, indirect=False)
+        # `complete`: clients ask those that can answer for the whole key, and no others.
+        queryable = self._session.declare_queryable(key, heard, complete=True)
+        self._faces[hash] = (queryable, self._session.liveliness().declare_token(str(token)))
+
+    def _heard(self, query: Any) -> None:
+        if not self._open or query.payload is None or query.attachment is None:
+            return  # dropped: who asks is told that no answer comes
+        try:
+            handle = _Handle(query, query.attachment.to_bytes())
+            self._on_request(query.payload.to_bytes(), handle)
+        except Exception:
+            log.exception("%s: a request was lost", self.name)
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        """Send the serialised response. Nothing happens once the service is withdrawn.
+
+        Raises:
+            Unreadable: The bytes are no message.
+        """
+        _check(payload)
+        if self._open:
+            self._worker.do(partial(self._send, handle, payload))
+
+    def _send(self, handle: _Handle, payload: bytes) -> None:
+        query, attachment = handle
+        try:
+            query.reply(
+                query.key_expr,
+                payload,
+                encoding=query.encoding or zenoh.Encoding.APPLICATION_CDR,
+                attachment=naming.response_attachment(attachment, time.time_ns()),
+            )
+        finally:
+            query.drop()
+
+    def close(self) -> None:
+        """Withdraw the service. Repeatable."""
+        if self._open:
+            self._open = False
+            self._worker.do(self._undeclare)
+            self._worker.close()
+
+    def _undeclare(self) -> None:
+        for queryable, token in self._faces.values():
+            token.undeclare()
+            queryable.undeclare()
+        self._faces.clear()
+
+
+class _Waiting(NamedTuple):
+    on_response: Callable[[bytes], None]
+    cancellation: Any
+
+
+class Client:
+    """A client of a service (`fogft.ros.port.RosClient`).
+
+    Args:
+        session: The Zenoh session.
+        token: How it is told, without a hash.
+        servers: Returns the type hash of each server that is there now.
+    """
+
+    def __init__(
+        self, session: Any, token: Callable[[str], naming.Token],
+        servers: Callable[[], list[str]],
+    ) -> None:  # fmt: skip
+        self._session = session
+        self._token = token
+        self._hashes = servers
+        self._name = token("").service
+        self._told: tuple[naming.Token, Any] | None = None
+        self._waiting: dict[int, _Waiting] = {}
+        self._asked = 0
+        self._errors = 0
+        self._open = True
+        self._lock = threading.Lock()
+        self._worker = Worker(f"rmw{self._name}")
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it may still be called with."""
+        return self._open
+
+    def available(self) -> bool:
+        """Whether anybody offers this service."""
+        return self.servers() > 0
+
+    def servers(self) -> int:
+        """Count those who offer it."""
+        return len(self._hashes()) if self._open else 0
+
+    def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
+        """Send a serialised request; return its ticket.
+
+        Raises:
+            Unreadable: The bytes are no message.
+            RosError: The client is closed, or nobody offers the service.
+        """
+        _check(payload)
+        hashes = self._hashes()
+        with self._lock:
+            if not self._open:
+                raise RosError(f"the client of `{self._name}` is closed")
+            if not hashes:
+                raise RosError(f"nobody offers `{self._name}`")
+            self._asked += 1
+            ticket = self._asked
+            self._waiting[ticket] = _Waiting(on_response, zenoh.CancellationToken())
+        self._worker.do(partial(self._ask, ticket, hashes[0], payload))
+        return ticket
+
+    def _ask(self, ticket: int, hash: str, payload: bytes) -> None:
+        waiting = self._waiting.get(ticket)
+        if waiting is None:
+            return  # forgotten meanwhile
+        token = self._tell(hash)
+        self._session.get(
+            naming.service_key(token.domain, token.service, token.type, hash),
+            handlers.Callback(partial(self._replied, ticket), partial(self._ended, ticket),
+                              indirect=False),
+            payload=payload,
+            attachment=naming.request_attachment(ticket, time.time_ns(), token.gid),
+            encoding=zenoh.Encoding.APPLICATION_CDR,
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            # NONE: under the default Zenoh keeps the first reply back until the last one.
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=_TIMEOUT_S,
+            cancellation_token=waiting.cancellation,
+        )  # fmt: skip
+
+    def _tell(self, hash: str) -> naming.Token:
+        """Be seen in the graph, with the type as the server has it."""
+        if self._told is not None and self._told[0].hash == hash:
+            return self._told[0]
+        token = self._token(hash)
+        if self._told is not None:
+            self._told[1].undeclare()
+        self._told = (token, self._session.liveliness().declare_token(str(token)))
+        return token
+
+    def _replied(self, ticket: int, reply: Any) -> None:
+        threads.note()
+        if reply.ok is None:
+            self._errors += 1
+            if worth_logging(self._errors):
+                log.warning("%s: an error came for a response (%d so far)", self._name,
+                            self._errors)  # fmt: skip
+            return
+        with self._lock:
+            waiting = self._waiting.pop(ticket, None)
+        if waiting is None:
+            return
+        try:
+            waiting.on_response(reply.ok.payload.to_bytes())
+        except Exception:
+            log.exception("%s: a response was lost", self._name)
+
+    def _ended(self, ticket: int) -> None:
+        self._waiting.pop(ticket, None)
+
+    def forget(self, ticket: int) -> None:
+        """Drop what is kept for a request; unknown tickets are fine."""
+        with self._lock:
+            waiting = self._waiting.pop(ticket, None)
+        if waiting is not None:
+            self._worker.do(waiting.cancellation.cancel)
+
+    def close(self) -> None:
+        """Withdraw the client. Repeatable."""
+        with self._lock:
+            if not self._open:
+                return
+            self._open = False
+            left, self._waiting = self._waiting, {}
+        for waiting in left.values():
+            self._worker.do(waiting.cancellation.cancel)
+        self._worker.do(self._undeclare)
+        self._worker.close()
+
+    def _undeclare(self) -> None:
+        if self._told is not None:
+            self._told[1].undeclare()
+            self._told = None
+
+
+def _check(payload: bytes) -> None:
+    if not naming.is_message(payload):
+        raise Unreadable(f"{len(payload)} bytes are not a serialised message")

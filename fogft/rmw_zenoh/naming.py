@@ -1,0 +1,163 @@
+"""How `rmw_zenoh` names services on the wire, and what it attaches to requests. Pure.
+
+A service is a queryable at ``domain/name/type/hash``. Who offers and who calls is told by
+liveliness tokens ``@ros2_lv/domain/session/node/entity/kind/enclave/namespace/node name``, and
+for all but nodes ``/name/type/hash/QoS``, with ``%`` for each slash within a part. With a
+request and its response go the client's sequence number, the time of sending and the client's
+identifier (GID), by which the client knows its own response.
+
+Owns: keys, tokens, attachments. Not here: sessions (`fogft.rmw_zenoh.node`).
+
+Source: the design document and `attachment_helpers.cpp` of ros2/rmw_zenoh.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+
+ROOT = "@ros2_lv"
+NODE, SERVER, CLIENT = "NN", "SS", "SC"
+KEEP_ALL = "::2,:,:,:,,"  # reliable and volatile are its defaults, and left out
+NO_HASH = "TypeHashNotSupported"  # what a distribution without type hashes (Humble) writes
+
+_NODE_PARTS, _SERVICE_PARTS = 9, 13
+_GID_BYTES = 16
+_STAMP = slice(8, 16)  # of the attachment: between sequence number and GID
+_ATTACHMENT_BYTES = (32, 33)  # without, and with, a byte that says how long the GID is
+_HEADER_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Token:
+    """A liveliness token of a node, or of a service's server or client.
+
+    Attributes:
+        domain: The ROS domain.
+        session: Identifier of the Zenoh session.
+        node_id: Number of the node in its session.
+        id: Number of the entity in its session.
+        kind: `NODE`, `SERVER` or `CLIENT`.
+        node: The node's name.
+        namespace: The node's namespace, with its slash.
+        service: The service's name, with its slash; empty for a node.
+        type: ``package/srv/Name``; empty for a node.
+        hash: The type's hash; empty for a node.
+        quality: Quality of service, as `rmw_zenoh` writes it.
+    """
+
+    domain: int
+    session: str
+    node_id: str
+    id: str
+    kind: str
+    node: str
+    namespace: str = "/"
+    service: str = ""
+    type: str = ""
+    hash: str = ""
+    quality: str = KEEP_ALL
+
+    def __str__(self) -> str:
+        parts = [ROOT, str(self.domain), self.session, self.node_id, self.id, self.kind]
+        parts += ["%", _flat(self.namespace), self.node]
+        if self.kind != NODE:
+            parts += [_flat(self.service), dds_type(self.type), self.hash, self.quality]
+        return "/".join(parts)
+
+    @property
+    def gid(self) -> bytes:
+        """16 bytes that no other entity has. `rmw_zenoh` hashes otherwise, and never compares."""
+        return hashlib.md5(str(self).encode(), usedforsecurity=False).digest()
+
+
+def read_token(key: str) -> Token | None:
+    """Return what a token's key says; None where it is none of a node or a service."""
+    parts = key.split("/")
+    if len(parts) < _NODE_PARTS or parts[0] != ROOT or not parts[1].isdigit():
+        return None
+    domain, session, node_id, id, kind = int(parts[1]), *parts[2:6]
+    namespace, node = _deep(parts[7]), parts[8]
+    if kind == NODE:
+        return Token(domain, session, node_id, id, kind, node, namespace)
+    if kind not in (SERVER, CLIENT) or len(parts) != _SERVICE_PARTS:
+        return None
+    type_name = ros_type(parts[10])
+    if not type_name:
+        return None
+    service = _deep(parts[9])
+    return Token(
+        domain, session, node_id, id, kind, node, namespace, service, type_name, *parts[11:]
+    )
+
+
+def tokens_of(domain: int) -> str:
+    """Return the key expression of all tokens in a domain."""
+    return f"{ROOT}/{domain}/**"
+
+
+def service_key(domain: int, name: str, type_name: str, hash: str) -> str:
+    """Return the key of a service.
+
+    Args:
+        domain: The ROS domain.
+        name: Its absolute name.
+        type_name: ``package/srv/Name``.
+        hash: The type's hash.
+    """
+    return f"{domain}/{name.strip('/')}/{dds_type(type_name)}/{hash}"
+
+
+def dds_type(type_name: str) -> str:
+    """Return ``package::srv::dds_::Name_`` for ``package/srv/Name``."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def ros_type(dds_name: str) -> str:
+    """Return ``package/srv/Name`` for ``package::srv::dds_::Name_``; empty where it is none."""
+    parts = dds_name.split("::")
+    if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
+        return ""
+    return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
+
+
+def request_attachment(sequence: int, sent_ns: int, gid: bytes) -> bytes:
+    """Return what goes with a request.
+
+    Args:
+        sequence: The client's own count.
+        sent_ns: Nanoseconds since 1970.
+        gid: The client's identifier.
+    """
+    return struct.pack("<qqB", sequence, sent_ns, _GID_BYTES) + gid
+
+
+def response_attachment(of_request: bytes, sent_ns: int) -> bytes:
+    """Return what goes with a response: the request's own number and GID, sent at another time.
+
+    A form that is not known goes back as it came, so that the client finds its number in it.
+    """
+    if len(of_request) not in _ATTACHMENT_BYTES:
+        return of_request
+    stamp = struct.pack("<q", sent_ns)
+    return of_request[: _STAMP.start] + stamp + of_request[_STAMP.stop :]
+
+
+def is_message(payload: bytes) -> bool:
+    """Whether these bytes may be a serialised message: all that can be said with no type."""
+    return len(payload) >= _HEADER_BYTES and payload[0] == 0
+
+
+def may_be_same(one: str, other: str) -> bool:
+    """Whether two hashes may be of one definition: equal, or not comparable."""
+    return one == other or one.partition("_")[0] != other.partition("_")[0]
+
+
+def _flat(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def _deep(part: str) -> str:
+    return part.replace("%", "/")

@@ -1,0 +1,176 @@
+"""A node among those of `rmw_zenoh`, with no ROS installed: `fogft.ros.port.RosNode` over Zenoh.
+
+Services pass through as bytes. What a type is nobody here knows; that two ends have the same
+one is told by its hash, which is part of every key: a server's stands in its token, a client's
+in its own.
+
+Owns: the session, the graph, what is offered and called. Not here: requests (`rmw_entities`),
+settings (`rmw_session`), names (`rmw_zenoh.naming`).
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import logging
+import os
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
+from zenoh import handlers
+
+from fogft.errors import RosError
+from fogft.rmw_zenoh import naming, session
+from fogft.rmw_zenoh.entities import Client, Server
+from fogft.rmw_zenoh.graph import Graph
+from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Token
+
+log = logging.getLogger(__name__)
+
+_DOMAIN = "ROS_DOMAIN_ID"
+
+
+class RmwZenohNode:
+    """Serialised services and clients among the `rmw_zenoh` nodes of one ROS domain.
+
+    Args:
+        name: The node's name: letters, digits and underscores.
+        domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
+        hash_of: Returns the hash of a service type, as known from elsewhere; empty where it is
+            not. A client's own goes before it.
+        noticed: Called, from Zenoh's thread, when a client has come. Must not block.
+        environ: Where the variables of ROS and Zenoh are.
+
+    Raises:
+        RosError: Zenoh cannot be configured or opened as the variables say.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        domain_id: int | None = None,
+        *,
+        hash_of: Callable[[str], str] = lambda _: "",
+        noticed: Callable[[], None] = lambda: None,
+        environ: Mapping[str, str] = os.environ,
+    ) -> None:
+        self._name = name
+        self._hash_of = hash_of
+        self._noticed = noticed
+        self._domain = _domain(environ) if domain_id is None else domain_id
+        self._numbers = itertools.count(1)
+        self._made: list[Server | Client] = []
+        self._lock = threading.Lock()
+        self._open = True
+        config = session.settings_from(environ)
+        try:
+            self._session: Any = zenoh.open(config)
+            self._start()
+        except zenoh.ZError as error:
+            raise RosError(f"no Zenoh session among `rmw_zenoh`'s nodes: {error}") from error
+
+    def _start(self) -> None:
+        self._id = str(self._session.zid())
+        self.graph = Graph(self._id)
+        live = self._session.liveliness()
+        node = Token(self._domain, self._id, "0", "0", NODE, self._name)
+        self._declared = live.declare_token(str(node))
+        seen = handlers.Callback(self._seen, indirect=False)
+        self._subscriber = live.declare_subscriber(
+            naming.tokens_of(self._domain), seen, history=True
+        )
+
+    def _seen(self, sample: Any) -> None:
+        key = str(sample.key_expr)
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self.graph.drop(key)
+            return
+        token = self.graph.put(key)
+        if token is None or token.kind != CLIENT:
+            return
+        for made in list(self._made):
+            if isinstance(made, Server) and (made.name, made.type) == (token.service, token.type):
+                made.clients_hash(token.hash)
+        self._noticed()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it is open."""
+        return self._open and not self._session.is_closed()
+
+    def serve(
+        self,
+        name: str,
+        type_name: str,
+        on_request: Callable[[bytes, Any], None],
+        on_burst: Callable[[bool], None] | None = None,
+    ) -> Server:
+        """Offer a service. A first request may come before this returns.
+
+        Raises:
+            RosError: The type's hash is not known yet, or the node is closed.
+        """
+        clients = self.graph.hashes(CLIENT, name, type_name)
+        known = self._hash_of(type_name) or next(iter(clients), "")
+        if not known:
+            raise RosError(
+                f"the type hash of `{type_name}` is not known here yet",
+                "a replica that is ready tells it, and so does a client on the robot",
+            )
+        server: Server = self._add(
+            lambda: Server(self._session, self._tokens(SERVER, name, type_name), known, on_request)
+        )
+        for hash in self.graph.hashes(CLIENT, name, type_name):
+            server.clients_hash(hash)
+        return server
+
+    def client(self, name: str, type_name: str) -> Client:
+        """Make a client of a service.
+
+        Raises:
+            RosError: The node is closed.
+        """
+        servers = functools.partial(self.graph.hashes, SERVER, name, type_name)
+        made: Client = self._add(
+            lambda: Client(self._session, self._tokens(CLIENT, name, type_name), servers)
+        )
+        return made
+
+    def _tokens(self, kind: str, name: str, type_name: str) -> Callable[[str], Token]:
+        id = str(next(self._numbers))
+        fields = (self._domain, self._id, "0", id, kind, self._name, "/", name, type_name)
+        return lambda hash: Token(*fields, hash)
+
+    def _add(self, make: Callable[[], Server | Client]) -> Any:
+        with self._lock:
+            if not self._open:
+                raise RosError("the ROS node is closed")
+            try:
+                made = make()
+            except zenoh.ZError as error:
+                raise RosError(f"Zenoh refuses a service or client: {error}") from error
+            self._made = [*(m for m in self._made if m.is_open), made]
+            return made
+
+    def offered(self) -> dict[str, str]:
+        """Return name -> type of the services that applications offer in this domain."""
+        return self.graph.offered()
+
+    def close(self) -> None:
+        """Close all that was made here, and the session. Repeatable."""
+        with self._lock:
+            if not self._open:
+                return
+            self._open = False
+        for made in self._made:
+            made.close()
+        self._session.close()
+
+
+def _domain(environ: Mapping[str, str]) -> int:
+    text = environ.get(_DOMAIN) or "0"
+    if not text.isdigit():
+        raise RosError(f"`{_DOMAIN}={text}` is not a ROS domain", "set it to a number, such as 7")
+    return int(text)

@@ -1,0 +1,91 @@
+"""The bytes of topics on the wire: a message to a replica, a pull, and what answers it. Pure.
+
+They travel as the payloads of requests and answers, so all that holds for those holds for them.
+Whatever bytes come in, a decoder returns a value or raises `FrameError`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+from fogft.link.frame import FrameError
+
+SESSION_BYTES = 8
+BATCH_LIMIT = 1000
+_NUMBER_LIMIT = 1 << 63
+_MESSAGE = struct.Struct(f">{SESSION_BYTES}sQ")
+_PULL = struct.Struct(f">{SESSION_BYTES}sQ")
+_BATCH = struct.Struct(f">{SESSION_BYTES}sQI")
+_ENTRY = struct.Struct(">QI")
+NO_SESSION = bytes(SESSION_BYTES)
+
+Batch = tuple[bytes, int, list[tuple[int, bytes]]]
+
+
+def encode_message(session: bytes, number: int, message: bytes) -> bytes:
+    """Return a message of the robot's: who publishes (random at its start), its number, CDR."""
+    return _MESSAGE.pack(session, number) + message
+
+
+def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
+    """Read a message of the robot's. Raises FrameError."""
+    if len(frame) < _MESSAGE.size:
+        raise FrameError(f"a message of {len(frame)} bytes")
+    session, number = _MESSAGE.unpack_from(frame)
+    _check(number)
+    return session, number, frame[_MESSAGE.size :]
+
+
+def encode_pull(session: bytes, after: int) -> bytes:
+    """Ask for what a replica's session published after a number.
+
+    `NO_SESSION` asks where to begin.
+    """
+    return _PULL.pack(session, after)
+
+
+def decode_pull(frame: bytes) -> tuple[bytes, int]:
+    """Read a pull. Raises FrameError."""
+    if len(frame) != _PULL.size:
+        raise FrameError(f"a pull of {len(frame)} bytes")
+    session, after = _PULL.unpack(frame)
+    _check(after)
+    return session, after
+
+
+def encode_batch(session: bytes, after: int, messages: Sequence[tuple[int, bytes]]) -> bytes:
+    """Answer a pull: the replica's session, the number to go on from, messages with theirs."""
+    parts = [_BATCH.pack(session, after, len(messages))]
+    for number, message in messages:
+        parts += [_ENTRY.pack(number, len(message)), message]
+    return b"".join(parts)
+
+
+def decode_batch(frame: bytes) -> Batch:
+    """Read what answers a pull. Raises FrameError."""
+    if len(frame) < _BATCH.size:
+        raise FrameError(f"a batch of {len(frame)} bytes")
+    session, after, count = _BATCH.unpack_from(frame)
+    _check(after)
+    if count > BATCH_LIMIT:
+        raise FrameError(f"a batch of {count} messages")
+    at, messages = _BATCH.size, []
+    for _ in range(count):
+        if at + _ENTRY.size > len(frame):
+            raise FrameError("a batch that is cut short")
+        number, size = _ENTRY.unpack_from(frame, at)
+        _check(number)
+        at += _ENTRY.size
+        if at + size > len(frame):
+            raise FrameError("a batch that is cut short")
+        messages.append((number, frame[at : at + size]))
+        at += size
+    if at != len(frame):
+        raise FrameError("a batch with more behind it")
+    return session, after, messages
+
+
+def _check(number: int) -> None:
+    if number >= _NUMBER_LIMIT:
+        raise FrameError(f"the number {number}")

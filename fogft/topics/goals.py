@@ -1,0 +1,279 @@
+"""An action's goals: each made by its client, and worked on by every replica. Pure.
+
+Everything about a goal is known by the id that its client gave it, the first 16 bytes of a
+request (CDR, after its header).
+
+Owns: what the parts' bytes mean, which goals are under way and who has them, one status out of
+several. Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.goal_status`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from fogft.model.spec import Part
+
+_ID = slice(4, 20)
+_SUCCEEDED = 4
+_UNKNOWN = 0
+_CDR_HEADER = b"\x00\x01\x00\x00"
+_NO_TIME = bytes(8)
+_GOALS_KEPT = 4096
+_BYTES_KEPT = 64 << 20
+_AGAIN_AFTER_S = 0.25  # and twice as long each time
+_AGAIN_LIMIT_S = 8.0
+# Which of two statuses says more: done well, then the furthest of those under way, then an end.
+_RANK = {4: 9, 3: 8, 2: 7, 1: 6, 5: 5, 6: 4, 0: 0}
+
+
+def goal_of(request: bytes) -> bytes:
+    """Return the goal's id of a request of any part."""
+    return request[_ID]
+
+
+def is_success(part: Part, response: bytes) -> bool:
+    """Whether a response ends its request: accepted, succeeded, or something is cancelled."""
+    if part is Part.RESULT:
+        return response[4:5] == bytes([_SUCCEEDED])
+    if part is Part.CANCEL:  # a return code, padding, and a list of goals
+        return response[4:5] == b"\0" and any(response[8:12])
+    return response[4:5] == b"\1"
+
+
+def is_unknown(response: bytes) -> bool:
+    """Whether a result says that its replica does not know the goal."""
+    return response[4:5] == bytes([_UNKNOWN])
+
+
+def cancelled(response: bytes) -> list[bytes]:
+    """Return the goals that a response to a cancellation names; a torn one names fewer."""
+    order = "little" if response[1:2] == b"\1" else "big"
+    count = int.from_bytes(response[8:12], order)  # type: ignore[arg-type]
+    found = [response[at : at + 16] for at in range(12, len(response), 24)]
+    return [goal for goal in found[:count] if len(goal) == 16]
+
+
+def cancel_request(goal: bytes) -> bytes:
+    """Return a request (CDR) that cancels one goal."""
+    return _CDR_HEADER + goal + _NO_TIME
+
+
+class Had(Enum):
+    """What a replica had said of a goal."""
+
+    NOTHING_SAID = "nothing said"
+    TAKEN = "taken"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class Took:
+    """That a replica took a goal.
+
+    Attributes:
+        goal: Which; None where it did not, had it before, or that is not known any more.
+        in_vain: The goal is over, or cancelled.
+    """
+
+    goal: bytes | None
+    in_vain: bool
+
+
+@dataclass(frozen=True)
+class _Word:
+    """What a replica has said of a goal that it was given. Times on the caller's clock, seconds.
+
+    Attributes:
+        until: When to give it the goal again, if it says nothing more.
+        since: From when on it is to be believed that it does not know the goal: it has taken or
+            refused it by then.
+        again_s: For how long it was left alone when it did not look at it.
+    """
+
+    until: float
+    since: float = math.inf
+    again_s: float = 0.0
+
+
+@dataclass
+class _Goal:
+    id: bytes  # of its client's request
+    request: bytes
+    accepted: bool = False
+    cancelled: bool = False
+    takers: set[int] = field(default_factory=set)  # replicas that ever took it
+    words: dict[int, _Word] = field(default_factory=dict)  # by replica
+    ids: set[bytes] = field(default_factory=set)  # of all requests that gave it to somebody
+
+
+class Goals:
+    """The goals of one action, from when they are made until they have their result.
+
+    A replica may be given a goal several times: because it came later, did not take it, or may
+    have lost it. Beyond 4 096 goals or 64 MiB of requests the oldest are forgotten, at first those
+    that nobody awaits.
+    """
+
+    def __init__(self) -> None:
+        self._goals: OrderedDict[bytes, _Goal] = OrderedDict()
+        self._of_id: dict[bytes, bytes] = {}  # request id -> goal
+        self._awaited: dict[bytes, _Goal] = {}
+        self._over: OrderedDict[bytes, bytes] = OrderedDict()  # the same, of goals that ended
+        self._bytes = 0
+
+    # -- giving ---------------------------------------------------------------------------
+
+    def made(self, request: bytes, id: bytes, replicas: Iterable[int], until: float) -> None:
+        """A client makes a goal: its request goes to these replicas, under one id."""
+        goal = goal_of(request)
+        if goal not in self._goals:
+            self._goals[goal] = _Goal(id, request)
+            self._bytes += len(request)
+        self._goals.move_to_end(goal)
+        self._note(goal, id)
+        for replica in replicas:
+            self.gave(goal, id, replica, until)
+        while len(self._goals) > 1 and (
+            len(self._goals) > _GOALS_KEPT or self._bytes > _BYTES_KEPT
+        ):
+            oldest = next(iter(self._goals))
+            unwanted = (one for one in self._goals if one != goal and one not in self._awaited)
+            self._drop(next(unwanted, oldest))
+
+    def gave(self, goal: bytes, id: bytes, replica: int, until: float) -> None:
+        """A replica is given a goal by a request; it is given it again if it is silent `until`."""
+        known = self._goals.get(goal)
+        if known is not None:
+            word = known.words.get(replica)
+            known.words[replica] = _Word(until, again_s=0.0 if word is None else word.again_s)
+            self._note(goal, id)
+
+    def _note(self, goal: bytes, id: bytes) -> None:
+        self._goals[goal].ids.add(id)
+        self._of_id[id] = goal
+
+    def took(self, id: bytes, replica: int, now: float, *, accepts: bool) -> Took:
+        """A replica has answered whether it takes a goal. Unknown ids are fine."""
+        known = self._given_by(id)
+        if known is None:
+            goal = self._over.get(id) if accepts else None
+            return Took(goal, in_vain=True)
+        if accepts:
+            known.accepted = True
+            known.takers.add(replica)
+        word = known.words.get(replica)
+        if word is not None and math.isfinite(word.since):  # it has taken it before
+            return Took(None, in_vain=False)
+        known.words[replica] = _Word(math.inf, now if accepts else -math.inf)
+        return Took(goal_of(known.request) if accepts else None, in_vain=known.cancelled)
+
+    def failed(self, id: bytes, replica: int, now: float) -> None:
+        """A replica was not reached, or did not look at a goal: it is given it again soon."""
+        known = self._given_by(id)
+        if known is None:
+            return
+        word = known.words.get(replica)
+        if word is None or word.since == math.inf:
+            waited_s = 0.0 if word is None else word.again_s
+            again_s = min(2 * waited_s or _AGAIN_AFTER_S, _AGAIN_LIMIT_S)
+            known.words[replica] = _Word(now + again_s, again_s=again_s)
+        if id != known.id:
+            known.ids.discard(id)
+            del self._of_id[id]
+
+    def _given_by(self, id: bytes) -> _Goal | None:
+        return self._goals.get(self._of_id.get(id, b""))
+
+    def lost(self, goal: bytes, replica: int) -> None:
+        """A replica may have lost a goal: it is to be given it again."""
+        known = self._goals.get(goal)
+        if known is not None:
+            known.words.pop(replica, None)
+
+    def left(self, replica: int) -> None:
+        """A replica is gone; whoever comes in its place may know nothing."""
+        for known in self._goals.values():
+            known.words.pop(replica, None)
+
+    def lacking(self, replica: int, now: float) -> list[bytes]:
+        """Return the requests of the awaited goals that a replica is to be given, oldest first."""
+        return [
+            known.request
+            for known in self._awaited.values()
+            if replica not in known.words or known.words[replica].until <= now
+        ]
+
+    # -- results --------------------------------------------------------------------------
+
+    def awaited(self, goal: bytes) -> None:
+        """Its client awaits the result of a goal that is under way."""
+        if goal in self and not self._goals[goal].cancelled:
+            self._awaited[goal] = self._goals[goal]
+
+    def cancelled(self, goal: bytes) -> None:
+        """A replica cancels a goal: it is begun nowhere any more. Unknown goals are fine."""
+        known = self._goals.get(goal)
+        if known is not None:
+            known.cancelled = True
+            self._awaited.pop(goal, None)
+
+    def ended(self, goal: bytes) -> None:
+        """A goal has its result, or its client has given up. Unknown goals are fine."""
+        known = self._drop(goal)
+        if known is not None and any(word.since == math.inf for word in known.words.values()):
+            self._over.update(dict.fromkeys(known.ids, goal))
+            while len(self._over) > _GOALS_KEPT:
+                self._over.popitem(last=False)
+
+    def _drop(self, goal: bytes) -> _Goal | None:
+        """Forget a goal, which may well go on."""
+        self._awaited.pop(goal, None)
+        known = self._goals.pop(goal, None)
+        if known is not None:
+            self._bytes -= len(known.request)
+            for id in known.ids:
+                del self._of_id[id]
+        return known
+
+    def takers(self, goal: bytes) -> frozenset[int]:
+        """Return the replicas that have taken a goal, also those that are gone."""
+        known = self._goals.get(goal)
+        return frozenset() if known is None else frozenset(known.takers)
+
+    def unwanted(self) -> list[bytes]:
+        """Return the goals under way that were cancelled."""
+        return [goal for goal, known in self._goals.items() if known.accepted and known.cancelled]
+
+    def clear(self) -> None:
+        """All goals are over."""
+        for goal in list(self._goals):
+            self.ended(goal)
+
+    def __contains__(self, goal: bytes) -> bool:
+        """Whether a goal is under way: accepted, and without a result."""
+        known = self._goals.get(goal)
+        return known is not None and known.accepted
+
+    def had(self, goal: bytes, replica: int, asked_at: float) -> Had:
+        """Return what a replica had said of a goal when it was asked for the result."""
+        known = self._goals.get(goal)
+        word = None if known is None else known.words.get(replica)
+        if known is not None and known.cancelled:
+            return Had.TAKEN  # it need not be given it any more
+        if word is None or asked_at < word.since:
+            return Had.NOTHING_SAID
+        return Had.TAKEN if math.isfinite(word.since) else Had.REFUSED
+
+
+def merged(said: Mapping[int, Mapping[bytes, int]]) -> dict[bytes, int]:
+    """Return one status for each goal of what replicas say (replica -> goal -> status)."""
+    found: dict[bytes, int] = {}
+    for statuses in said.values():
+        for goal, status in statuses.items():
+            if goal not in found or _RANK.get(status, 0) > _RANK.get(found[goal], 0):
+                found[goal] = status
+    return found

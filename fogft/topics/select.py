@@ -1,0 +1,93 @@
+"""Which of several replicas' messages the robot gets. Pure: time comes in.
+
+Replicas run the same nodes on the same input, so most of what they publish says the same.
+
+Owns: `leader`, `stamp`, `goal`, `all`. Not here: an action's status (`goal_status`).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from fogft.model.topic import Select
+
+# A leader loses its place by silence of twice its last gap, but within these bounds; of one that
+# has spoken only once no gap is known, and the longer one holds.
+QUIET_S = 1.0
+QUIET_LIMIT_S = 10.0
+_STAMPS_KEPT = 1024
+_GOALS_KEPT = 1024
+_STAMP = slice(4, 12)  # of a message whose first field is a std_msgs/Header
+_GOAL = slice(4, 20)  # of a feedback message: its goal's id
+
+
+class Leader:
+    """Passes one replica's messages; another one's when that falls silent or leaves."""
+
+    def __init__(self) -> None:
+        self._leader: int | None = None
+        self._last = 0.0
+        self._quiet_s = QUIET_LIMIT_S
+
+    def passes(self, replica: int, now: float) -> bool:
+        """Whether a message of a replica's is the robot's (`now`: monotonic seconds)."""
+        if replica != self._leader:
+            if self._leader is not None and now - self._last <= self._quiet_s:
+                return False
+            self._leader, self._quiet_s = replica, QUIET_LIMIT_S
+        else:
+            self._quiet_s = min(max(QUIET_S, 2 * (now - self._last)), QUIET_LIMIT_S)
+        self._last = now
+        return True
+
+    def left(self, replica: int) -> None:
+        """A replica answers no more: whoever speaks next leads."""
+        if replica == self._leader:
+            self._leader = None
+
+
+class Selection:
+    """Decides message by message.
+
+    Args:
+        select: By what.
+    """
+
+    def __init__(self, select: Select) -> None:
+        self._select = select
+        self._leader = Leader()
+        self._stamps: OrderedDict[bytes, None] = OrderedDict()
+        self._goals: OrderedDict[bytes, Leader] = OrderedDict()
+
+    def passes(self, replica: int, message: bytes, now: float) -> bool:
+        """Whether the robot gets a message (CDR) of a replica's (`now`: monotonic seconds)."""
+        if self._select is Select.STAMP:
+            return self._first_of_its_stamp(replica, message, now)
+        if self._select is Select.GOAL:
+            return self._of_goal(message[_GOAL]).passes(replica, now)
+        return self._select is not Select.LEADER or self._leader.passes(replica, now)
+
+    def _first_of_its_stamp(self, replica: int, message: bytes, now: float) -> bool:
+        stamp = message[:2] + message[_STAMP]
+        if not any(message[_STAMP]):  # not set: it identifies nothing
+            return self._leader.passes(replica, now)
+        if stamp in self._stamps:
+            return False
+        self._stamps[stamp] = None
+        if len(self._stamps) > _STAMPS_KEPT:
+            self._stamps.popitem(last=False)
+        return True
+
+    def _of_goal(self, goal: bytes) -> Leader:
+        leader = self._goals.get(goal)
+        if leader is None:
+            leader = self._goals[goal] = Leader()
+            if len(self._goals) > _GOALS_KEPT:
+                self._goals.popitem(last=False)
+        return leader
+
+    def left(self, replica: int) -> None:
+        """A replica answers no more."""
+        self._leader.left(replica)
+        for leader in self._goals.values():
+            leader.left(replica)

@@ -1,1 +1,0 @@
-"""How proxies reach each other: one link a replica, mutual TLS, serialised bytes."""

@@ -1,0 +1,247 @@
+"""Frames: what goes out comes back, and no bytes whatever do harm."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.link import frame, probe_frames
+from fogft.link.frame import FrameError
+from fogft.link.port import Probe, ProbeAnswer
+from fogft.model.type_definition import Definition
+
+ids = st.binary(min_size=16, max_size=16)
+tokens = st.binary(min_size=8, max_size=8)
+stamps = st.binary(min_size=4, max_size=4)
+robots = st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size=64).filter(
+    lambda name: len(name.encode()) <= frame.ROBOT_BYTES_LIMIT and name.isprintable()
+)
+remaining = st.floats(0, frame.REMAINING_LIMIT_S, allow_nan=False)
+reasons = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=64)
+texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=100)
+counts = st.integers(0, 2**53 - 1)
+answers = st.builds(
+    ProbeAnswer,
+    slot=counts,
+    generation=counts,
+    incarnation=texts,
+    ready=st.frozensets(texts, max_size=8),
+    draining=st.booleans(),
+    restarts=counts,
+    in_flight=counts,
+    detail=texts,
+    work=st.dictionaries(texts, st.floats(0, 1e9, allow_nan=False), max_size=4),
+)
+probes = st.builds(
+    Probe,
+    robot=texts,
+    manager_age_s=st.none() | st.floats(0, 1e9, allow_nan=False),
+)
+
+DECODERS: list[Callable[[bytes], Any]] = [
+    frame.decode_request,
+    frame.decode_answer,
+    frame.decode_refusal,
+    probe_frames.decode_probe,
+    probe_frames.decode_probe_answer,
+    frame.decode_greeting,
+    frame.decode_cancel,
+]
+
+
+FLAGS = st.fixed_dictionaries(
+    {name: st.booleans() for name in ("packed", "may_pack", "reads_packed")}
+)
+
+
+@given(request_id=ids, remaining_s=remaining, token=tokens, robot=robots, seen=stamps, flags=FLAGS)
+def test_a_request_header_comes_back(
+    request_id: bytes,
+    remaining_s: float,
+    token: bytes,
+    robot: str,
+    seen: bytes,
+    flags: dict[str, bool],
+) -> None:
+    """Decoding undoes encoding."""
+    origin = frame.origin(robot, token)
+    sent = frame.encode_request(request_id, remaining_s, origin, seen=seen, **flags)
+    expected = frame.RequestHeader(request_id, remaining_s, token, robot, seen, **flags)
+    assert frame.decode_request(sent) == expected
+
+
+@given(stamp=stamps, request_id=ids)
+def test_an_answer_header_comes_back(stamp: bytes, request_id: bytes) -> None:
+    """Decoding undoes encoding."""
+    for packed in (False, True):
+        header = frame.encode_answer(stamp, request_id, packed=packed)
+        assert frame.decode_answer(header) == (stamp, request_id, packed)
+
+
+@given(stamp=stamps, request_id=ids, reason=reasons)
+def test_a_refusal_comes_back(stamp: bytes, request_id: bytes, reason: str) -> None:
+    """Decoding undoes encoding."""
+    sent = frame.encode_refusal(stamp, request_id, reason)
+    assert frame.decode_refusal(sent) == (stamp, request_id, reason)
+
+
+@given(token=tokens, certificate=st.binary(max_size=1500), signature=st.binary(min_size=1))
+def test_a_greeting_comes_back(token: bytes, certificate: bytes, signature: bytes) -> None:
+    """Decoding undoes encoding; without a certificate the token alone travels."""
+    sent = frame.Greeting(token, certificate, signature if certificate else b"")
+    assert frame.decode_greeting(frame.encode_greeting(sent)) == sent
+
+
+@given(cancelled=st.lists(ids, max_size=20))
+def test_a_cancellation_comes_back(cancelled: list[bytes]) -> None:
+    """Decoding undoes encoding."""
+    assert frame.decode_cancel(frame.encode_cancel(cancelled)) == cancelled
+
+
+@given(probe=probes)
+def test_a_probe_comes_back(probe: Probe) -> None:
+    """Decoding undoes encoding."""
+    assert probe_frames.decode_probe(probe_frames.encode_probe(probe)) == probe
+
+
+@given(answer=answers)
+def test_a_probe_answer_comes_back(answer: ProbeAnswer) -> None:
+    """Decoding undoes encoding."""
+    assert probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer)) == answer
+
+
+@pytest.mark.parametrize("decode", DECODERS)
+@given(garbage=st.binary(max_size=200))
+def test_garbage_is_a_frame_error_or_a_frame(
+    decode: Callable[[bytes], Any], garbage: bytes
+) -> None:
+    """Whatever bytes come, a decoder raises nothing but FrameError."""
+    try:
+        decode(garbage)
+    except FrameError:
+        return
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@pytest.mark.parametrize("decode", [probe_frames.decode_probe, probe_frames.decode_probe_answer])
+@given(data=st.data())
+def test_json_of_the_wrong_shape_is_a_frame_error_or_a_frame(
+    decode: Callable[[bytes], Any], data: st.DataObject
+) -> None:
+    """A probe in which any one value is replaced by any JSON at all raises only FrameError."""
+    good = {
+        "v": 1,
+        "robot": "r",
+        "manager_age_s": 1.0,
+        "slot": 0,
+        "generation": 1,
+        "incarnation": "i",
+        "ready": ["/a"],
+        "draining": False,
+        "restarts": 0,
+        "in_flight": 0,
+        "detail": "",
+    }
+    key = data.draw(st.sampled_from(sorted(good)))
+    bad = {**good, key: data.draw(json_values)}
+    try:
+        value = decode(json.dumps(bad).encode())
+    except FrameError:
+        return
+    assert isinstance(value, (Probe, ProbeAnswer))
+
+
+@given(request_id=ids, cut=st.integers(0, 100), grown=st.binary(max_size=80))
+def test_a_header_of_the_wrong_length_is_refused(request_id: bytes, cut: int, grown: bytes) -> None:
+    """An answer's header has one length; every other is a FrameError."""
+    whole = frame.encode_answer(frame.NO_STAMP, request_id)
+    for wrong in {whole[: cut % len(whole)], whole + grown + b"x"}:
+        with pytest.raises(FrameError):
+            frame.decode_answer(wrong)
+
+
+@pytest.mark.parametrize("version", [0, 1, 255])
+def test_another_version_is_refused(version: int) -> None:
+    """A peer of another version is told apart from garbage by its version."""
+    request = frame.encode_request(bytes(16), 1.0, frame.origin("r", bytes(8)))
+    refusal = frame.encode_refusal(frame.NO_STAMP, bytes(16), "lost")
+    for sent, decode in ((request, frame.decode_request), (refusal, frame.decode_refusal)):
+        with pytest.raises(FrameError, match=f"version {version}"):
+            decode(bytes([version]) + sent[1:])
+
+
+@pytest.mark.parametrize("remaining_s", [-1.0, math.nan, math.inf, -math.inf, 1e8])
+def test_an_impossible_remaining_time_is_refused(remaining_s: float) -> None:
+    """A deadline is a number of seconds that can be added to a clock."""
+    with pytest.raises(FrameError, match="remaining time"):
+        frame.decode_request(frame.encode_request(bytes(16), remaining_s, bytes(8) + b"r"))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"[" * 5000,
+        b'{"v":1,"robot":"r","manager_age_s":NaN}',
+        b'{"v":1,"robot":"r","manager_age_s":1e999}',
+        b'{"v":1,"robot":"\\ud800"}',
+        b'{"v":true,"robot":"r"}',
+        b'{"robot":"r"}',
+        b"1",
+        b" " * 2000 + b'{"v":1,"robot":"r"}',
+        b"1" * 900,
+    ],
+)
+def test_a_hostile_probe_is_refused(content: bytes) -> None:
+    """Depth, NaN, infinity, lone surrogates, a missing version, too much: all are FrameErrors."""
+    with pytest.raises(FrameError):
+        probe_frames.decode_probe(content)
+
+
+@pytest.mark.parametrize("robot", ["", "x" * 65, "a\nb", "\u00e4" * 33])
+def test_a_robot_name_that_cannot_travel_is_refused_at_once(robot: str) -> None:
+    """The sender learns of it, not the receiver."""
+    with pytest.raises(ValueError, match="robot's name"):
+        frame.origin(robot, bytes(8))
+
+
+def test_a_long_detail_is_cut_and_the_answer_still_travels() -> None:
+    """Detail is for people; it never costs the probe."""
+    answer = ProbeAnswer(0, 1, "i", detail="\ud800" + "x" * 100_000)
+    decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
+    assert len(decoded.detail) == probe_frames.DETAIL_LIMIT
+
+
+def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels() -> None:
+    """Health never depends on how long a type is."""
+    large = {"a/srv/B": Definition("h", {"request": (("x" * 70_000, "int32"),)})}
+    small = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
+    for types, told in ((large, {}), (small, small)):
+        answer = ProbeAnswer(0, 1, "i", frozenset({"/s"}), types=types, offered={"/s": "a/srv/B"})
+        decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
+        assert (decoded.types, decoded.ready) == (told, {"/s"})
+        assert decoded.offered == {"/s": "a/srv/B"}
+
+
+def test_too_many_services_for_a_frame_are_an_error_at_the_sender() -> None:
+    """A frame that nobody could read is not sent."""
+    answer = ProbeAnswer(0, 1, "i", ready=frozenset(f"/{n:0100}" for n in range(1000)))
+    with pytest.raises(ValueError, match="probe's answer"):
+        probe_frames.encode_probe_answer(answer)
+
+
+def test_a_probe_answer_nested_without_end_is_refused() -> None:
+    """The parser's own recursion limit is a FrameError like any other."""
+    with pytest.raises(FrameError):
+        probe_frames.decode_probe_answer(b"[" * 60_000)

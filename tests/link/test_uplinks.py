@@ -1,0 +1,247 @@
+"""Several uplinks as one link: each attempt ends once, and an uplink that is lost costs nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.link.port import Answer, Peer, Refusal
+from fogft.link.uplinks import UplinkDialer
+from fogft.model.choices import Freshness
+from fogft.model.replica import ReplicaId
+from fogft.model.spec import ServiceSpec
+from fogft.model.uplinks import UplinkPolicy, choose, is_interface
+from tests.proxy.fakes import UID, FakeDialer
+
+READY = frozenset({"/s"})
+ID = b"i" * 16
+LOST = Refusal.LOST
+PEER = Peer(ReplicaId(UID, 0, 1), "h:1", "replica")
+
+
+class Owner:
+    def __init__(self) -> None:
+        self.answers: list[Answer] = []
+        self.too_late: list[bytes] = []
+        self.changes = 0
+
+    def answered(self, link, answer) -> None:
+        self.answers.append(answer)
+
+    def late(self, link, service, request_id) -> None:
+        self.too_late.append(request_id)
+
+    def changed(self, link) -> None:
+        self.changes += 1
+
+
+class Scene:
+    def __init__(self, policy: str, uplinks: int = 2) -> None:
+        self.owner, inner = Owner(), FakeDialer()
+        dialer = self.dialer = UplinkDialer(inner)
+        dialer.use(
+            [f"if{i}" for i in range(uplinks)],
+            [ServiceSpec("/s", "t/srv/T", uplinks=UplinkPolicy(policy))],
+        )
+        self.link = dialer.dial(PEER, {"/s": "k"}, self.owner)
+        self.uplinks = inner.links
+        for one in self.uplinks:
+            one.ready = READY
+
+    def offer(self, id: bytes = ID) -> bool:
+        return self.link.offer("/s", id, b"payload", 5.0)
+
+    def counts(self) -> list[int]:
+        return [len(one.offered) for one in self.uplinks]
+
+    def end(self, at: int, payload: bytes | None = None, refusal: str = "", id: bytes = ID) -> None:
+        one = self.uplinks[at]
+        one.events.answered(one, Answer(id, payload, refusal, "/s"))
+
+    def lose(self, at: int) -> None:
+        self.uplinks[at].ready = frozenset()
+        for _, id, _, _ in list(self.uplinks[at].offered):
+            self.end(at, refusal=LOST, id=id)
+
+
+def test_each_uplink_is_dialled_through_its_interface():
+    scene = Scene("prefer", 3)
+    assert [one.peer.interface for one in scene.uplinks] == ["if0", "if1", "if2"]
+    assert [u["interface"] for u in scene.link.uplinks()] == ["if0", "if1", "if2"]
+
+
+def test_all_sends_on_each_and_takes_the_first_answer():
+    scene = Scene("all")
+    assert scene.offer()
+    assert scene.counts() == [1, 1]
+    scene.end(1, b"a")
+    scene.end(0, b"a")
+    assert [a.payload for a in scene.owner.answers] == [b"a"]
+    assert scene.uplinks[0].forgotten == [ID]
+    one = scene.uplinks[0]
+    one.events.late(one, "/s", ID)
+    assert scene.owner.too_late == []  # the replica ran it once: nothing was in vain
+
+
+def test_each_service_has_its_own_policy():
+    """Over the same links at the same time."""
+    scene = Scene("all")
+    policies = [("/s", UplinkPolicy.ALL), ("/t", UplinkPolicy.PREFER)]
+    scene.dialer.use(["if0", "if1"], [ServiceSpec(n, "t/srv/T", uplinks=p) for n, p in policies])
+    assert scene.offer()
+    assert scene.counts() == [1, 1]
+    assert scene.link.offer("/t", b"t" * 16, b"payload", 5.0)
+    assert scene.counts() == [2, 1]
+
+
+def test_links_are_dialled_anew_for_other_interfaces_or_ways_only():
+    one, other = ServiceSpec("/s", "t/srv/T"), ServiceSpec("/t", "t/srv/T")
+    dialer = UplinkDialer(FakeDialer())
+    assert dialer.use(["if0"], [one])
+    assert not dialer.use(["if0"], [one, other])
+    assert dialer.use(["if0", "if1"], [one])
+    assert dialer.use(["if0", "if1"], [replace(one, freshness=Freshness.LATEST)])
+
+
+def test_prefer_goes_back_and_failover_does_not():
+    for policy, expected in (("prefer", [2, 1]), ("failover", [1, 2])):
+        scene = Scene(policy)
+        assert scene.offer(b"1" * 16)
+        scene.uplinks[0].ready = frozenset()
+        assert scene.offer(b"2" * 16)
+        scene.uplinks[0].ready = READY
+        assert scene.offer(b"3" * 16)
+        assert scene.counts() == expected, policy
+
+
+def test_what_is_too_slow_on_one_uplink_goes_out_on_the_other():
+    """It ends as lost where no uplink takes it any more, so that another replica is asked."""
+    scene = Scene("failover")
+    assert scene.offer()
+    scene.uplinks[0].room = 1
+    scene.end(0, refusal=Refusal.TOO_SLOW)
+    scene.link.flush()
+    assert (scene.counts(), scene.owner.answers) == ([1, 1], [])
+    scene.uplinks[1].room = 1
+    scene.end(1, refusal=Refusal.TOO_SLOW)
+    scene.link.flush()
+    assert [a.refusal for a in scene.owner.answers] == [LOST]
+
+
+def test_what_was_on_a_lost_uplink_goes_out_on_the_other():
+    """The owner hears nothing of it, but that it shall flush: an event may send nothing."""
+    scene = Scene("prefer")
+    scene.offer()
+    scene.lose(0)
+    assert (scene.owner.answers, scene.counts()) == ([], [1, 0])
+    assert scene.owner.changes
+    scene.link.flush()
+    assert scene.counts() == [1, 1]
+    assert scene.uplinks[1].offered[0][2] == b"payload"
+    scene.end(1, b"a")
+    assert [a.payload for a in scene.owner.answers] == [b"a"]
+
+
+def test_with_no_uplink_left_it_is_lost_once():
+    scene = Scene("all")
+    scene.offer()
+    scene.lose(0)
+    scene.lose(1)
+    scene.link.flush()
+    assert [a.refusal for a in scene.owner.answers] == [LOST]
+    assert not scene.offer()
+
+
+def test_a_refusal_counts_when_no_other_copy_is_under_way():
+    scene = Scene("all")
+    scene.offer()
+    scene.end(0, refusal=Refusal.OVERLOADED)
+    assert scene.owner.answers == []
+    scene.end(1, refusal=Refusal.OVERLOADED)
+    assert [a.refusal for a in scene.owner.answers] == [Refusal.OVERLOADED]
+
+
+def test_what_is_forgotten_is_forgotten_on_every_uplink():
+    scene = Scene("all")
+    scene.offer()
+    scene.link.forget(ID)
+    assert [one.forgotten for one in scene.uplinks] == [[ID], [ID]]
+    scene.lose(0)
+    assert scene.owner.answers == []
+
+
+def test_a_full_uplink_is_passed_over():
+    scene = Scene("prefer")
+    scene.uplinks[0].room = 0
+    assert scene.offer()
+    assert scene.counts() == [0, 1]
+    scene.uplinks[1].room = 1
+    assert not scene.offer(b"2" * 16)
+
+
+def test_what_is_on_this_machine_takes_no_uplink():
+    """The door through which replicas dial in."""
+    dialer = UplinkDialer(FakeDialer())
+    dialer.use(["if0"], [])
+    link = dialer.dial(Peer(PEER.id, "127.0.0.1:9", "n"), {}, Owner())
+    assert link.peer.interface == ""
+
+
+step = st.sampled_from(["offer", "answer", "refuse", "lose", "back", "forget", "flush"])
+
+
+@given(
+    st.sampled_from(list(UplinkPolicy)),
+    st.lists(st.tuples(step, st.integers(0, 2), st.integers(0, 3)), max_size=60),
+)
+def test_each_accepted_attempt_ends_once_whatever_happens(policy, steps):
+    """Exactly one `answered` for each offer that was taken, but for those forgotten."""
+    scene = Scene(policy.value, 3)
+    taken: dict[bytes, int] = {}
+    forgotten: set[bytes] = set()
+    number = 0
+    for what, at, which in steps:
+        one = scene.uplinks[at]
+        open_ = [o[1] for o in one.offered]
+        if what == "offer":
+            number += 1
+            id = number.to_bytes(16, "big")
+            if scene.offer(id):
+                taken[id] = 0
+        elif what in ("answer", "refuse") and open_:
+            id = open_[which % len(open_)]
+            one.offered = [o for o in one.offered if o[1] != id]
+            scene.end(at, b"a" if what == "answer" else None, "" if what == "answer" else "x", id)
+        elif what == "lose":
+            scene.lose(at)
+            one.offered = []
+        elif what == "back":
+            one.ready = READY
+        elif what == "forget" and taken:
+            id = list(taken)[which % len(taken)]
+            if not any(a.request_id == id for a in scene.owner.answers):
+                forgotten.add(id)
+            scene.link.forget(id)
+        elif what == "flush":
+            scene.link.flush()
+    for at in range(3):
+        scene.lose(at)
+    scene.link.flush()
+    for answer in scene.owner.answers:
+        if answer.request_id in taken:
+            taken[answer.request_id] += 1
+    assert {id: count for id, count in taken.items() if id not in forgotten and count != 1} == {}
+    assert all(taken[id] == 0 for id in forgotten)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "x" * 16, "..", "eth0/1", "é"])
+def test_what_is_no_interface(name):
+    assert not is_interface(name)
+
+
+def test_nothing_is_chosen_where_nothing_is_up():
+    for policy in UplinkPolicy:
+        assert choose(policy, [], 1)[0] == []

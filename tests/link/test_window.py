@@ -1,0 +1,110 @@
+"""The window: bounded, and each attempt ends once."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from dataclasses import dataclass
+
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from fogft.link.window import LinkWindow
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    request_id: bytes
+    size: int
+
+
+class WindowMachine(RuleBasedStateMachine):
+    """A window beside a plain model of it: a list of what is open."""
+
+    LIMIT, LIMIT_BYTES = 4, 100
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.window: LinkWindow[Attempt] = LinkWindow(self.LIMIT, self.LIMIT_BYTES)
+        self.open: list[Attempt] = []
+        self.all: list[Attempt] = []
+        self.closed = False
+
+    @rule(number=st.integers(0, 6), size=st.integers(0, 150))
+    def admit(self, number: int, size: int) -> None:
+        attempt = Attempt(bytes([number]), size)
+        room = len(self.open) < self.LIMIT and sum(a.size for a in self.open) + size <= 100
+        known = any(a.request_id == attempt.request_id for a in self.open)
+        expected = not self.closed and not known and (room or not self.open)
+        assert self.window.admit(attempt) is expected
+        if expected:
+            self.open.append(attempt)
+            self.all.append(attempt)
+
+    @precondition(lambda self: self.all)
+    @rule(data=st.data())
+    def remove(self, data: st.DataObject) -> None:
+        attempt = data.draw(st.sampled_from(self.all))
+        assert self.window.holds(attempt) is (attempt in self.open)
+        assert self.window.remove(attempt) is (attempt in self.open)
+        self.open = [a for a in self.open if a is not attempt]
+
+    @rule(number=st.integers(0, 6))
+    def forget(self, number: int) -> None:
+        known = any(a.request_id == bytes([number]) for a in self.open)
+        assert (self.window.forget(bytes([number])) is not None) is known
+        self.open = [a for a in self.open if a.request_id != bytes([number])]
+
+    @rule()
+    def close(self) -> None:
+        assert self.window.close() == self.open
+        self.open, self.closed = [], True
+
+    @invariant()
+    def counts_are_right(self) -> None:
+        assert len(self.window) == len(self.open)
+        assert self.window.held_bytes == sum(a.size for a in self.open)
+
+
+TestWindow = WindowMachine.TestCase
+
+
+@given(limit=st.integers(1, 20), extra=st.integers(1, 5))
+def test_room_is_announced_once_after_a_refusal(limit: int, extra: int) -> None:
+    """Only a window that declined something tells of room, and only once."""
+    window: LinkWindow[Attempt] = LinkWindow(limit)
+    attempts = [Attempt(bytes([n]), 1) for n in range(limit + extra)]
+    taken = [window.admit(a) for a in attempts]
+    assert taken == [True] * limit + [False] * extra
+    announced = 0
+    for attempt in attempts[:limit]:
+        window.remove(attempt)
+        announced += window.regained_room()
+    assert announced == 1
+    window.admit(attempts[0])
+    window.remove(attempts[0])
+    assert not window.regained_room()
+
+
+def test_an_attempt_ends_once_whoever_comes_first() -> None:
+    """Four threads end the same attempts; each end is granted to exactly one of them."""
+    window: LinkWindow[Attempt] = LinkWindow(10_000)
+    attempts = [Attempt(n.to_bytes(4, "big"), 3) for n in range(5000)]
+    assert all(window.admit(a) for a in attempts)
+    granted: Counter[bytes] = Counter()
+    lock = threading.Lock()
+
+    def end_all(step: int) -> None:
+        mine = [a.request_id for a in attempts[::step] if window.remove(a)]
+        with lock:
+            granted.update(mine)
+
+    threads = [threading.Thread(target=end_all, args=(step,)) for step in (1, -1, 1, -1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(granted.values()) == {1}
+    assert len(granted) == len(attempts)
+    assert (len(window), window.held_bytes) == (0, 0)

@@ -1,0 +1,191 @@
+"""What the wire tests share: a small pool of certificates, replicas as processes, a link owner."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import zenoh
+
+from fogft.link.port import Answer, Link, Peer
+from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.model import names
+from fogft.model.replica import LinkState, ReplicaId
+from fogft.pool.credentials import authority
+from fogft.pool.credentials.authority import Role
+from tests.freezing import freeze
+
+POOL_UID = "0123456789abcdef"
+SERVICE, TYPE = "/echo", "std_srvs/srv/SetBool"
+LIMIT_S = 30.0  # generous: a test that passes never waits for it
+
+
+def wait_for(condition: Callable[[], object], limit_s: float = LIMIT_S) -> None:
+    """Wait until a condition holds; fail where it never does."""
+    end = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end, "the awaited condition never came"
+        time.sleep(0.005)
+
+
+class Authority:
+    """A pool's CA in a folder, and what it issued; `ca` is where, if not in the same."""
+
+    def __init__(self, folder: Path, *, ca: Path | None = None) -> None:
+        self.folder = folder
+        self._ca = ca or folder / "ca"
+        folder.mkdir(exist_ok=True)
+        authority.create_authority(self._ca, POOL_UID)
+
+    def issue(self, common_name: str, role: Role, *, days: float = 30.0) -> CredentialPaths:
+        stem = f"{common_name}-{role.value}"
+        credential = authority.issue(self._ca, common_name, role=role, days=days)
+        authority.write(credential, self.folder, stem)
+        return CredentialPaths(
+            self.folder / "ca.crt", self.folder / f"{stem}.crt", self.folder / f"{stem}.key"
+        )
+
+    def robot(self, name: str = "robot", generation: int = 1) -> CredentialPaths:
+        name = names.robot_certificate_name(POOL_UID, name, generation)
+        return self.issue(name, Role.ROBOT)
+
+    def replica(self, slot: int = 0, generation: int = 1) -> CredentialPaths:
+        id = ReplicaId(POOL_UID, slot, generation)
+        return self.issue(names.replica_certificate_name(id), Role.REPLICA)
+
+
+def keys(slot: int) -> dict[str, str]:
+    return {SERVICE: names.service_key(POOL_UID, slot, SERVICE, TYPE)}
+
+
+def peer(endpoint: str, slot: int = 0, generation: int = 1) -> Peer:
+    id = ReplicaId(POOL_UID, slot, generation)
+    return Peer(id, endpoint, names.replica_certificate_name(id))
+
+
+def hears(session: zenoh.Session, key: str) -> None:
+    """Wait until a session knows that the replica hears what is published at a key."""
+    publisher = session.declare_publisher(key)
+    wait_for(lambda: publisher.matching_status.matching)  # type: ignore[attr-defined]
+    publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+def knows(session: zenoh.Session, slot: int) -> None:
+    """Wait until a session knows all that a replica or gateway hears; what it declares last."""
+    querier = session.declare_querier(names.probe_key(POOL_UID, slot))
+    wait_for(lambda: querier.matching_status.matching)  # type: ignore[attr-defined]
+    querier.undeclare()  # type: ignore[no-untyped-call]
+    hears(session, names.cancel_key(POOL_UID, slot))
+
+
+def request_id(number: int) -> bytes:
+    return number.to_bytes(16, "big")
+
+
+class Owner:
+    """Takes what links tell, and remembers it."""
+
+    def __init__(self) -> None:
+        self.answers: list[tuple[int, Answer]] = []
+        self.states: list[tuple[int, LinkState]] = []
+        self.changes = 0
+        self.too_late: list[tuple[str, bytes]] = []
+        self._lock = threading.Lock()
+
+    def answered(self, link: Link, answer: Answer) -> None:
+        with self._lock:
+            self.answers.append((link.peer.id.slot, answer))
+
+    def late(self, link: Link, service: str, request_id: bytes) -> None:
+        with self._lock:
+            self.too_late.append((service, request_id))
+
+    def changed(self, link: Link) -> None:
+        with self._lock:
+            self.changes += 1
+            self.states.append((link.peer.id.slot, link.status().state))
+
+    def of(self, number: int) -> list[Answer]:
+        return [a for _, a in list(self.answers) if a.request_id == request_id(number)]
+
+    def from_slot(self, slot: int) -> list[Answer]:
+        return [a for s, a in list(self.answers) if s == slot]
+
+
+class ReplicaProcess:
+    """A listener in a process of its own; see `replica_process.py` for what it answers."""
+
+    def __init__(
+        self,
+        files: CredentialPaths,
+        *,
+        endpoint: str = "127.0.0.1:0",
+        slot: int = 0,
+        generation: int = 1,
+        claims: Sequence[int] | None = None,
+        delay_s: float = 0.0,
+        reply_bytes: int = -1,
+        settings: LinkSettings | None = None,
+    ) -> None:
+        """Start one. `claims`: slot and generation that it says it is, where that is a lie."""
+        arguments = {
+            "endpoint": endpoint,
+            "ca": str(files.ca),
+            "certificate": str(files.certificate),
+            "key": str(files.key),
+            "slot": slot,
+            "generation": generation,
+            "claims": list(claims or (slot, generation)),
+            "delay_s": delay_s,
+            "reply_bytes": reply_bytes,
+            "settings": asdict(settings or LinkSettings()),
+        }
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.link.zenoh.replica_process", json.dumps(arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=Path(__file__).parents[2],
+        )
+        self.endpoint = str(self._read()["endpoint"])
+
+    def _read(self) -> dict[str, object]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        assert line, "the replica's process has ended"
+        return dict(json.loads(line))
+
+    def stop(self) -> None:
+        """Have it close its listener and end. Does not wait for that."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+
+    def ask(self, **command: object) -> dict[str, object]:
+        """Send a command: `ready`, `draining`, `delay_s`, `revoke`; none asks for its counters."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(command) + "\n")
+        self._process.stdin.flush()
+        return self._read()
+
+    def count(self, event: str) -> int:
+        return int(self.ask().get(event, 0))  # type: ignore[call-overload]
+
+    def signal(self, number: int) -> None:
+        if number == signal.SIGSTOP:
+            freeze(self._process.pid)
+        else:
+            self._process.send_signal(number)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()

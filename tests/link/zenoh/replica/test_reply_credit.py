@@ -1,0 +1,160 @@
+"""What may leave at once to a robot: only what cannot block, whatever it says and has."""
+
+from __future__ import annotations
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.link import frame
+from fogft.link.zenoh.replica.reply_credit import UNSEEN_LIMIT, Unseen
+from fogft.link.zenoh.replica.reply_streams import Streams
+from tests.proxy.fakes import Clock
+
+ONE, OTHER = object(), object()  # two connections of a robot
+
+
+@given(
+    st.lists(
+        st.one_of(
+            st.sampled_from(["at once", "with patience", "forged"]),
+            st.integers(0, 40),  # the robot has seen the reply of this number, if it was sent
+        )
+    )
+)
+def test_only_what_cannot_block_leaves_at_once(steps: list[str | int]) -> None:
+    """At most so much on the way, by what the robot proves; nothing behind what may be stuck."""
+    unseen, sent, seen, patient = Unseen(), [], 0, 0
+    for step in steps:
+        if step == "at once":
+            left = unseen.send_at_once(ONE, sent.append)
+            assert left == (len(sent) - left - seen < UNSEEN_LIMIT and patient <= seen)
+        elif step == "with patience":
+            unseen.send(ONE, sent.append)
+            patient = len(sent)
+        elif step == "forged":
+            unseen.seen(ONE, frame.NO_STAMP)
+        elif isinstance(step, int) and step < len(sent):
+            unseen.seen(ONE, sent[step])
+            if step + 1 >= patient:  # older ones say nothing of what was sent with patience
+                seen = max(seen, step + 1)
+    assert len(set(sent)) == len(sent)
+
+
+def test_nothing_leaves_at_once_while_somebody_sends_who_may_block() -> None:
+    unseen, tried = Unseen(), []
+    unseen.send(ONE, lambda _: tried.append(unseen.send_at_once(ONE, tried.append)))
+    assert tried == [False]
+    assert not unseen.send_at_once(ONE, tried.append)  # nor before the robot has seen that one
+
+
+def test_whoever_sends_with_patience_goes_on_after_an_error() -> None:
+    unseen = Unseen()
+
+    def fail(_: bytes) -> None:
+        raise zenoh.ZError("closed")
+
+    for send in (unseen.send_at_once, unseen.send):
+        with pytest.raises(zenoh.ZError):
+            send(ONE, fail)
+    sent: list[bytes] = []
+    unseen.send(ONE, sent.append)
+    assert len(sent) == 1
+
+
+def test_what_is_sent_with_patience_while_a_stamp_is_looked_up_is_not_taken_for_seen() -> None:
+    unseen, sent = Unseen(), []
+    unseen.send_at_once(ONE, sent.append)
+
+    class Raced(dict):
+        """Somebody else is faster, once."""
+
+        def __contains__(self, stamp: object) -> bool:
+            if len(sent) == 1:
+                unseen.send(ONE, sent.append)
+            return super().__contains__(stamp)
+
+    unseen._unseen = Raced(unseen._unseen)
+    unseen.seen(ONE, sent[0])
+    assert len(sent) == 2
+    assert not unseen.send_at_once(ONE, sent.append)
+    unseen.seen(ONE, sent[1])
+    assert unseen.send_at_once(ONE, sent.append)
+
+
+def test_all_connections_of_a_robot_count_together() -> None:
+    """They may share one socket: together they would fill what it holds."""
+    unseen, sent = Unseen(), []
+    for connection in (ONE, OTHER, ONE, OTHER):
+        assert unseen.send_at_once(connection, sent.append)
+    assert not unseen.send_at_once(ONE, sent.append)
+    unseen.seen(OTHER, sent[2])  # it was sent on the other one: that says nothing of this
+    assert not unseen.send_at_once(ONE, sent.append)
+    unseen.seen(ONE, sent[2])
+    assert unseen.send_at_once(OTHER, sent.append)
+    unseen.send(OTHER, sent.append)
+    assert not unseen.send_at_once(ONE, sent.append)
+
+
+def test_nothing_leaves_at_once_beside_one_who_may_block_on_another_connection() -> None:
+    """However long he is at it; and whoever sends so does not wait for the next one."""
+    clock, tried = Clock(), []
+    unseen = Unseen(clock=clock)
+
+    def long(_: bytes) -> None:
+        clock.now += 3600.0
+        tried.append(unseen.send_at_once(ONE, tried.append))
+        unseen.send(ONE, lambda stamp: unseen.seen(ONE, stamp))
+
+    unseen.send(OTHER, long)
+    tried.append(unseen.send_at_once(ONE, tried.append))
+    assert tried == [False, False]
+
+
+def test_what_was_sent_on_another_connection_counts_for_a_minute() -> None:
+    """That may be gone: a robot opens a new one where the old one is lost."""
+    clock, sent = Clock(), []
+    unseen = Unseen(clock=clock)
+    unseen.send(OTHER, sent.append)
+    clock.now += 59.0
+    assert not unseen.send_at_once(ONE, sent.append)
+    clock.now += 2.0
+    assert unseen.send_at_once(ONE, sent.append)
+    clock.now += 3600.0
+    unseen.send(ONE, sent.append)
+    clock.now += 3600.0
+    assert not unseen.send_at_once(ONE, sent.append), "its own must be seen"
+
+
+def test_connections_that_are_gone_leave_nothing_behind() -> None:
+    clock = Clock()
+    unseen = Unseen(clock=clock)
+    for _ in range(1000):
+        unseen.send(object(), lambda _: None)
+        clock.now += 1.0
+    assert len(unseen._unseen) < 70
+
+
+def test_who_reads_slowly_is_sent_nothing_at_once() -> None:
+    slow: set[str] = {"a"}
+    streams, found = Streams(slow=lambda holder: holder in slow), []
+    for token, holder in ((b"1", "a"), (b"2", "b")):
+        streams.opened(token, None, holder)
+        stream = streams.of(token)
+        assert stream is not None
+        found.append(stream.send_at_once(lambda _: None))
+    assert found == [False, True]
+
+
+def test_only_the_connections_of_one_robot_count_together() -> None:
+    streams = Streams()
+    for token, holder in ((b"1", "a"), (b"2", "a"), (b"3", "b")):
+        streams.opened(token, None, holder)
+    first, second, other = (streams.of(token) for token in (b"1", b"2", b"3"))
+    assert first is not None
+    first.send(lambda _: None)
+    assert second is not None
+    assert not second.send_at_once(lambda _: None)
+    assert other is not None
+    assert other.send_at_once(lambda _: None)

@@ -1,0 +1,54 @@
+"""The queues of replies, without Zenoh: what is sent by which thread, and what an error costs."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, cast
+
+import pytest
+
+from fogft.link.counters import Counters
+from fogft.link.zenoh.replica import reply_queue
+from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from tests.link.wire_pool import wait_for
+
+
+class Stream:
+    """Takes what is sent with patience only."""
+
+    def send_at_once(self, send: object) -> bool:
+        return False
+
+    def send(self, send: Any) -> None:
+        send(b"stamp")
+
+
+class Reply:
+    """A small reply."""
+
+    small = joins = True
+    refusal = payload = b""
+
+    def __init__(self) -> None:
+        self.stream = Stream()
+
+
+def test_a_thread_that_cannot_be_started_costs_only_the_reply_it_was_for(monkeypatch):
+    queues = ReplyQueues(Counters(), idle_s=0.01)
+    start, tries, sent = threading.Thread.start, [], []
+
+    def fails_once(thread: threading.Thread) -> None:
+        tries.append(thread)
+        if len(tries) == 1:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", fails_once)
+    monkeypatch.setattr(reply_queue, "send_together", lambda replies, stamp: sent.extend(replies))
+    lost, reply = cast("Any", Reply()), cast("Any", Reply())
+    with pytest.raises(RuntimeError, match="thread"):
+        queues.put(b"token", "robot", lost, more=True)
+    assert len(queues) == 0
+    queues.put(b"token", "robot", reply, more=True)
+    wait_for(lambda: sent == [reply])
+    wait_for(lambda: len(queues) == 0)

@@ -1,0 +1,176 @@
+"""The requests of one connection, over an outlet that the test plays: each ends once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.link import batch_frames, frame
+from fogft.link.cancellations import Recalls
+from fogft.link.large_send_gate import LARGE_BYTES, Turns
+from fogft.link.port import Answer, Refusal
+from fogft.link.send_options import PLAIN_WAYS
+from fogft.link.zenoh.robot.attempts import Attempts
+from tests.link.wire_pool import request_id
+
+SERVICE = "/s"
+
+
+class Flow:
+    """A fast link of which nothing is known."""
+
+    thin = False
+    bytes_per_s = None
+
+    def carries_bytes_per_s(self, now: float) -> None:
+        return None
+
+
+class Outlet:
+    """What was sent; refuses to send where the test says so."""
+
+    def __init__(self) -> None:
+        self.flow: Any = Flow()
+        self.fails = False
+        self.sent: list[bytes] = []
+        self.lost: list[str] = []
+
+    def publish(self, service: str, content: bytes, header: bytes) -> None:
+        if self.fails:
+            raise OSError("no way out")
+        if batch_frames.is_batch(header):
+            found = batch_frames.decode_requests(header, content)
+            self.sent += [one.request_id for one, _ in found]
+        else:
+            self.sent.append(frame.decode_request(header).request_id)
+
+    def recall(self, ids: Sequence[bytes]) -> None:
+        pass
+
+    def alive(self) -> bool:
+        return True
+
+    def lose(self, because: str) -> None:
+        self.lost.append(because)
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.outlet = Outlet()
+        self.answers: list[Answer] = []
+        self.late: list[bytes] = []
+        self.ended = 0
+        self.attempts = Attempts(
+            self.outlet,
+            [SERVICE],
+            frame.origin("ada", bytes(frame.TOKEN_BYTES)),
+            ways=PLAIN_WAYS,
+            turns=Turns(),
+            recalls=Recalls(),
+            answered=self.answers.append,
+            late=lambda service, id: self.late.append(id),
+            room=lambda: None,
+            large=lambda: None,
+            ended=self._end,
+            name="test-send",
+        )
+
+    def _end(self) -> None:
+        self.ended += 1
+
+    def close(self) -> None:
+        self.attempts.close()
+        self.attempts.end()
+        self.attempts.join(30.0)
+
+
+steps = st.lists(
+    st.one_of(
+        st.tuples(
+            st.just("offer"),
+            st.integers(0, 9),
+            st.sampled_from([8, 5000, LARGE_BYTES]),
+            st.booleans(),
+        ),
+        st.tuples(st.sampled_from(["answer", "refuse", "forget"]), st.integers(0, 9)),
+        st.tuples(st.sampled_from(["send", "sweep", "fail", "work"])),
+    ),
+    max_size=40,
+)
+
+
+@given(steps)
+def test_each_attempt_that_was_taken_ends_once_unless_it_was_forgotten(steps: list[Any]) -> None:
+    """Whatever is sent, fails, is answered twice, comes late, or is open at the end."""
+    scene = Scene()
+    attempts, taken, forgotten = scene.attempts, Counter[bytes](), Counter[bytes]()
+    for what, *rest in steps:
+        id = request_id(rest[0]) if rest else b""
+        if what == "offer":
+            if attempts.offer(SERVICE, id, bytes(rest[1]), 60.0, more=rest[2]):
+                taken[id] += 1
+        elif what == "answer":
+            attempts.heard(b"once", [Answer(id, b"payload")])
+        elif what == "refuse":
+            attempts.heard(b"once", [Answer(id, None, Refusal.OVERLOADED)])
+        elif what == "forget":
+            forgotten[id] += id in {one.request_id for one in attempts.window.attempts()}
+            attempts.forget(id)
+        elif what == "send":
+            attempts.send()
+        elif what == "sweep":
+            attempts.sweep()
+        else:
+            scene.outlet.fails = what == "fail"
+    scene.close()
+    told = Counter(answer.request_id for answer in scene.answers)
+    # A large one may end by itself, in the sender thread, between our look and our `forget`.
+    assert all(taken[id] - forgotten[id] <= told[id] <= taken[id] for id in taken)
+    assert told.keys() <= taken.keys()
+    assert not attempts.window.attempts()
+    assert scene.ended == 1
+    assert not attempts.offer(SERVICE, request_id(99), b"x", 60.0)
+
+
+def test_what_is_small_is_sent_before_offer_returns_and_shows_what_was_seen() -> None:
+    scene = Scene()
+    scene.attempts.heard(b"seen", [])
+    headers: list[frame.RequestHeader] = []
+    scene.outlet.publish = lambda service, content, header: headers.append(  # type: ignore[method-assign]
+        frame.decode_request(header)
+    )
+    assert scene.attempts.offer(SERVICE, request_id(1), b"x", 60.0)
+    assert [(one.request_id, one.seen) for one in headers] == [(request_id(1), b"seen")]
+    scene.close()
+    assert [answer.refusal for answer in scene.answers] == [Refusal.LOST]
+
+
+def test_no_time_left_is_said_as_none_and_not_as_less() -> None:
+    """The replica would not know a frame of it, and say nothing."""
+    scene = Scene()
+    assert scene.attempts.offer(SERVICE, request_id(1), b"x", -1.0)
+    assert scene.outlet.sent == [request_id(1)]
+    scene.close()
+
+
+def test_what_cannot_be_sent_ends_at_once_and_takes_the_connection_with_it() -> None:
+    scene = Scene()
+    scene.outlet.fails = True
+    assert scene.attempts.offer(SERVICE, request_id(1), b"x", 60.0)
+    assert [answer.refusal for answer in scene.answers] == [Refusal.LOST]
+    assert scene.outlet.lost == ["sending failed: no way out"]
+    scene.close()
+    assert len(scene.answers) == 1
+
+
+def test_an_answer_after_it_was_forgotten_is_late() -> None:
+    scene = Scene()
+    assert scene.attempts.offer(SERVICE, request_id(1), b"x", 60.0)
+    scene.attempts.forget(request_id(1))
+    scene.attempts.heard(b"once", [Answer(request_id(1), b"y")])
+    scene.close()
+    assert (scene.answers, scene.late) == ([], [request_id(1)])

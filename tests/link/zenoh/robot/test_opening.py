@@ -1,0 +1,49 @@
+"""How long a link's tries to open a connection may take, and what is said of those that fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fogft.link.zenoh import diagnosis
+from fogft.link.zenoh.robot.opening import Opening
+from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from tests.link.wire_pool import peer
+
+SETTINGS = LinkSettings(open_timeout_s=1.0, long_open_timeout_s=4.0)
+CREDENTIALS = CredentialPaths(Path("ca"), Path("crt"), Path("key"))
+
+
+def test_every_third_time_out_in_a_row_is_a_long_one() -> None:
+    opening = Opening(peer("10.0.0.1:1"), SETTINGS)
+    allowed = []
+    for _ in range(7):
+        allowed.append(opening.timeout_s)
+        assert "does not answer" in opening.failed(opening.timeout_s, 0.0, CREDENTIALS)
+    assert allowed == [1.0, 1.0, 4.0, 1.0, 1.0, 4.0, 1.0]
+
+
+def test_a_try_that_is_well_or_refused_at_once_begins_the_count_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(diagnosis, "explain", lambda *_: "refused")
+    opening = Opening(peer("10.0.0.1:1"), SETTINGS)
+    for end in (opening.done, lambda: opening.failed(0.01, 0.0, CREDENTIALS)):
+        for _ in range(2):
+            opening.failed(1.0, 0.0, CREDENTIALS)
+        end()
+        assert opening.timeout_s == 1.0
+
+
+def test_words_are_looked_for_once_in_five_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnosis, "explain", lambda *_: "refused")
+    opening = Opening(peer("10.0.0.1:1"), SETTINGS)
+    said = [opening.failed(0.01, now, CREDENTIALS) for now in (0.0, 1.0, 4.9, 5.0, 6.0)]
+    assert said == ["refused", "", "", "refused", ""]
+
+
+def test_an_interface_that_is_not_there_is_named() -> None:
+    opening = Opening(replace(peer("10.0.0.1:1"), interface="no-such"), SETTINGS)
+    assert "`no-such`" in opening.failed(0.01, 0.0, CREDENTIALS)

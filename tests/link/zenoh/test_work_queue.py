@@ -1,0 +1,45 @@
+"""The thread for chores: it does what it takes, in order, whatever one of them does."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+from fogft.link.counters import Counters
+from fogft.link.zenoh.work_queue import LIMIT, Chores
+from tests.link.wire_pool import LIMIT_S
+
+
+def test_chores_are_done_in_order_and_one_that_fails_stops_none(caplog):
+    counters, done, last = Counters(), [], threading.Event()
+    chores = Chores(counters)
+    chores.add(lambda: done.append(1))
+    chores.start()
+    chores.add(lambda: done.append(1 // 0))
+    assert chores.offer(lambda: done.append(2))
+    chores.add(last.set)
+    assert last.wait(LIMIT_S)
+    chores.close()
+    assert done == [1, 2]
+    assert counters.snapshot() == {"failed": 1}
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_only_so_many_wait_but_what_must_be_taken_is():
+    counters = Counters()
+    chores = Chores(counters)
+    assert all(chores.offer(print) for _ in range(LIMIT))
+    assert not chores.offer(print)
+    chores.add(print)
+    assert len(chores) == LIMIT + 1
+    assert counters.snapshot() == {"chores_dropped": 1}
+
+
+def test_what_happens_often_is_logged_seldom(caplog):
+    counters, log = Counters(), logging.getLogger("test")
+    for number in range(9):
+        counters.warn(log, "odd", "it_was_odd number=%d", number)
+    assert counters.add("odd", 2) == 11
+    assert [record.getMessage() for record in caplog.records] == [
+        f"it_was_odd number={count - 1} count={count}" for count in (1, 2, 4, 8)
+    ]

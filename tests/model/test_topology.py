@@ -1,0 +1,95 @@
+"""Who talks through whom: read back as written, never with a loop, neighbours as described."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.errors import StateError
+from fogft.model import topology as topologies
+from fogft.model.certificate_holder import Holder, Role
+from fogft.model.topology import Gateway, Topology, find_loop
+
+UID = "0123456789abcdef"
+NAMES = ["a", "b", "c", "d"]
+through = st.lists(st.sampled_from(NAMES), unique=True, max_size=3).map(tuple)
+graphs = st.fixed_dictionaries(dict.fromkeys(NAMES, through))
+
+
+def made(graph: dict[str, tuple[str, ...]]) -> Topology:
+    gateways = tuple(Gateway(name, "h:1", ups, (1,)) for name, ups in graph.items())
+    return Topology(gateways, {"ada": ("a", "b")}, ("c",))
+
+
+def reaches(graph: dict[str, tuple[str, ...]], start: str) -> set[str]:
+    found: set[str] = set()
+    stack = list(graph[start])
+    while stack:
+        name = stack.pop()
+        if name not in found:
+            found.add(name)
+            stack += graph[name]
+    return found
+
+
+@given(graphs)
+def test_a_loop_is_found_where_there_is_one(graph):
+    """A loop is reported exactly where somebody reaches itself, and each step of it is real."""
+    loop = find_loop(graph)
+    assert bool(loop) == any(name in reaches(graph, name) for name in graph)
+    if loop:
+        assert loop[0] == loop[-1]
+        assert all(b in graph[a] for a, b in pairwise(loop))
+
+
+@given(graphs)
+def test_what_is_written_is_read_unless_it_loops(graph):
+    """A topology survives JSON; one with a loop is refused by every reader."""
+    topology = made(graph)
+    raw = json.loads(json.dumps(topologies.to_plain(topology)))
+    if find_loop(graph):
+        with pytest.raises(StateError, match="loop"):
+            topologies.from_plain(raw)
+    else:
+        assert topologies.from_plain(raw) == topology
+
+
+@given(
+    st.recursive(
+        st.none() | st.integers() | st.text(),
+        lambda s: (
+            st.lists(s)
+            | st.dictionaries(
+                st.sampled_from(
+                    ["gateways", "robots", "through", "name", "endpoint", "generations"]
+                ),
+                s,
+            )
+        ),
+    )
+)
+def test_anything_else_is_an_error(raw):
+    """Whatever JSON comes, a reader returns a topology or raises `StateError`."""
+    try:
+        topologies.from_plain(raw)
+    except StateError:
+        return
+    assert set(raw) >= {"gateways", "robots", "through"}
+
+
+def test_neighbours():
+    """Robots by name, else the default; gateways by their own `through`; strangers the replicas."""
+    topology = made({"a": ("b",), "b": (), "c": (), "d": ()})
+
+    def of(role: Role, name: str) -> list[str]:
+        return [g.name for g in topology.neighbours(Holder(role, name, 1, UID))]
+
+    assert of(Role.ROBOT, "ada") == ["a", "b"]
+    assert of(Role.ROBOT, "bob") == ["c"]
+    assert of(Role.GATEWAY, "a") == ["b"]
+    assert of(Role.GATEWAY, "b") == []
+    assert of(Role.GATEWAY, "unknown") == []

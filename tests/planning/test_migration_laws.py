@@ -1,0 +1,105 @@
+"""Who moves in a pool that is whole and quiet: what spares work changes no plan."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.model.choices import MigrationSpec, OnDemandSpec
+from fogft.model.replica import Offer
+from fogft.planning import migration
+from fogft.planning.buying import Buyer
+from fogft.planning.classification import take_census
+from fogft.planning.observed.health import judge
+from fogft.planning.observed.history import Event, EventKind
+from fogft.planning.sizing import size
+from tests.planning.pool_worlds import NOW, PLACES, UID, World, applied, replica, spec
+
+PRICES = st.sampled_from([0.02, 0.1, 0.2, 0.5])
+WANTED = st.integers(1, 4)
+RULES = st.builds(MigrationSpec, st.sampled_from([0.1, 0.3]), st.sampled_from([60.0, 3600.0]))
+ON_DEMAND = st.sampled_from([OnDemandSpec(), OnDemandSpec(1, False), OnDemandSpec(0, True)])
+
+
+@st.composite
+def quiet(draw: st.DrawFn) -> World:
+    """A pool in which all serve, each somewhere, with places that refused and lost some."""
+    asked = spec(
+        draw(WANTED),
+        max_surge=draw(st.integers(0, 2)),
+        max_usd_per_hour=draw(st.sampled_from([None, None, 0.5])),
+        migration=draw(RULES),
+        on_demand=draw(ON_DEMAND),
+    )
+    sold = [
+        Offer(replace(place, spot=spot), draw(PRICES))
+        for place in PLACES
+        for spot in (True, False)
+        if draw(st.booleans())
+    ]
+    homes = st.sampled_from([replace(p, spot=spot) for p in PLACES for spot in (True, True, False)])
+    world = World(asked, offers=tuple(sold)).having(
+        *(
+            replica(
+                slot,
+                at=draw(homes),
+                age_s=draw(st.sampled_from([100.0, 5000.0])),
+                price=draw(PRICES),
+                of=asked,
+            )
+            for slot in range(asked.replicas)
+        )
+    )
+    past = []
+    for generation in range(1, draw(st.integers(0, 4)) + 1):
+        at, place = NOW - draw(st.floats(1, 4000)), draw(st.sampled_from(PLACES))
+        kind = draw(st.sampled_from([EventKind.REFUSED, EventKind.GONE]))
+        past.append(Event(at, EventKind.LAUNCH, 9, generation, place.location))
+        past.append(Event(at, kind, 9, generation, "", "capacity: full"))
+    return replace(world, events=tuple(sorted((*world.events, *past), key=lambda e: e.at)))
+
+
+def buyer(world: World) -> Buyer:
+    """What the planner asks who is to move."""
+    health = judge(UID, world.spec, world.observed, world.history)
+    sized = size(world.spec, world.intent, world.observed)
+    census = take_census(world.spec, world.intent, world.observed, health=health, size=sized)
+    cap = sized.max_usd_per_hour
+    seen = world.observed, world.history
+    return Buyer(world.spec, world.intent, *seen, census, sized.groups, cap)
+
+
+@given(quiet())
+def test_nobody_moves_who_would_not_if_nothing_rested_or_were_avoided(world: World) -> None:
+    """To ask the restless alone who moves, and where to, is to ask everybody."""
+    asked = buyer(world)
+    everybody = [standing.id for standing in asked.census.good]
+    found = migration.mover(asked, world.now, everybody)
+    narrowed = migration.mover(asked, world.now, migration.restless(asked))
+    assert found == narrowed
+
+
+@given(quiet())
+def test_a_move_under_way_leaves_nothing_to_plan(world: World) -> None:
+    """Who moves is not ended, and nobody else comes, before the successor serves."""
+    planned = world.plan()
+    again = applied(world, planned).plan()
+    assert not again.launches
+    assert not again.terminations
+    assert set(again.draining) == set(planned.draining)
+
+
+@given(quiet(), quiet(), st.booleans())
+def test_what_was_planned_before_changes_no_plan(
+    world: World, other: World, same_offers: bool
+) -> None:
+    """An answer that is kept is that of the same question: another pool's history is none."""
+    asked_before = replace(other, spec=world.spec)
+    if same_offers:
+        asked_before = replace(asked_before, offers=world.offers)
+    asked_before.plan()
+    world.plan()
+    fresh = replace(world, spec=replace(world.spec))
+    assert world.plan() == fresh.plan()

@@ -1,0 +1,473 @@
+"""Rules of placement, size, mixture and migration, for pools that live through simulated days."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fogft.model.choices import (
+    AvailabilitySpec,
+    GroupSpec,
+    MigrationSpec,
+    OnDemandSpec,
+    PlacementSpec,
+    ScheduleSpec,
+    WindowSpec,
+)
+from fogft.model.groups import CRITICAL_BLOCK, services_at
+from fogft.model.replica import Offer, Placement
+from fogft.model.scoring import Weights
+from fogft.model.spec import PoolSpec
+from fogft.planning.availability import Assumption, Correlation, expected
+from fogft.planning.observed.history import Event, EventKind
+from tests.planning.pool_worlds import (
+    NOW,
+    SERVICE,
+    UID,
+    World,
+    applied,
+    elapsed,
+    replica,
+    serving,
+    spec,
+)
+
+some = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+MIXED = OnDemandSpec(0, True)
+
+
+def offer(place: str, price: float, *, spot: bool = True, group: str = "") -> Offer:
+    cloud, region, zone = place.split("/")
+    kind = "s" if spot else "d"
+    return Offer(Placement(cloud, region, zone, kind, spot), price, group=group)
+
+
+SPOT = tuple(offer(p, 0.1) for p in ("a/r/1", "a/r/2", "b/r/1"))
+ON_DEMAND = tuple(offer(p, 0.3, spot=False) for p in ("a/r/1", "b/r/1"))
+
+
+def lived(world: World, steps: int, seconds: float = 30.0) -> tuple[World, int]:
+    """Carry plans out for a while; return the world after, and how many launches there were."""
+    launched = 0
+    for _ in range(steps):
+        planned = world.plan()
+        launched += len(planned.launches)
+        world = elapsed(applied(world, planned), seconds)
+    return world, launched
+
+
+def ours(world: World) -> list[Placement]:
+    return [m.placement for m in world.machines or () if m.id.pool_uid == UID]
+
+
+# -- spread and price ------------------------------------------------------------------------
+
+offers = st.lists(
+    st.tuples(
+        st.sampled_from(["a", "b", "c"]), st.sampled_from(["r", "s"]), st.sampled_from(["1", "2"])
+    ),
+    min_size=1,
+    unique=True,
+).flatmap(
+    lambda places: st.tuples(
+        *(st.floats(0.05, 1).map(lambda price, p=p: offer("/".join(p), price)) for p in places)
+    )
+)
+
+
+@some
+@given(offers, st.integers(2, 6), st.none() | st.floats(0.2, 3))
+def test_never_all_in_one_domain_when_another_is_affordable(sold, count, cap):
+    """Where replicas share one cloud (or region), no offer elsewhere was within the budget."""
+    world = World(spec(count, max_usd_per_hour=cap), offers=sold)
+    chosen = [launch.offer for launch in world.plan().launches]
+    if len(chosen) < 2:
+        return
+    for domain in (lambda p: p.cloud, lambda p: (p.cloud, p.region)):
+        used = {domain(o.placement) for o in chosen}
+        if len(used) == 1:
+            left = math.inf if cap is None else cap - chosen[0].usd_per_hour
+            others = [o for o in sold if domain(o.placement) not in used]
+            assert all(o.usd_per_hour > left + 1e-9 for o in others)
+
+
+@some
+@given(offers, st.integers(1, 6), st.floats(0.05, 3))
+def test_a_pool_that_lives_never_exceeds_its_cap(sold, count, cap):
+    world = World(spec(count, max_usd_per_hour=cap), offers=sold)
+    for _ in range(6):
+        world = elapsed(applied(world, world.plan()), 30.0)
+        assert sum(m.usd_per_hour for m in world.machines or ()) <= cap + 1e-6
+
+
+def test_distance_and_price_are_weighed():
+    """Twice as far for a third of the price is worth it; with a heavier latency it is not."""
+    near, far = offer("a/near/1", 0.30), offer("a/far/1", 0.10)
+    rtt_s = {"a/near": 0.02, "a/far": 0.04}
+
+    def first(weights: Weights) -> str:
+        asked = spec(1, placement=PlacementSpec(weights))
+        [launch] = World(asked, offers=(near, far), rtt_s=rtt_s).plan().launches
+        return launch.offer.placement.region
+
+    assert first(Weights(1, 1)) == "far"
+    assert first(Weights(1, 2)) == "near"
+    assert first(Weights(0, 1)) == "near"
+
+
+@pytest.mark.parametrize("price", [-0.1, math.nan, math.inf])
+def test_an_impossible_price_launches_nothing_there(price):
+    wrong = offer("a/r/1", price)
+    planned = World(spec(1), offers=(wrong,)).plan()
+    assert not planned.launches
+    assert "impossible price" in planned.notes[0]
+    [launch] = World(spec(1), offers=(wrong, offer("b/r/1", 9.0))).plan().launches
+    assert launch.offer.placement.cloud == "b"
+
+
+def test_losses_are_avoided_for_longer_each_time_and_forgiven():
+    """Lost once: avoided for 300 s; three times: for 1200 s; then as good as any other."""
+    cheap, dear = offer("a/r/1", 0.1), offer("a/r/2", 0.2)
+
+    def chosen(losses: int, age_s: float) -> str:
+        events = [
+            e
+            for n in range(losses)
+            for e in (
+                Event(NOW - age_s - 5000, EventKind.LAUNCH, 7, n + 1, "a/r/1"),
+                Event(NOW - age_s - 4900, EventKind.READY, 7, n + 1),
+                Event(NOW - age_s, EventKind.GONE, 7, n + 1),
+            )
+        ]
+        world = World(spec(1), offers=(cheap, dear), events=tuple(events))
+        [launch] = world.plan().launches
+        return launch.offer.placement.zone
+
+    assert [chosen(1, age) for age in (10, 290, 310)] == ["2", "2", "1"]
+    assert [chosen(3, age) for age in (310, 1190, 1210)] == ["2", "2", "1"]
+    assert chosen(3, -7000) == "1"  # the clock jumped back: what is to come counts for nothing
+
+
+# -- availability ----------------------------------------------------------------------------
+
+
+@some
+@given(offers, st.floats(0.5, 0.99999), st.floats(0, 0.3))
+def test_a_target_is_reached_by_no_more_than_it_needs(sold, target, correlation):
+    """The planned pool reaches the target and one fewer does not; or the note says it cannot."""
+    assumed = Assumption(correlation=Correlation(0.5, 0.3, correlation))
+    asked = spec(1, availability=AvailabilitySpec(target, assumed))
+    planned = World(asked, offers=sold).plan()
+    places = [launch.offer.placement for launch in planned.launches]
+    reached = expected(places, assumed).correlated
+    if any("cannot be met" in note for note in planned.notes):
+        assert reached < target
+        assert len(places) == 16
+    else:
+        assert reached >= target - 1e-9
+        assert len(places) == 1 or expected(places[:-1], assumed).correlated < target
+
+
+def test_a_target_out_of_reach_within_the_cap_says_what_the_money_buys():
+    asked = spec(1, availability=AvailabilitySpec(0.99999), max_usd_per_hour=0.25)
+    planned = World(asked, offers=SPOT).plan()
+    assert len(planned.launches) == 2
+    [note] = [n for n in planned.notes if "cannot be met" in n]
+    assert "2 replicas are expected to reach 0.99" in note
+    assert "`max_usd_per_hour`" in note
+
+
+def test_two_clouds_need_fewer_than_one():
+    """Correlation within a cloud costs replicas; the paper's independent figure is 2."""
+    asked = spec(1, availability=AvailabilitySpec(0.9995))
+    one_cloud = tuple(o for o in SPOT if o.placement.cloud == "a")
+    assert World(asked, offers=one_cloud).plan().wanted == 11  # in two zones of one region
+    assert World(asked, offers=SPOT).plan().wanted == 2
+
+
+def test_a_target_does_not_shrink_while_nothing_is_offered():
+    asked = spec(1, availability=AvailabilitySpec(0.9995))
+    world = World(asked, offers=()).having(*(replica(n, of=asked) for n in range(4)))
+    assert world.plan().wanted == 4
+    assert not world.plan().draining
+
+
+# -- groups, on-demand, critical services ------------------------------------------------------
+
+GROUPS = (
+    GroupSpec("anchor", 1, {"cpus": 4}),
+    GroupSpec("fast", 2, {"cpus": 16, "use_spot": True}, MIXED),
+)
+
+
+def test_each_group_gets_its_own_kind_in_its_own_slots():
+    sold = (
+        *(replace(o, group="anchor") for o in ON_DEMAND),
+        *(replace(o, group="fast") for o in SPOT),
+    )
+    planned = World(spec(3, groups=GROUPS), offers=sold).plan()
+    assert [(x.slot, x.offer.group, x.offer.placement.spot) for x in planned.launches] == [
+        (0, "anchor", False),
+        (100, "fast", True),
+        (101, "fast", True),
+    ]
+    assert len({x.offer.placement.location for x in planned.launches[1:]}) == 2
+
+
+def test_a_group_that_left_the_file_is_replaced_new_before_old():
+    asked = spec(1)
+    world = World(asked).having(replica(100, of=asked))
+    planned = world.plan()
+    assert [x.slot for x in planned.launches] == [0]
+    assert not planned.terminations
+    world, _ = lived(world, 6)
+    assert [m.id.slot for m in world.machines or ()] == [0]
+
+
+@some
+@given(st.integers(0, 3), st.integers(1, 4), st.lists(st.booleans(), min_size=4, max_size=10))
+def test_fallback_stands_in_within_the_target_and_gives_way(base, count, short):
+    """On demand never exceeds what is wanted; when spot is back, only the base stays on demand."""
+    base = min(base, count)
+    asked = spec(count, on_demand=OnDemandSpec(base, True))
+    world = World(asked)
+    for is_short in short:
+        sold = ON_DEMAND if is_short else (*SPOT, *ON_DEMAND)
+        world, _ = lived(replace(world, offers=sold), 3, 300.0)
+        on_demand = [p for p in ours(world) if not p.spot]
+        assert base <= len(on_demand) <= count
+        assert len(ours(world)) <= count + asked.max_surge
+        assert len(serving(world)) >= count
+    world, _ = lived(replace(world, offers=(*SPOT, *ON_DEMAND)), 30, 300.0)
+    assert sorted(p.spot for p in ours(world)) == [False] * base + [True] * (count - base)
+
+
+def test_fallback_keeps_to_the_cap():
+    asked = spec(2, on_demand=MIXED, max_usd_per_hour=0.5)
+    world, _ = lived(World(asked, offers=ON_DEMAND), 3)
+    assert len(ours(world)) == 1
+
+
+@pytest.mark.parametrize("cause", ["capacity", "quota"])
+def test_where_spot_is_refused_on_demand_of_the_same_place_stands_in(cause):
+    """A location at rest for spot machines is not at rest for on-demand ones, nor the reverse."""
+    spot, demand = offer("a/r/1", 0.1), offer("a/r/1", 0.3, spot=False)
+    mixed = spec(1, on_demand=OnDemandSpec(0, fallback=True))
+
+    def refused(*, on_demand: bool) -> tuple[Event, ...]:
+        launch = Event(NOW - 2, EventKind.LAUNCH, 0, 1, "a/r/1", on_demand=on_demand)
+        return launch, Event(NOW - 1, EventKind.REFUSED, 0, 1, detail=f"{cause}: none")
+
+    for was_on_demand in (False, True):
+        world = World(mixed, offers=(spot, demand), events=refused(on_demand=was_on_demand))
+        [launch] = world.plan().launches
+        assert launch.offer.placement.spot is was_on_demand
+
+
+def test_without_fallback_nothing_stands_in():
+    asked = spec(2, on_demand=OnDemandSpec(1, False))
+    world, _ = lived(World(asked, offers=ON_DEMAND), 3)
+    assert [p.spot for p in ours(world)] == [False]
+
+
+def test_critical_services_get_replicas_that_carry_them_alone():
+    critical = replace(SERVICE, name="/stop", replicas=4)
+    asked = replace(spec(2), services=(SERVICE, critical))
+    planned = World(asked).plan()
+    assert planned.wanted == 4
+    first = CRITICAL_BLOCK * 100
+    assert [x.slot for x in planned.launches] == [0, 1, first, first + 1]
+    assert [s.name for s in services_at(asked, 0)] == ["/plan", "/stop"]
+    assert [s.name for s in services_at(asked, first)] == ["/stop"]
+
+
+# -- schedule --------------------------------------------------------------------------------
+
+
+def with_window(replicas: int | None, cap: float | None) -> PoolSpec:
+    # NOW is a Tuesday, 22:13:20 UTC.
+    window = WindowSpec(frozenset(range(7)), 23 * 3600, 24 * 3600, replicas, cap)
+    return spec(2, schedule=ScheduleSpec("UTC", (window,), 600.0))
+
+
+def test_the_pool_is_whole_when_its_window_opens_and_shrinks_after():
+    opens = NOW - 22 * 3600 - 13 * 60 - 20 + 23 * 3600
+    opens -= (opens - NOW) // 86_400 * 86_400
+    world, _ = lived(World(with_window(4, None), now=opens - 900), 3, 60.0)
+    assert len(ours(world)) == 2
+    world = replace(world, now=opens - 600)
+    world, _ = lived(world, 3, 60.0)
+    assert world.now < opens
+    assert len(serving(world)) == 4
+    world, _ = lived(replace(world, now=opens + 3600.0), 6, 30.0)
+    assert len(ours(world)) == 2
+
+
+def test_a_lower_cap_ends_the_dearest_and_keeps_one():
+    asked = spec(3, max_usd_per_hour=0.25)
+    dear = replica(0, price=0.3, of=asked)
+    world = World(asked).having(dear, replica(1, of=asked), replica(2, of=asked))
+    assert [id.short for id in world.plan().draining] == ["0.1"]
+    world, _ = lived(world, 8)
+    assert sorted(m.usd_per_hour for m in world.machines or ()) == [0.1, 0.1]
+    lone = World(spec(1, max_usd_per_hour=0.01)).having(replica(0))
+    assert not lone.plan().draining
+
+
+# -- migration -------------------------------------------------------------------------------
+
+OLD = 4000.0  # older than `stay_s`
+
+
+def settled(*sold: Offer, count: int = 1, **others: object) -> World:
+    world, _ = lived(World(spec(count, **others), offers=sold), 4)
+    return elapsed(world, OLD)
+
+
+def test_a_replica_moves_to_a_much_cheaper_place_new_before_old():
+    world = settled(offer("a/r/1", 0.2))
+    world = replace(world, offers=(offer("a/r/1", 0.2), offer("a/r/2", 0.1)))
+    planned = world.plan()
+    [launch] = planned.launches
+    assert launch.offer.placement.zone == "2"
+    assert "50% better" in launch.reason
+    assert not planned.draining
+    for _ in range(5):
+        world = elapsed(applied(world, world.plan()), 5.0)
+        assert serving(world)
+    assert [p.zone for p in ours(world)] == ["2"]
+
+
+def test_a_nearer_place_moves_it_too():
+    world = settled(offer("a/r/1", 0.1))
+    sold = (offer("a/r/1", 0.1), offer("a/s/1", 0.1))
+    world = replace(world, offers=sold, rtt_s={"a/r": 0.1, "a/s": 0.02})
+    assert [x.offer.placement.region for x in world.plan().launches] == ["s"]
+
+
+def test_only_one_moves_at_a_time():
+    world = settled(offer("a/r/1", 0.2), offer("b/r/1", 0.2), count=2)
+    cheap = (offer("a/r/2", 0.05), offer("b/r/2", 0.05))
+    world = replace(world, offers=(*world.offers, *cheap))
+    assert len(world.plan().launches) == 1
+    assert not applied(world, world.plan()).plan().launches
+
+
+def test_spread_is_restored_when_a_domain_comes_back():
+    world = settled(offer("a/r/1", 0.1), count=2)
+    world = replace(world, offers=(offer("a/r/1", 0.1), offer("b/r/1", 0.4)))
+    world, launched = lived(world, 6)
+    assert launched == 1
+    assert {p.cloud for p in ours(world)} == {"a", "b"}
+
+
+def refused(place: str, *ages_s: float, generation: int = 1) -> tuple[Event, ...]:
+    """Launches of another slot that a location had no room for, so many seconds ago."""
+    return tuple(
+        event
+        for number, age_s in enumerate(ages_s, generation)
+        for event in (
+            Event(NOW - age_s, EventKind.LAUNCH, 9, number, place),
+            Event(NOW - age_s, EventKind.REFUSED, 9, number, detail="capacity: none"),
+        )
+    )
+
+
+def test_nobody_moves_to_where_there_was_no_room_within_an_hour():
+    """A move is no need: a full place is asked again an hour later, and a launch is at once."""
+    world = settled(offer("a/r/1", 0.2))
+    at = world.now - NOW
+    world = replace(world, offers=(offer("a/r/1", 0.2), offer("b/r/1", 0.02)))
+    for age_s, moves in ((3500.0, 0), (3700.0, 1)):
+        past = refused("b/r/1", age_s - at)
+        events = tuple(sorted((*world.events, *past), key=lambda e: e.at))
+        assert len(replace(world, events=events).plan().launches) == moves
+    needy = replace(world, machines=(), links=(), events=refused("b/r/1", 3500.0 - at))
+    assert [x.offer.placement.cloud for x in needy.plan().launches] == ["b"]
+
+
+def test_where_all_rest_the_one_resting_longest_is_tried_once_a_minute():
+    """Nobody waits for ten minutes when no location is left; one try at a time."""
+    sold = (offer("a/r/1", 0.1), offer("b/r/1", 0.1))
+    longest = refused("b/r/1", *range(300, 200, -10))  # ten times: rests for 600 s
+    later = refused("a/r/1", *range(190, 90, -10), generation=11)
+    world = World(spec(2), offers=sold, events=(*longest, *later))
+    [launch] = world.plan().launches
+    assert launch.offer.placement.cloud == "b"
+    assert "this location longest" in launch.reason
+    again = replace(world, events=(*world.events, *refused("b/r/1", 59.0, generation=21)))
+    assert not again.plan().launches
+    quota = tuple(e._replace(detail=e.detail.replace("capacity", "quota")) for e in world.events)
+    assert not replace(world, events=quota).plan().launches
+
+
+def test_migration_can_be_switched_off():
+    world = settled(offer("a/r/1", 0.2), migration=None)
+    world = replace(world, offers=(offer("a/r/1", 0.2), offer("b/r/2", 0.01)))
+    assert not world.plan().launches
+
+
+@some
+@given(offers, st.integers(1, 4))
+def test_with_steady_offers_moves_come_to_an_end(sold, count):
+    """A pool started on a part of the offers ends up where nothing moves any more."""
+    world = settled(*sold[: max(1, len(sold) // 2)], count=count)
+    world, _ = lived(replace(world, offers=sold), 40, OLD)
+    _, launched = lived(world, 10, OLD)
+    assert launched == 0
+
+
+@some
+@given(
+    offers,
+    st.integers(1, 3),
+    st.lists(st.lists(st.floats(0.9, 1.1), min_size=12, max_size=12), min_size=5, max_size=12),
+)
+def test_prices_that_waver_take_nobody_back(sold, count, wavers):
+    """Within 10 % up and down a pool may find a better layout, and never returns to a former one.
+
+    No two offers swing apart by more than 22 %: a move that needs 30 % lowers the steady price.
+    """
+    world = settled(*sold, count=count, migration=MigrationSpec(0.3, 60.0))
+    world, _ = lived(world, 20, OLD)
+    layouts = [sorted(ours(world))]
+    for factors in wavers:
+        now = tuple(
+            replace(o, usd_per_hour=o.usd_per_hour * f) for o, f in zip(sold, factors, strict=False)
+        )
+        for _ in range(3):
+            world, _ = lived(replace(world, offers=now), 1, OLD)
+            if len(ours(world)) == count and sorted(ours(world)) != layouts[-1]:
+                layouts.append(sorted(ours(world)))
+    assert all(layouts.count(one) == 1 for one in layouts)
+
+
+def test_a_waver_smaller_than_the_gain_moves_nothing():
+    world = settled(offer("a/r/1", 0.1), offer("a/r/2", 0.1), migration=MigrationSpec(0.3, 60.0))
+    for cheap in (0.085, 0.115) * 10:
+        sold = (offer("a/r/1", 0.2 - cheap), offer("a/r/2", cheap))
+        world, launched = lived(replace(world, offers=sold), 2, OLD)
+        assert launched == 0
+
+
+@some
+@given(st.lists(st.booleans(), min_size=4, max_size=20))
+def test_no_replica_moves_twice_within_its_stay(flips):
+    """Whatever prices do, a replica that has just moved stays for `stay_s`."""
+    a, b = offer("a/r/1", 0.1), offer("a/r/2", 0.1)
+    world = settled(a, b)
+    moves = []
+    for flip in flips:
+        dear, cheap = (a, b) if flip else (b, a)
+        sold = (replace(dear, usd_per_hour=1.0), replace(cheap, usd_per_hour=0.1))
+        for _ in range(4):
+            world = replace(world, offers=sold)
+            planned = world.plan()
+            moves += [world.now] * len(planned.launches)
+            world = elapsed(applied(world, planned), 100.0)
+    assert all(later - before >= 3600.0 for before, later in itertools.pairwise(moves))

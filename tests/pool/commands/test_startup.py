@@ -1,0 +1,91 @@
+"""`up` on disk: new, changed, somebody else's, or cut short."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.errors import PoolNotFound, SpecError
+from fogft.model import intent as intents
+from fogft.model.names import POOL_UID_PATTERN
+from fogft.pool.commands import startup
+from fogft.pool.credentials import authority
+from fogft.poolfile import file
+from tests.pool.scene import Scene
+
+
+def test_a_new_pool_has_all_it_needs_and_is_private(scene: Scene) -> None:
+    """Identity, file, intent and CA, in a folder that only its user can enter."""
+    written = scene.write()
+    assert (written.created, written.changed) == (True, True)
+    assert POOL_UID_PATTERN.fullmatch(written.identity.uid)
+    assert scene.paths.folder.stat().st_mode & 0o777 == 0o700
+    assert scene.paths.spec.read_text() == scene.file.read_text()
+    for path in (scene.paths.identity, scene.paths.spec, scene.paths.credentials / "ca.key"):
+        assert path.stat().st_mode & 0o777 == 0o600
+    name = authority.describe(scene.paths.credentials / "ca.crt").common_name
+    assert name == f"fogft.{written.identity.uid}"
+
+
+def test_the_same_file_again_changes_nothing(scene: Scene) -> None:
+    """`up` is repeatable: same uid, same CA."""
+    first = scene.write()
+    ca = (scene.paths.credentials / "ca.crt").read_bytes()
+    second = scene.write()
+    assert second == startup.Written(first.identity, created=False, changed=False)
+    assert (scene.paths.credentials / "ca.crt").read_bytes() == ca
+
+
+def test_a_changed_file_is_applied_and_keeps_the_scale(scene: Scene) -> None:
+    """A change elsewhere keeps `scale`; the file's own `replicas` ends it."""
+    scene.write(replicas=2)
+    store = scene.store
+    store.write_intent(intents.scale(store.intent(), store.spec(), 1))
+    assert scene.write(replicas=2, timeout_s=9.0).changed
+    assert store.intent().wanted(store.spec()) == 3
+    scene.write(replicas=4)
+    assert store.intent().wanted(store.spec()) == 4
+
+
+def test_the_same_name_from_another_file_is_refused(scene: Scene) -> None:
+    """Two projects that call their pool alike do not change each other's."""
+    scene.write()
+    other = scene.home / "other.yaml"
+    other.write_text(scene.file.read_text().replace("replicas: 2", "replicas: 3"))
+    with pytest.raises(SpecError, match="was started from") as caught:
+        startup.write(
+            scene.store,
+            file.read(other),
+            source=other.read_text(),
+            file=other,
+            cloud="folder",
+        )
+    assert "fogft down pool" in caught.value.hint
+    assert scene.store.spec().replicas == 2
+
+
+def test_another_cloud_is_refused(scene: Scene) -> None:
+    """A pool does not move between clouds under its machines' feet."""
+    scene.write()
+    with pytest.raises(SpecError, match="runs on cloud `folder`"):
+        startup.write(
+            scene.store,
+            file.read(scene.file),
+            source=scene.file.read_text(),
+            file=scene.file,
+            cloud="sky",
+        )
+
+
+def test_an_up_cut_short_is_an_up_that_never_was(scene: Scene) -> None:
+    """Without the identity there is no pool, and the next `up` starts over with a new CA."""
+    first = scene.write()
+    scene.paths.identity.unlink()
+    scene.paths.history.write_text('{"at": 1, "event": "launch", "slot": 0, "generation": 7}\n')
+    with pytest.raises(PoolNotFound):
+        scene.store.identity()
+    second = scene.write()
+    assert second.created
+    assert second.identity.uid != first.identity.uid
+    name = authority.describe(scene.paths.credentials / "ca.crt").common_name
+    assert name == f"fogft.{second.identity.uid}"
+    assert not scene.paths.history.exists()

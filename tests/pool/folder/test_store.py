@@ -1,0 +1,141 @@
+"""What is on disk: whole or not at all, remembered before it is done, readable after a crash."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from fogft import disk
+from fogft.errors import PoolNotFound, StateError
+from fogft.model.intent import Intent
+from fogft.model.replica import Membership
+from fogft.planning.observed.history import Event, EventKind
+from fogft.pool.folder import history_file
+from fogft.pool.folder.store import read_identity
+from tests.pool.scene import Scene, store_of
+
+LAUNCH = Event(1.0, EventKind.LAUNCH, 0, 1, "c/r/a", "fills a new slot")
+READY = Event(2.0, EventKind.READY, 0, 1)
+
+
+@pytest.fixture
+def pool(scene: Scene) -> Scene:
+    """A pool as `up` writes it, without a manager."""
+    scene.write()
+    return scene
+
+
+def test_history_outlives_the_process(pool: Scene) -> None:
+    """Another store over the same folder knows what the first one wrote."""
+    pool.store.append(LAUNCH)
+    pool.store.append(READY)
+    other = store_of(pool.home)
+    assert other.recent() == [LAUNCH, READY]
+    assert other.history().generation(0) == 1
+    assert pool.paths.history.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("torn", ["{", '{"at": 3, "event": "rea', "\x00\x00\x00", "null"])
+def test_torn_last_line_costs_that_line_only(pool: Scene, torn: str) -> None:
+    """A crash in the middle of a write loses nothing before it and nothing after it."""
+    pool.store.append(LAUNCH)
+    with pool.paths.history.open("a") as file:
+        file.write(torn)
+    other = store_of(pool.home)
+    assert other.recent() == [LAUNCH]
+    other.append(READY)
+    assert store_of(pool.home).recent() == [LAUNCH, READY]
+
+
+def test_full_disk_is_an_error_and_nothing_has_happened(
+    pool: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An event that could not be written is not in the history, on disk or in memory."""
+    pool.store.append(LAUNCH)
+
+    def full(descriptor: int, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        with pytest.raises(StateError, match="No space left"):
+            pool.store.append(LAUNCH._replace(generation=2))
+    assert pool.store.history().generation(0) == 1
+    assert store_of(pool.home).recent() == [LAUNCH]
+
+
+def test_half_written_event_is_taken_back(pool: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When the disk takes only half a line, the half is cut off again."""
+    pool.store.append(LAUNCH)
+    before = pool.paths.history.read_bytes()
+    write = os.write
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", lambda d, data: write(d, data[:10]))
+        with pytest.raises(StateError):
+            pool.store.append(READY)
+    assert pool.paths.history.read_bytes() == before
+
+
+def test_history_is_compacted_as_it_grows(pool: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A year of flapping does not fill the disk, and keeps generations and readiness."""
+    monkeypatch.setattr(history_file, "COMPACT_AFTER", 50)
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    pool.store.append(LAUNCH)
+    for at in range(200):
+        kind = EventKind.UNREADY if at % 2 else EventKind.READY
+        pool.store.append(Event(float(at), kind, 0, 1))
+    assert len(pool.paths.history.read_text().splitlines()) < 60
+    record = store_of(pool.home).history().record(0, 1)
+    assert record is not None
+    assert (record.first_ready_at, record.unready_since) == (0.0, 199.0)
+
+
+def test_intent_and_membership_round_trip(pool: Scene) -> None:
+    """What is written is what is read."""
+    intent = Intent(target=3, scaled_from=2, drained={1: 2}, excluded=frozenset({"c/r"}))
+    pool.store.write_intent(intent)
+    assert pool.store.intent() == intent
+    membership = Membership("pool", "0" * 16, 2, 3)
+    pool.store.write_membership(membership)
+    assert pool.store.membership() == membership
+
+
+def test_damaged_files_are_told_apart_from_missing_ones(pool: Scene) -> None:
+    """A damaged intent is an error, a missing one is empty; a damaged membership is none."""
+    pool.paths.intent.write_text("{")
+    with pytest.raises(StateError, match="damaged"):
+        pool.store.intent()
+    pool.paths.intent.unlink()
+    assert pool.store.intent() == Intent()
+    pool.paths.membership.write_text('{"epoch": 1}')
+    assert pool.store.membership() is None
+
+
+@pytest.mark.parametrize(
+    "damage", [{"uid": "short"}, {"uid": None}, {"created_at": "yesterday"}, {"name": ...}]
+)
+def test_damaged_identity_is_an_error(pool: Scene, damage: dict[str, object]) -> None:
+    """Machines are ended by uid, so a uid that is not one is never used."""
+    raw = {**disk.read_json(pool.paths.identity), **damage}
+    pool.paths.identity.write_text(json.dumps({k: v for k, v in raw.items() if v is not ...}))
+    with pytest.raises(StateError, match="damaged"):
+        read_identity(pool.paths)
+
+
+def test_no_pool_is_its_own_error(tmp_path: Path) -> None:
+    """Asking for what is not there says so, with what to do."""
+    with pytest.raises(PoolNotFound) as caught:
+        store_of(tmp_path, "nothing").identity()
+    assert "fogft up" in caught.value.hint
+
+
+def test_spec_is_read_again_when_it_changes(pool: Scene) -> None:
+    """The stored file is parsed once per content."""
+    first = pool.store.spec()
+    assert pool.store.spec() is first
+    pool.write(replicas=3)
+    assert pool.store.spec().replicas == 3

@@ -1,0 +1,138 @@
+"""What a manager with a rendezvous in its pool file signs, over epochs and addresses."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from pathlib import Path
+
+import pytest
+
+from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model import names
+from fogft.model.certificate_holder import Holder, Role
+from fogft.model.membership import Found, members_of
+from fogft.model.replica import Machine, MachinePhase, Member, Membership, Placement, ReplicaId
+from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.pool.credentials import authority
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager.announcing import ManagerRecords
+from fogft.records import cache
+from fogft.records.exchange import Exchange
+from fogft.records.record import RecordKind
+from fogft.records.record_set import RecordSet
+from fogft.records.roster import admission
+from fogft.records.server import RendezvousServer
+from fogft.records.signing import Verifier
+from tests.link.wire_pool import wait_for
+
+UID = "0123456789abcdef"
+
+
+class Place:
+    """A rendezvous in a thread."""
+
+    def __init__(self, folder: Path) -> None:
+        name = names.rendezvous_certificate_name(UID, "a")
+        authority.write(authority.issue(folder, name, role=Role.RENDEZVOUS), folder, "rendezvous")
+        files = CredentialPaths(
+            folder / "ca.crt", folder / "rendezvous.crt", folder / "rendezvous.key"
+        )
+        verify = Verifier(files.ca)
+        self.records = RecordSet(UID, verify)
+        self._server = RendezvousServer("127.0.0.1:0", files, verify, Exchange(self.records))
+        self._server.bind()
+        self.endpoint = self._server.endpoint
+        self._loop = asyncio.new_event_loop()
+        self._task = self._loop.create_task(self._server.serve())
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self._loop.run_until_complete(asyncio.gather(self._task, return_exceptions=True))
+        self._loop.close()
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._task.cancel)
+        self._thread.join()
+
+    def admitted(self) -> Membership | None:
+        record = self.records.get(RecordKind.ADMISSION)
+        return None if record is None else admission(record)
+
+
+@pytest.fixture
+def paths(tmp_path):
+    made = PoolPaths(tmp_path)
+    authority.create_authority(made.credentials, UID)
+    return made
+
+
+@pytest.fixture
+def place(paths):
+    made = Place(paths.credentials)
+    yield made
+    made.close()
+
+
+def membership(epoch: int, version: int, *slots: int, revoked: tuple[str, ...] = ()) -> Membership:
+    members = tuple(Member(ReplicaId(UID, slot, 1), "10.0.0.1:1") for slot in slots)
+    return Membership("p", UID, epoch, version, members, frozenset(revoked))
+
+
+def test_every_change_is_published_and_the_next_manager_goes_on(paths, place):
+    first = ManagerRecords(paths, UID, 1)
+    first.look((place.endpoint,), membership(1, 1))
+    wait_for(lambda: place.admitted() == membership(1, 1))
+    first.look((place.endpoint,), membership(1, 2, 0, 1))
+    wait_for(lambda: place.admitted() == membership(1, 2, 0, 1))
+    assert first.trouble == ""
+    first.close()
+    second = ManagerRecords(paths, UID, 2)
+    second.look((place.endpoint,), membership(2, 1, 0))
+    wait_for(lambda: place.admitted() == membership(2, 1, 0))
+    second.close()
+    assert {r.body for r in cache.read(paths.manager_records)} == {
+        r.body for r in place.records.lacking({})
+    }
+
+
+def test_revocations_are_published(paths, place):
+    gone = Holder(Role.ROBOT, "eve", 1, UID).common_name
+    manager = ManagerRecords(paths, UID, 1)
+    manager.look((place.endpoint,), membership(1, 1, 0, revoked=(gone,)))
+    wait_for(lambda: place.records.revoked == {gone})
+    manager.close()
+
+
+def test_without_a_rendezvous_nothing_is_made(paths):
+    manager = ManagerRecords(paths, UID, 1)
+    manager.look((), membership(1, 1))
+    assert not (paths.credentials / "manager.crt").exists()
+    assert not paths.manager_records.exists()
+
+
+def test_it_says_when_none_can_be_reached_and_follows_a_changed_file(paths, place):
+    manager = ManagerRecords(paths, UID, 1)
+    manager.look(("127.0.0.1:1",), membership(1, 1, 0))
+    wait_for(lambda: "refused" in manager.trouble.lower())
+    manager.look((place.endpoint,), membership(1, 1, 0))
+    wait_for(lambda: place.admitted() == membership(1, 1, 0))
+    manager.close()
+
+
+def test_a_replica_whose_address_the_cloud_does_not_know_is_admitted_where_it_can_be_found():
+    """By its own record or at the door; without either there is nothing to link to."""
+    where = Placement("local", "r", "z", "i")
+    machine = Machine(ReplicaId(UID, 0, 1), where, MachinePhase.RUNNING, 0.0)
+    known = Machine(ReplicaId(UID, 1, 1), where, MachinePhase.RUNNING, 0.0, "10.0.0.1:1")
+    services = (ServiceSpec("/a", "std_srvs/srv/SetBool"),)
+
+    def endpoints(**keys: object) -> dict[int, str]:
+        found = Found.of(PoolSpec("p", services, **keys))
+        members = members_of((machine, known), pool_uid=UID, found=found)
+        return {m.id.slot: m.endpoint for m in members}
+
+    assert endpoints() == {1: "10.0.0.1:1"}
+    assert endpoints(rendezvous=("h:1",)) == {0: "", 1: "10.0.0.1:1"}
+    assert endpoints(dial_in="h:1") == {0: "", 1: ""}

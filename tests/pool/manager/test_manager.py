@@ -1,0 +1,227 @@
+"""The manager as a real process: killed, stopped, doubled, and told what to do by files."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+import pytest
+
+from fogft import disk, logfile
+from fogft.errors import PoolBusy
+from fogft.model import intent as intents
+from fogft.pool.commands import startup
+from fogft.pool.folder.lease import Lease, read_pid
+from tests.pool.scene import Scene
+
+
+def test_manager_brings_up_what_the_file_asks_for(scene: Scene) -> None:
+    """A started manager launches, certifies, configures and reports."""
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    assert scene.running() == ["0.1", "1.1"]
+    assert len({r["location"] for r in scene.status()["replicas"]}) == 2
+    for private in (scene.paths.proxy_config, scene.paths.credentials / "robot.key"):
+        assert private.stat().st_mode & 0o777 == 0o600
+    machine = disk.read_json(next(scene.cloud.folder.glob("*.json")))
+    assert machine["files"] == ["ca.crt", "replica.crt", "replica.key", "replica.yaml"]
+
+
+def test_killed_manager_stops_nothing_and_the_next_one_adopts(scene: Scene) -> None:
+    """SIGKILL of the manager costs no machine and no proxy; its successor launches nothing."""
+    scene.write(replicas=2)
+    first = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    proxy = scene.status()["proxy_pid"]
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    scene.start_manager()
+    scene.wait(lambda: scene.status().get("epoch") == 2 and scene.whole(2))
+    assert scene.cloud.launched() == ["0.1", "1.1"]
+    assert scene.status()["proxy_pid"] == proxy
+
+
+def test_sigterm_ends_the_managing_only(scene: Scene) -> None:
+    """A manager told to stop exits cleanly and leaves machines and client proxy running."""
+    scene.write(replicas=1)
+    process = scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    process.terminate()
+    assert process.wait(20) == 0
+    assert scene.running() == ["0.1"]
+    assert disk.is_locked(scene.paths.proxy_lock)
+    assert not disk.is_locked(scene.paths.manager_lock)
+
+
+def test_second_manager_is_refused(scene: Scene) -> None:
+    """One pool, one manager: the second says who is in office and changes nothing."""
+    scene.write()
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    second = scene.start_manager()
+    assert second.wait(20) == 1
+    assert "has a manager already (pid" in scene._output()
+    assert scene.cloud.launched() == ["0.1", "1.1"]
+
+
+def test_manager_of_an_older_epoch_steps_down(scene: Scene) -> None:
+    """A manager that finds a later epoch in the lease stops at once."""
+    scene.write(replicas=1)
+    process = scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    disk.write_json(scene.paths.lease, {"epoch": 99, "pid": 1, "beat": 0})
+    assert process.wait(20) == 1
+    assert "has a later manager" in scene._output()
+
+
+def test_scale_and_file_change_reach_a_running_manager(scene: Scene) -> None:
+    """What the commands write into the folder is acted upon, without a signal or a socket."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    scene.store.write_intent(intents.scale(scene.store.intent(), scene.store.spec(), 2))
+    scene.wait(lambda: scene.whole(3))
+    assert 'timeout_s": 5.0' in scene.paths.proxy_config.read_text()
+    scene.write(replicas=2, timeout_s=7.0)
+    scene.wait(lambda: scene.whole(2))
+    scene.wait(lambda: 'timeout_s": 7.0' in scene.paths.proxy_config.read_text())
+
+
+def test_dead_proxy_is_started_again(scene: Scene) -> None:
+    """The client proxy comes back under a new pid, and no replica is touched for it."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    old = scene.status()["proxy_pid"]
+    os.kill(old, signal.SIGKILL)
+    scene.wait(lambda: scene.status()["proxy_pid"] not in (None, old))
+    assert scene.cloud.launched() == ["0.1"]
+
+
+def test_a_notice_is_answered_with_a_replacement_while_the_old_one_lives(scene: Scene) -> None:
+    """A replica asks to be left alone: the next one is launched at once, elsewhere.
+
+    The cloud knows of no notice here, as with real clouds: the link alone tells.
+    """
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    lost_in = next(r["location"] for r in scene.status()["replicas"] if r["slot"] == 1)
+    keeping = scene.cloud.keep("1.1")
+    (scene.paths.folder / "draining").write_text("1.1")
+    scene.wait(lambda: "1.2" in scene.cloud.launched())
+    assert "1.1" in scene.running()
+    keeping.unlink()
+    scene.wait(lambda: scene.running() == ["0.1", "1.2"] and scene.whole(2))
+    events = [(e["event"], e["replica"]) for e in scene.status()["events"]]
+    assert events.index(("launched", "1.2")) < events.index(("ending", "1.1"))
+    [after] = [r["location"] for r in scene.status()["replicas"] if r["slot"] == 1]
+    assert after != lost_in
+
+
+def test_a_pool_ends_by_itself_when_its_hours_are_over(scene: Scene) -> None:
+    """Machines, client proxy and manager go; the folder says why; `up` gives the hours again."""
+    scene.write(replicas=2, max_hours=2)
+    scene.let_hours_pass(2)
+    scene.write(replicas=2, max_hours=2)  # `up` on a pool whose hours are over
+    scene.let_hours_pass(1.9)
+    process = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    scene.write(replicas=2, max_hours=0.0001)  # the file takes them away
+    assert process.wait(30) == 0
+    assert scene.running() == []
+    assert not disk.is_locked(scene.paths.proxy_lock)
+    status = scene.status()
+    assert status["ended"] == "by itself, after 0.0001 hours (`max_hours`)"
+    assert (status["replicas"], status["proxy_alive"]) == ([], False)
+    assert "`max_hours` is over" in {e["detail"] for e in status["events"]}
+    scene.write(replicas=2, max_hours=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2) and not scene.status()["ended"])
+    assert scene.running() == ["0.2", "1.2"]
+
+
+def test_hours_that_are_over_end_a_pool_that_had_no_manager(scene: Scene) -> None:
+    """Killed before the end, and started again after it: it launches nothing, and cleans up."""
+    scene.write(replicas=1, max_hours=2)
+    first = scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    scene.let_hours_pass(2)
+    assert scene.start_manager().wait(30) == 0
+    assert scene.running() == []
+    assert scene.cloud.launched() == ["0.1"]
+    assert not disk.is_locked(scene.paths.proxy_lock)
+
+
+def test_a_cloud_that_does_not_answer_does_not_end_the_ending(scene: Scene) -> None:
+    """Over, and the cloud is silent: the manager stays until it is certain that nothing runs."""
+    scene.write(replicas=1, max_hours=2)
+    process = scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    (scene.cloud.folder / "outage").touch()
+    scene.wait(lambda: not scene.status()["cloud_reachable"])
+    scene.let_hours_pass(2)
+    scene.wait(lambda: any("are over" in note for note in scene.status()["notes"]))
+    assert process.poll() is None
+    (scene.cloud.folder / "outage").unlink()
+    assert process.wait(30) == 0
+    assert scene.running() == []
+
+
+def test_unreachable_cloud_changes_nothing(scene: Scene) -> None:
+    """While the cloud does not answer, status says so and keeps what was seen last."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    (scene.cloud.folder / "outage").touch()
+    scene.wait(lambda: not scene.status()["cloud_reachable"])
+    assert [r["slot"] for r in scene.status()["replicas"]] == [0]
+    (scene.cloud.folder / "outage").unlink()
+    scene.wait(lambda: scene.status()["cloud_reachable"] and scene.whole(1))
+    assert scene.cloud.launched() == ["0.1"]
+
+
+def test_lease_survives_damage_and_ends_with_its_holder(scene: Scene) -> None:
+    """A damaged lease gives a higher epoch all the same, if the membership knows one."""
+    scene.write()
+    scene.paths.lease.write_text("{torn")
+    lease = Lease.take(scene.paths, at_least=7)
+    assert lease.epoch == 8
+    assert read_pid(scene.paths) == os.getpid()
+    with pytest.raises(PoolBusy):
+        Lease.take(scene.paths)
+    lease.release()
+    assert Lease.take(scene.paths).epoch == 9
+
+
+def test_start_manager_reports_why_it_did_not_start(scene: Scene) -> None:
+    """A manager that dies at once is an error with the end of its log."""
+    scene.write()
+    with pytest.raises(Exception, match="did not start:\nboom"):
+        startup.start_manager(
+            scene.store, lambda _: [sys.executable, "-c", "import sys; sys.exit('boom')"]
+        )
+
+
+def test_start_manager_starts_one_only_where_there_is_none(scene: Scene) -> None:
+    """`up` on a managed pool starts nothing."""
+    scene.write(replicas=1)
+    assert startup.start_manager(scene.store, scene.command)
+    scene.wait(lambda: scene.whole(1))
+    assert not startup.start_manager(scene.store, scene.command)
+    assert [what.split(" ")[0] for what in scene.end()] == ["manager", "client", "replica"]
+
+
+def test_logs_of_the_pool_stay_bounded(scene: Scene) -> None:
+    """The manager shortens its own log and the client proxy's."""
+    scene.write(replicas=1)
+    logs = (scene.paths.manager_log, scene.paths.proxy_log)
+    for log in logs:
+        log.touch()
+        os.truncate(log, logfile.LIMIT_BYTES + 1)
+    scene.start_manager()
+    scene.wait(lambda: all(log.stat().st_size <= logfile.LIMIT_BYTES for log in logs))

@@ -1,0 +1,196 @@
+"""Long cloud calls: never two at once on a replica, and none is ever overlooked."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import pytest
+
+from fogft.errors import CloudUnreachable, NoCapacity, StateError
+from fogft.model.replica import LinkReport, LinkState, ReplicaId
+from fogft.planning.observed.history import Event, EventKind
+from fogft.planning.planner import PlannedLaunch
+from fogft.pool.folder.store import Identity
+from fogft.pool.manager.operations import Operations
+from fogft.pool.manager.reconciler import Reconciler
+from tests.fakes.cloud import MockCloud, zones
+from tests.planning.pool_worlds import NOW, SERVICE, UID, spec
+from tests.simulation.memory_store import MemoryStore
+
+ID = ReplicaId(UID, 0, 1)
+
+
+def test_one_operation_a_replica() -> None:
+    """A second one is refused until the first one's outcome was collected."""
+    waiting: list = []
+    operations: Operations[str] = Operations(waiting.append)
+    assert operations.start(ID, "first", lambda: None)
+    assert not operations.start(ID, "second", lambda: None)
+    waiting.pop()()
+    assert operations.busy() == {ID: "first"}  # ended, but nobody has looked yet
+    assert not operations.start(ID, "second", lambda: None)
+    assert [(o.subject, o.error) for o in operations.collect()] == [("first", None)]
+    assert operations.start(ID, "second", lambda: None)
+
+
+def test_outcome_carries_the_error_and_wakes(caplog: pytest.LogCaptureFixture) -> None:
+    """A refusal is data; a defect of an adapter is logged with its trace; both wake the owner."""
+    woken = threading.Event()
+    operations: Operations[None] = Operations(lambda run: run(), woken.set)
+
+    def refuse() -> None:
+        raise NoCapacity("full")
+
+    def break_down() -> None:
+        raise ZeroDivisionError
+
+    with caplog.at_level(logging.ERROR):
+        operations.start(ID, None, refuse)
+        assert not caplog.records
+        operations.start(ReplicaId(UID, 1, 1), None, break_down)
+    assert [type(o.error) for o in operations.collect()] == [NoCapacity, ZeroDivisionError]
+    assert caplog.records[0].exc_info
+    assert woken.is_set()
+
+
+class Bench:
+    """A reconciler over the mock cloud, its operations run by hand."""
+
+    def __init__(self, replicas: int = 1) -> None:
+        self.now = NOW
+        self.cloud = MockCloud(lambda: self.now, zones("east/one/a", "west/one/a"))
+        self.store = MemoryStore(Identity("pool", UID, "mock", "/p", NOW), spec(replicas))
+        self.waiting: list = []
+        self.ready = True
+        self.reconciler = Reconciler(
+            self.cloud,
+            self.store,
+            clock=lambda: self.now,
+            links=self.links,
+            submit=self.waiting.append,
+        )
+
+    def links(self, uid: str, now: float) -> tuple[LinkReport, ...]:
+        members = self.store.published.members if self.store.published else ()
+        ready = frozenset({SERVICE.name}) if self.ready else frozenset()
+        return tuple(LinkReport(m.id, LinkState.UP, ready) for m in members)
+
+    def run(self) -> None:
+        while self.waiting:
+            self.waiting.pop(0)()
+
+    def kinds(self) -> list[EventKind]:
+        return [event.kind for event in self.store.events]
+
+
+def test_launch_is_in_the_history_before_the_cloud_is_asked() -> None:
+    """And while the call is under way nothing more is ordered, though the list lacks it."""
+    bench = Bench()
+    bench.reconciler.tick()
+    assert bench.kinds() == [EventKind.LAUNCH]
+    assert bench.cloud.calls.launched == []
+    for _ in range(3):
+        tick = bench.reconciler.tick()
+        assert tick.plan.launches == ()
+    assert len(bench.waiting) == 1
+
+
+def test_refused_launch_is_followed_elsewhere_under_a_new_generation() -> None:
+    """A want of capacity is remembered with its cause, and the next offer is tried."""
+    bench = Bench()
+    bench.cloud.zones["east/one/a"].capacity = 0
+    bench.reconciler.tick()
+    bench.run()
+    bench.reconciler.tick()
+    bench.run()
+    assert bench.kinds() == [EventKind.LAUNCH, EventKind.REFUSED, EventKind.LAUNCH]
+    assert bench.store.events[1].detail.startswith("capacity: ")
+    assert [id.short for id in bench.cloud.calls.launched] == ["0.2"]
+
+
+def test_launch_of_unknown_outcome_is_looked_up() -> None:
+    """Unreachable is not refused: what the cloud lists counts, what it lacks is followed."""
+    bench = Bench()
+    bench.cloud.fail_next("launch", CloudUnreachable("?"))
+    bench.reconciler.tick()
+    bench.run()
+    bench.reconciler.tick()
+    assert bench.kinds() == [EventKind.LAUNCH, EventKind.GONE, EventKind.LAUNCH]
+
+
+def test_readiness_is_remembered_once_for_each_change() -> None:
+    """READY, UNREADY and READY again, however many ticks pass in between."""
+    bench = Bench()
+    for ready in (True, True, False, False, True, True):
+        bench.ready = ready
+        for _ in range(3):
+            bench.reconciler.tick()
+            bench.run()
+            bench.now += 2.0
+    assert bench.kinds() == [
+        EventKind.LAUNCH,
+        EventKind.READY,
+        EventKind.UNREADY,
+        EventKind.READY,
+    ]
+
+
+def test_machine_that_history_lacks_is_adopted() -> None:
+    """The cloud's list is the record: a lost history costs no machine."""
+    bench = Bench()
+    for _ in range(5):
+        bench.reconciler.tick()
+        bench.run()
+        bench.now += 2.0
+    bench.store.events.clear()
+    bench.store.reopen()
+    successor = Bench()
+    successor.store.published = bench.store.published
+    reconciler = Reconciler(
+        bench.cloud, successor.store, clock=lambda: bench.now, links=bench.links, epoch=2
+    )
+    tick = reconciler.tick()
+    assert (tick.plan.launches, tick.plan.terminations) == ((), ())
+    assert successor.store.history().generation(0) == 1
+
+
+def test_order_that_cannot_be_built_launches_nothing() -> None:
+    """An error while certificates are made leaves no trace in history or cloud."""
+    bench = Bench()
+
+    def fail(identity: Identity, asked: object, planned: PlannedLaunch) -> None:
+        raise StateError("no CA")
+
+    reconciler = Reconciler(
+        bench.cloud,
+        bench.store,
+        clock=lambda: bench.now,
+        links=bench.links,
+        build_order=fail,  # type: ignore[arg-type]
+    )
+    with pytest.raises(StateError):
+        reconciler.tick()
+    assert bench.store.events == []
+    assert bench.cloud.calls.launched == []
+
+
+def test_prices_are_kept_while_the_cloud_is_away_for_prices() -> None:
+    """Old prices are better than none; a changed `resources` makes them useless."""
+    bench = Bench()
+    bench.reconciler.tick()
+    bench.run()
+    bench.now += 100.0
+    bench.cloud.fail_next("offers", CloudUnreachable("?"))
+    tick = bench.reconciler.tick()
+    assert len(tick.observed.offers) == 2
+    assert any("no prices" in note for note in tick.plan.notes)
+
+
+def test_events_are_one_per_line_facts() -> None:
+    """A history event is what it says: time, kind, replica, place and reason."""
+    bench = Bench()
+    bench.reconciler.tick()
+    assert bench.store.events == [
+        Event(NOW, EventKind.LAUNCH, 0, 1, "east/one/a", "fills a new slot")
+    ]

@@ -1,0 +1,156 @@
+"""`down` ends everything of a pool and nothing else, in whatever state the pool is."""
+
+from __future__ import annotations
+
+import signal
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from fogft import disk
+from fogft.cloud.port import Launch
+from fogft.errors import CloudUnreachable, FogftError, PoolNotFound
+from fogft.model.replica import ReplicaId
+from fogft.pool.manager import shutdown
+from tests.pool.folder_cloud import ZONES
+from tests.pool.scene import Scene
+
+STRANGER = ReplicaId("f" * 16, 0, 1)
+
+
+def test_down_ends_all_and_leaves_the_stranger(scene: Scene) -> None:
+    """Manager, proxy, machines and folder go; another pool's machine stays."""
+    scene.cloud.launch(Launch(STRANGER, "other", ZONES[0], 0.1, ""))
+    scene.write(replicas=2)
+    manager = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    uid = scene.store.identity().uid
+    told = scene.end()
+    assert manager.wait(10) == 0
+    assert [line.split(" ")[0] for line in told] == ["manager", "client", "replica", "replica"]
+    assert not scene.cloud.machines(uid)
+    assert [m.id for m in scene.cloud.machines(STRANGER.pool_uid)] == [STRANGER]
+    assert not scene.paths.folder.exists()
+    with pytest.raises(PoolNotFound):
+        scene.end()
+
+
+def test_down_works_when_the_manager_is_dead_or_frozen(scene: Scene) -> None:
+    """Neither a dead nor a stopped manager keeps a pool alive."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    frozen = scene._started[0]
+    frozen.send_signal(signal.SIGSTOP)
+    told = scene.end()
+    frozen.wait(10)
+    assert "replica 0.1 (folder/one/a)" in told
+    assert not scene.paths.folder.exists()
+
+
+def test_down_without_manager_or_proxy(scene: Scene) -> None:
+    """A pool that was written and never started is ended too."""
+    scene.write()
+    assert scene.end() == []
+    assert not scene.paths.folder.exists()
+
+
+def test_down_ends_what_the_list_forgot(scene: Scene) -> None:
+    """The clouds are asked past every memory before "nothing is left" is said."""
+    scene.write(replicas=2)
+    manager = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    manager.terminate()
+    manager.wait(20)
+    uid = scene.store.identity().uid
+    scene.cloud.forget(ReplicaId(uid, 1, 1))
+    warned: list[str] = []
+    told = scene.end(warned)
+    assert [what for what in told if what.startswith("replica")] == [
+        "replica 0.1 (folder/one/a)",
+        "replica 1.1 (folder/three/a)",
+    ]
+    assert not scene.cloud.audit().machines
+    assert warned == []
+
+
+def test_down_says_which_cloud_could_not_be_asked(scene: Scene) -> None:
+    """Its own list could not be had: whose word it is then, and how to look for oneself."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    uid = scene.store.identity().uid
+    (scene.cloud.folder / "mute").touch()
+    warned: list[str] = []
+    scene.end(warned)
+    [warning] = warned
+    assert warning.startswith("`folder` could not be asked itself")
+    assert f"`fogft-pool={uid}`" in warning
+
+
+def test_down_that_gets_no_answer_lists_what_may_still_run(scene: Scene) -> None:
+    """Which replicas, where, how to look, and when they end by themselves."""
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    (scene.cloud.folder / "outage").touch()
+    with pytest.raises(CloudUnreachable) as caught:
+        scene.end()
+    lines = caught.value.message.splitlines()
+    assert lines[0] == "it cannot be told what of `pool` still runs: told to be"
+    assert [line.strip() for line in lines[1:]] == [
+        "may still run: replica 0.1 (folder/one/a)",
+        "may still run: replica 1.1 (folder/three/a)",
+    ]
+    assert caught.value.hint == (
+        "run `fogft down pool` again; what hears of no manager ends by itself after 3600 s"
+    )
+
+
+def test_down_that_is_refused_says_by_whom_and_why(scene: Scene) -> None:
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    keeping = scene.cloud.keep("0.1")
+    with pytest.raises(FogftError) as caught:
+        shutdown.end(scene.store, lambda _: scene.cloud, limit_s=0)
+    assert caught.value.message == (
+        "these replicas did not end: `0.1` (folder/one/a): told to keep it"
+    )
+    keeping.unlink()
+    assert scene.end() == ["replica 0.1 (folder/one/a)"]
+
+
+def test_down_can_be_repeated_after_an_outage(scene: Scene) -> None:
+    """While the cloud cannot tell, the pool's files stay, so that the next try finds all."""
+    scene.write(replicas=1)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    (scene.cloud.folder / "outage").touch()
+    with pytest.raises(CloudUnreachable):
+        scene.end()
+    assert scene.store.intent().stopping
+    assert not disk.is_locked(scene.paths.manager_lock)
+    (scene.cloud.folder / "outage").unlink()
+    assert scene.end() == ["replica 0.1 (folder/one/a)"]
+
+
+def test_of_two_at_once_one_ends_the_pool_and_neither_complains(scene: Scene) -> None:
+    """The slower one finds nothing left to do."""
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    inode = scene.paths.intent_lock.stat().st_ino
+
+    def waiting() -> int:
+        lines = Path("/proc/locks").read_text().splitlines()
+        return sum("->" in line and f":{inode} " in line for line in lines)
+
+    with ThreadPoolExecutor(2) as threads:
+        with disk.locked(scene.paths.intent_lock):
+            downs = [threads.submit(scene.end) for _ in range(2)]
+            scene.wait(lambda: waiting() == 2)
+        ended = sorted(len(down.result()) for down in downs)
+    assert ended[0] == 0
+    assert ended[1] >= 3

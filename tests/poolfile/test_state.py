@@ -1,0 +1,195 @@
+"""`state` in a pool file: what it means, what it becomes, and how mistakes are told."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.errors import FogftError, SpecError
+from fogft.model.intent import Intent, scale
+from fogft.poolfile import file as pool_file
+from fogft.poolfile import service_form
+from fogft.poolfile.state import StateService, StateSpec
+
+FILE = """
+name: p
+run: exec serve
+fogft:
+  services:
+    - name: /count
+      type: std_srvs/srv/SetBool
+"""
+SHORT = "{snapshot: /count/get_state, restore: count/set_state}"
+LONG = (
+    "{snapshot: {name: /a, type: my_msgs/srv/GetState, field: state.data},"
+    " restore: {name: /b, type: my_msgs/srv/SetState, field: data}}"
+)
+
+
+def parse(state: str, more: str = "", **checks):
+    return pool_file.parse(f"{FILE}      state: {state}\n{more}", file="p.yaml", **checks)
+
+
+def test_names_alone_stand_for_the_types_of_the_helpers():
+    (service,) = parse(SHORT).services
+    assert service.state == StateSpec(
+        StateService("/count/get_state", "nav_msgs/srv/GetMap", "map.data"),
+        StateService("/count/set_state", "nav_msgs/srv/SetMap", "map.data"),
+    )
+
+
+def test_any_types_and_fields_can_be_named():
+    (service,) = parse(LONG).services
+    assert service.state == StateSpec(
+        StateService("/a", "my_msgs/srv/GetState", "state.data"),
+        StateService("/b", "my_msgs/srv/SetState", "data"),
+    )
+
+
+@pytest.mark.parametrize("state", [SHORT, LONG])
+def test_both_proxies_read_what_is_written(state):
+    (service,) = parse(state).services
+    assert service_form.from_plain(service_form.to_plain(service)) == service
+    for_replica = service_form.to_plain(service, service_form.REPLICA_KEYS)
+    assert service_form.from_plain(for_replica).state == service.state
+
+
+SHARED = SHORT.replace("}", ", shared: true}")
+
+
+def test_a_shared_service_needs_every_replica_of_the_pool_to_begin():
+    """Both proxies read it, and replicas that run go on when only their number changes."""
+    five = parse(SHARED, "  replicas: 5\n")
+    (service,) = five.services
+    assert service.state.shared
+    assert service.state.founders == 5
+    read = service_form.from_plain(service_form.to_plain(service))
+    assert (read.state.shared, read.state.founders) == (True, 5)
+    three = parse(SHARED, "  replicas: 3\n")
+    assert three.replica_hash == five.replica_hash != parse(SHORT).replica_hash
+
+
+@pytest.mark.parametrize("more", ["", "  replicas: 1\n"])
+def test_a_shared_service_with_too_few_replicas_is_refused(more):
+    with pytest.raises(SpecError, match=r"p.yaml:8: .*shared.*: needs 3 replicas or more"):
+        parse(SHARED, more)
+
+
+def test_running_replicas_are_replaced_when_a_service_becomes_stateful():
+    plain = pool_file.parse(FILE, file="p.yaml")
+    assert plain.replica_hash != parse(SHORT).replica_hash != parse(LONG).replica_hash
+
+
+@pytest.mark.parametrize(
+    ("state", "key", "what", "hint"),
+    [
+        ("[]", "state", "must be a map", "get_state"),
+        ("{snapshot: /a}", "state.restore", "is missing", "set_state"),
+        ("{snapshot: /a, restor: /b}", "state.restor", "unknown key", "restore"),
+        ("{snapshot: /a b, restore: /b}", "state.snapshot", "is not a service name", "/svc"),
+        ("{snapshot: 3, restore: /b}", "state.snapshot", "must be text", "quotes"),
+        ("{snapshot: {name: /a, type: x/srv/A}, restore: /b}", "field", "is missing", "type"),
+        ("{snapshot: {name: /a, field: x}, restore: /b}", "type", "is missing", "type"),
+        (
+            "{snapshot: {name: /a, type: x.A, field: d}, restore: /b}",
+            "snapshot.type",
+            "is not a service type",
+            "x/srv/A",
+        ),
+        (
+            "{snapshot: {name: /a, type: x/srv/A, field: a..b}, restore: /b}",
+            "snapshot.field",
+            "is not the path of a field",
+            "map.data",
+        ),
+    ],
+)
+def test_mistakes_name_line_key_and_remedy(state, key, what, hint):
+    with pytest.raises(SpecError) as caught:
+        parse(state)
+    message = caught.value.message
+    assert message.startswith("p.yaml:8: ")
+    assert key in message
+    assert what in message
+    assert hint in caught.value.hint
+
+
+@pytest.mark.parametrize("line", ["ok_field: success", "hedging: adaptive"])
+def test_what_does_not_go_with_state_is_refused(line):
+    with pytest.raises(SpecError, match="does not go with `state`"):
+        parse(SHORT, f"      {line}\n")
+
+
+def test_types_are_judged_where_they_can_be():
+    with pytest.raises(SpecError, match=r"p.yaml:8: fogft.services\[0\].state: no such field"):
+        parse(SHORT, check_states=lambda state: "no such field; name another")
+
+
+VOTING = FILE + "      quorum: 2\n"
+
+
+def test_a_quorum_and_its_tolerances_reach_the_client_proxy():
+    (service,) = pool_file.parse(
+        VOTING + "      tolerance: {plan.cost: 0.5, x: 1}\n", file="p.yaml"
+    ).services
+    assert (service.quorum, service.tolerance) == (2, (("plan.cost", 0.5), ("x", 1.0)))
+    assert service_form.from_plain(service_form.to_plain(service)) == service
+
+
+@pytest.mark.parametrize(
+    ("file", "what"),
+    [
+        (VOTING + "      ok_field: success\n", "does not go with `quorum`"),
+        (VOTING + "      hedging: failover\n", "does not go with `quorum`"),
+        (VOTING + f"      state: {SHORT}\n", "does not go with `state`"),
+        (FILE + "      tolerance: {x: 1}\n", "has no meaning here"),
+        (VOTING + "      tolerance: {a..b: 1}\n", "is not the path of a field"),
+        (VOTING + "      tolerance: {x: 0}\n", "must be above 0"),
+        (VOTING + "      tolerance: 3\n", "must be a map"),
+        (FILE + "      quorum: 1\n", "must be from 2 to 16"),
+    ],
+)
+def test_mistakes_with_a_quorum_are_told(file, what):
+    with pytest.raises(SpecError, match=what):
+        pool_file.parse(file, file="p.yaml")
+
+
+WINDOW = "  schedule: {time_zone: UTC, windows: [{days: mon, replicas: %d}]}\n"
+
+
+@pytest.mark.parametrize(
+    ("more", "fewest"),
+    [
+        ("      quorum: 3\n", 2),
+        ("      quorum: 5\n      replicas: 4\n", 4),
+        ("      quorum: 3\n  replicas: 2\n", 2),
+        ("      quorum: 2\n  availability: 0.99\n", 1),
+        ("      quorum: 2\n  groups: [{name: a, replicas: 1}]\n", 1),
+        ("      quorum: 3\n  replicas: 4\n" + WINDOW % 2, 2),
+    ],
+)
+def test_a_quorum_that_cannot_be_reached_is_refused(more, fewest):
+    """No answer could win, ever or at some time: that is said with file, line and key."""
+    expected = rf"p.yaml:8: fogft.services\[0\].quorum: is \d, but only {fewest} can be asked"
+    with pytest.raises(SpecError, match=expected) as refused:
+        pool_file.parse(FILE + more, file="p.yaml")
+    assert "a smaller `quorum`" in refused.value.hint
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        "      quorum: 2\n",
+        "      quorum: 4\n      replicas: 4\n",
+        "      quorum: 3\n  replicas: 3\n" + WINDOW % 4,
+        "      quorum: 2\n  replicas: 2\n  availability: 0.99\n",
+    ],
+)
+def test_a_quorum_that_can_be_reached_is_taken(more):
+    assert pool_file.parse(FILE + more, file="p.yaml").services[0].quorum > 1
+
+
+def test_a_pool_is_not_scaled_below_a_quorum():
+    spec = pool_file.parse(FILE + "      quorum: 2\n  replicas: 3\n", file="p.yaml")
+    fewer = scale(Intent(), spec, -1)
+    with pytest.raises(FogftError, match=r"cannot scale `p` to 1 replicas: .* has a quorum of 2"):
+        scale(fewer, spec, -1)

@@ -1,0 +1,71 @@
+"""`topology` in a pool file: what it means, and how mistakes are told."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.errors import SpecError
+from fogft.model.topology import Gateway, Topology
+from fogft.poolfile import file
+
+FILE = """name: p
+run: exec serve
+fogft:
+  services: [{name: /s, type: std_srvs/srv/SetBool%s}]
+  rendezvous: [meet:7450]
+  topology: %s
+"""
+
+
+def parse(topology: str, service: str = "", drop: str = ""):
+    text = (FILE % (service, topology)).replace(drop or "\0", "")
+    return file.parse(text, file="p.yaml").topology
+
+
+def test_what_is_written_is_what_is_meant():
+    found = parse(
+        "{gateways: [{name: a, endpoint: h:1, through: [b]}, {name: b, endpoint: h:2}],"
+        " robots: [{name: ada, through: [a, b]}, {name: bob, through: []}], through: [b]}"
+    )
+    assert found == Topology(
+        (Gateway("a", "h:1", ("b",)), Gateway("b", "h:2")), {"ada": ("a", "b"), "bob": ()}, ("b",)
+    )
+
+
+ONE = "gateways: [{name: a, endpoint: h:1}]"
+WRONG = {
+    "a loop": ("{gateways: [{name: a, endpoint: h:1, through: [b]},"
+               " {name: b, endpoint: h:2, through: [a]}]}", "loop: a -> b -> a"),
+    "itself": ("{gateways: [{name: a, endpoint: h:1, through: [a]}]}", "loop: a -> a"),
+    "unknown": ("{" + ONE + ", through: [c]}", "there is no gateway"),
+    "unknown of a robot": ("{" + ONE + ", robots: [{name: r, through: [c]}]}", "there is no"),
+    "robot twice": (
+        "{" + ONE + ", robots: [{name: r, through: []}, {name: r, through: []}]}", "twice"),
+    "gateway twice": ("{gateways: [{name: a, endpoint: h:1}, {name: a, endpoint: h:2}]}", "twice"),
+    "listed twice": ("{" + ONE + ", through: [a, a]}", "twice"),
+    "no list": ("{" + ONE + ", through: a}", "must be a list"),
+    "no endpoint": ("{gateways: [{name: a}]}", "is missing"),
+    "bad endpoint": ("{gateways: [{name: a, endpoint: here}]}", "not `host:port`"),
+    "bad name": ("{gateways: [{name: a b, endpoint: h:1}]}", "is not a name"),
+    "no gateways": ("{through: []}", "is missing"),
+    "unknown key": ("{" + ONE + ", robot: x}", "unknown key"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_mistakes_are_told_with_line_and_remedy(case):
+    topology, words = WRONG[case]
+    with pytest.raises(SpecError, match=words) as found:
+        parse(topology)
+    assert found.value.message.startswith("p.yaml:6: fogft.topology")
+    assert found.value.hint
+
+
+def test_what_does_not_go_with_gateways_is_refused():
+    """Votes and states need every replica to be asked by the robot itself."""
+    with pytest.raises(SpecError, match="which has `quorum`"):
+        parse("{" + ONE + "}", ", quorum: 2")
+    with pytest.raises(SpecError, match="which has `state`"):
+        parse("{" + ONE + "}", ", state: {snapshot: /a, restore: /b}")
+    with pytest.raises(SpecError, match="needs a `rendezvous`"):
+        parse("{" + ONE + "}", drop="  rendezvous: [meet:7450]\n")

@@ -1,0 +1,287 @@
+"""Dispatcher and responder of a stateful service, joined by hand: nothing happens by itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.errors import RosError, Unreadable
+from fogft.link.port import Answer, Refusal
+from fogft.model.spec import OnTimeout, ServiceSpec
+from fogft.poolfile.state import StateService, StateSpec
+from fogft.proxy.order_mark import MarkFile
+from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
+from fogft.proxy.robot.ordered_dispatcher import OrderedDispatcher
+from tests.proxy.fakes import UID, Clock, FakeClient, FakeLink
+
+STATE = StateSpec(StateService("/g", "p/srv/G", "d"), StateService("/s", "p/srv/S", "d"))
+
+
+class Plain:
+    """A state that travels as it is."""
+
+    def snapshot_request(self):
+        return b"get"
+
+    def read_snapshot(self, response):
+        if response == b"no":
+            raise RosError("it will not")
+        return response
+
+    def restore_request(self, state):
+        return b"set " + state
+
+    def check_restored(self, response):
+        if response != b"ok":
+            raise RosError("it would not")
+
+
+class Incoming:
+    """An order that goes back where it came from."""
+
+    def __init__(self, scene, link, request_id, payload, robot="r"):
+        self.scene, self.link = scene, link
+        self.request_id, self.payload, self.robot = request_id, payload, robot
+        self.service, self.remaining_s = "/s", 60.0
+
+    def reply(self, payload):
+        self.scene.answers.append((self.link, Answer(self.request_id, payload=payload)))
+
+    def refuse(self, reason):
+        self.scene.answers.append((self.link, Answer(self.request_id, refusal=reason)))
+
+
+class Scene:
+    """One dispatcher, its links, a responder behind each, and their three clients."""
+
+    def __init__(self, folder, replicas=2, **spec):
+        self.clock = Clock()
+        self.responses = []
+        self.answers = []
+        self.spec = ServiceSpec("/s", "p/srv/S", timeout_s=5.0, state=STATE, **spec)
+        self.folder = folder
+        self.links = [FakeLink(slot) for slot in range(replicas)]
+        self.clients = [Clients(FakeClient(), FakeClient(), FakeClient()) for _ in self.links]
+        self.responders = [OrderedResponder("/s", Plain(), self.clock) for _ in self.links]
+        for link, responder, clients in zip(self.links, self.responders, self.clients, strict=True):
+            link.ready = frozenset(["/other"])
+            responder.use(clients)
+            responder.tick(alive=True)
+        self.dispatcher = self.start()
+
+    def start(self):
+        dispatcher = OrderedDispatcher(
+            self.spec,
+            lambda handle, payload: self.responses.append((handle, payload)),
+            MarkFile(self.folder / "mark", UID),
+            empty_response=b"empty",
+            clock=self.clock,
+        )
+        dispatcher.route(self.links)
+        return dispatcher
+
+    def run(self, *slots):
+        """Carry orders and answers until nothing moves; services stay as they are."""
+        for _ in range(50):
+            for slot in slots or range(len(self.links)):
+                offered, self.links[slot].offered = self.links[slot].offered, []
+                for _, request, payload, _ in offered:
+                    incoming = Incoming(self, self.links[slot], request, payload)
+                    self.responders[slot].request(incoming)
+            answers, self.answers = self.answers, []
+            for link, answer in answers:
+                self.dispatcher.answered(link, answer)
+            self.clock.now += 0.04
+            self.dispatcher.tick()
+
+    def serve(self, slot, answer):
+        """Let a replica's service answer the oldest call that it has."""
+        payload, on_response = self.clients[slot].service.calls.pop(0)
+        on_response(answer)
+        return payload
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return Scene(tmp_path)
+
+
+def test_the_first_answer_is_returned_and_the_others_apply_all_the_same(scene):
+    scene.run()
+    scene.dispatcher.submit(b"q1", "h1")
+    scene.run()
+    assert scene.serve(1, b"a1") == b"q1"
+    scene.run()
+    assert scene.responses == [("h1", b"a1")]
+    assert scene.serve(0, b"other") == b"q1"
+    scene.run()
+    assert scene.responses == [("h1", b"a1")]
+    assert scene.dispatcher.report()["late"] == 1
+
+
+def test_a_service_is_given_one_request_at_a_time(scene):
+    scene.run()
+    for i in range(5):
+        scene.dispatcher.submit(b"q%d" % i, i)
+    scene.run()
+    for i in range(5):
+        assert len(scene.clients[0].service.calls) == 1
+        assert scene.serve(0, b"a%d" % i) == b"q%d" % i
+    scene.run()
+    assert scene.responses == [(i, b"a%d" % i) for i in range(5)]
+
+
+def test_requests_wait_until_a_replica_has_joined(tmp_path):
+    scene = Scene(tmp_path, replicas=1)
+    scene.clients[0].restore.there = False
+    scene.responders[0].tick(alive=True)
+    scene.dispatcher.submit(b"q", "h")
+    scene.run()
+    assert not scene.dispatcher.able
+    assert not scene.clients[0].service.calls
+    scene.clients[0].restore.there = True
+    scene.responders[0].tick(alive=True)
+    scene.run()
+    assert scene.serve(0, b"a") == b"q"
+
+
+def test_a_new_replica_is_restored_before_it_is_ready(scene):
+    scene.run(0)
+    for i in range(3):
+        scene.dispatcher.submit(b"q%d" % i, i)
+        scene.run(0)
+        scene.serve(0, b"a%d" % i)
+        scene.run(0)
+    restarted = scene.dispatcher  # a proxy that knows no earlier requests
+    scene.dispatcher = scene.start()
+    del restarted
+    scene.run()
+    assert not scene.responders[1].ready
+    _, snapshot_came = scene.clients[0].snapshot.calls.pop(0)
+    snapshot_came(b"STATE")
+    scene.run()
+    assert not scene.responders[1].ready
+    ((payload, restored),) = scene.clients[1].restore.calls
+    assert payload == b"set STATE"
+    restored(b"ok")
+    scene.run()
+    assert scene.responders[1].ready
+    assert not scene.clients[1].service.calls, "nothing is applied twice"
+
+
+def test_a_failed_restore_is_told_and_tried_again(scene):
+    scene.run(0)
+    scene.dispatcher.submit(b"q", "h")
+    scene.run(0)
+    scene.serve(0, b"a")
+    scene.run(0)
+    scene.dispatcher = scene.start()
+    scene.run()
+    scene.clients[0].snapshot.calls.pop(0)[1](b"STATE")
+    scene.run()
+    scene.clients[1].restore.calls.pop(0)[1](b"bad")
+    assert "it would not" in scene.responders[1].detail
+    assert not scene.responders[1].ready
+    scene.run()
+    scene.clients[1].restore.calls.pop(0)[1](b"ok")
+    scene.run()
+    assert scene.responders[1].ready
+    assert scene.responders[1].detail == ""
+
+
+def test_a_crashed_service_does_not_answer_from_its_first_state(scene):
+    """Its command was started again: it is given requests only after it has been restored."""
+    scene.run()
+    scene.dispatcher.submit(b"q1", "h1")
+    scene.run()
+    scene.serve(0, b"a1")
+    scene.serve(1, b"a1")
+    scene.run()
+    scene.responders[1].crashed()
+    scene.responders[1].use(scene.clients[1])
+    scene.responders[1].tick(alive=True)
+    assert not scene.responders[1].ready
+    scene.dispatcher.submit(b"q2", "h2")
+    scene.run(1)
+    # The log still has everything from the start: it is replayed in order.
+    assert [scene.serve(1, b"a%d" % i) for i in (1, 2)] == [b"q1", b"q2"]
+
+
+def test_a_request_that_ros_refuses_for_now_is_passed_on_later(scene):
+    scene.run()
+    scene.clients[0].service.broken = RosError("its queue is full")
+    scene.dispatcher.submit(b"q", "h")
+    scene.run()
+    scene.clients[0].service.broken = None
+    assert not scene.clients[0].service.calls
+    scene.responders[0].tick(alive=True)
+    assert scene.serve(0, b"a") == b"q"
+
+
+def test_an_unreadable_request_counts_as_applied_and_holds_nobody_up(scene):
+    scene.run()
+    for clients in scene.clients:
+        clients.service.broken = Unreadable("no such message")
+    scene.dispatcher.submit(b"bad", "h1")
+    scene.run()
+    for clients in scene.clients:
+        clients.service.broken = None
+    scene.dispatcher.submit(b"good", "h2")
+    scene.run()
+    assert scene.serve(0, b"a") == b"good"
+    scene.run()
+    assert scene.responses == [("h2", b"a")]
+
+
+@pytest.mark.parametrize("on_timeout", list(OnTimeout)[:2])
+def test_at_the_deadline_the_policy_answers_and_a_late_answer_does_not(tmp_path, on_timeout):
+    scene = Scene(tmp_path, on_timeout=on_timeout)
+    scene.run()
+    scene.dispatcher.submit(b"q", "h")
+    scene.run()
+    scene.clock.now += 5.0
+    scene.dispatcher.tick()
+    empty = on_timeout is OnTimeout.EMPTY
+    assert scene.responses == ([("h", b"empty")] if empty else [])
+    scene.serve(0, b"late")
+    scene.run()
+    assert len(scene.responses) == empty
+    report = scene.dispatcher.report()
+    assert (report["silent"], report["empty"], report["pending"]) == (not empty, empty, 0)
+
+
+def test_a_lost_link_does_not_apply_a_request_twice(scene):
+    """The order is ended as lost while the replica works on it; it is recalled, not repeated."""
+    scene.run()
+    scene.dispatcher.submit(b"q", "h")
+    for slot, link in enumerate(scene.links):
+        for _, request, payload, _ in link.offered:
+            scene.responders[slot].request(Incoming(scene, link, request, payload))
+            scene.dispatcher.answered(link, Answer(request, refusal=Refusal.LOST))
+        link.offered = []
+    scene.serve(0, b"a")
+    scene.answers.clear()
+    scene.run()
+    assert scene.responses == [("h", b"a")]
+    assert not scene.clients[0].service.calls
+
+
+def test_an_order_of_another_robot_is_refused(scene):
+    scene.run()
+    other = Scene(scene.folder / "other", replicas=2)
+    other.responders, other.clients = scene.responders, scene.clients
+    for link in other.links:
+        offered, link.offered = link.offered, []
+        for _, request, payload, _ in offered:
+            slot = link.peer.id.slot
+            scene.responders[slot].request(Incoming(other, link, request, payload, robot="x"))
+    for link, answer in other.answers:
+        other.dispatcher.answered(link, answer)
+    other.dispatcher.tick()
+    assert "`r`" in other.dispatcher.report()["order"]["trouble"]
+    assert scene.dispatcher.able
+
+
+def test_noise_is_refused(scene):
+    incoming = Incoming(scene, scene.links[0], b"\xff" * 16, b"q")
+    scene.responders[0].request(incoming)
+    assert scene.answers[-1][1].refusal == Refusal.MALFORMED

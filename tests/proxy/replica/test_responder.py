@@ -1,0 +1,509 @@
+"""The replica runs a request id once and answers every copy of it."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.errors import RosError, Unreadable
+from fogft.proxy.replica.interruption import EMPTY_REQUEST
+from fogft.proxy.replica.responder import Responder
+from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
+
+A = b"a" * 16
+B = b"b" * 16
+
+
+class Scene:
+    def __init__(self, **options) -> None:
+        self.clock = Clock()
+        self.ready = True
+        self.client = FakeClient()
+        self.responder = Responder(lambda name: self.ready, clock=self.clock, **options)
+        self.responder.use({"/s": self.client})
+
+    def ask(self, id: bytes, **options) -> FakeIncoming:
+        incoming = FakeIncoming(id, **options)
+        self.responder.request(incoming)
+        return incoming
+
+    def answer(self, n: int, payload: bytes = b"r") -> None:
+        self.client.calls[n][1](payload)
+
+
+def test_a_request_is_run_and_answered():
+    scene = Scene()
+    incoming = scene.ask(A, payload=b"q")
+    assert scene.client.calls[0][0] == b"q"
+    scene.answer(0, b"r")
+    assert incoming.outcome == [b"r"]
+    assert scene.responder.in_flight == 0
+
+
+def test_only_an_answer_beside_which_nothing_is_at_work_leaves_alone():
+    scene = Scene()
+    first, second = scene.ask(A), scene.ask(B)
+    scene.answer(0)
+    scene.answer(1)
+    assert (first.more, second.more) == (True, False)
+
+
+def test_an_answer_leaves_before_it_is_counted_and_makes_room_after():
+    """The robot does not wait for our numbers; what it sends next is passed on all the same."""
+    scene = Scene(limits={"/s": 1})
+    first, second = scene.ask(A), scene.ask(B)
+    ran_s: list[float] = []
+    first.reply = lambda payload, more: ran_s.append(scene.responder.ran_s)
+    scene.clock.now += 1.0
+    scene.answer(0)
+    assert (ran_s, scene.responder.ran_s) == ([0.0], 1.0)
+    scene.answer(1)
+    assert second.outcome == [b"r"]
+    assert scene.responder.in_flight == 0
+
+
+def test_a_copy_joins_the_work_in_progress():
+    scene = Scene()
+    first, copy = scene.ask(A), scene.ask(A)
+    scene.answer(0, b"r")
+    assert (first.outcome, copy.outcome) == ([b"r"], [b"r"])
+    assert scene.responder.ran == 1
+
+
+def test_a_reply_that_cannot_be_sent_keeps_no_room():
+    """What waits for it goes on, and the next requests too."""
+    scene = Scene(limits={"/s": 1})
+    first, second = scene.ask(A), scene.ask(B)
+
+    def fail(payload: bytes, *, more: bool = False) -> None:
+        raise RuntimeError("can't start new thread")
+
+    first.reply = fail
+    with pytest.raises(RuntimeError, match="thread"):
+        scene.answer(0)
+    scene.answer(1)
+    assert second.outcome == [b"r"]
+    assert scene.responder.in_flight == 0
+
+
+def test_whoever_waits_behind_a_request_that_ros_refuses_does_not_wait_longer():
+    """It came while that was being passed on."""
+    scene = Scene(limits={"/s": 1})
+    call, waiting = scene.client.call, []
+
+    def refuse(payload: bytes, on_response) -> int:
+        scene.client.call = call
+        waiting.append(scene.ask(B))
+        raise RosError("its queue is full")
+
+    scene.client.call = refuse
+    assert scene.ask(A).outcome == ["refused overloaded"]
+    scene.answer(0)
+    assert waiting[0].outcome == [b"r"]
+
+
+def test_deadlines_of_what_was_forgotten_do_not_pile_up():
+    """An id that is run anew, again and again, and more ids than are kept."""
+    scene = Scene(passing=lambda service, answer: answer == b"not yet", kept_ids=10)
+    for n in range(5000):
+        scene.ask(A, remaining_s=3600.0)
+        scene.answer(n, b"not yet")
+    for n in range(5000):
+        scene.ask(n.to_bytes(16, "big"), remaining_s=3600.0)
+        scene.answer(5000 + n)
+    assert len(scene.responder._deadlines["/s"]) < 1200
+    scene.clock.now += 3601.0
+    scene.responder.tick()
+    assert not scene.responder._deadlines["/s"]
+    assert not scene.responder._work
+
+
+def test_a_copy_of_finished_work_gets_the_kept_answer():
+    scene = Scene()
+    scene.ask(A)
+    scene.answer(0, b"r")
+    assert scene.ask(A).outcome == [b"r"]
+    assert len(scene.client.calls) == 1
+
+
+def test_an_answer_for_the_moment_is_not_kept_and_a_copy_is_run_anew():
+    scene = Scene(passing=lambda service, answer: answer == b"not yet")
+    first = scene.ask(A)
+    scene.answer(0, b"not yet")
+    copy = scene.ask(A)
+    assert (first.outcome, copy.outcome) == ([b"not yet"], [])
+    scene.answer(1, b"r")
+    assert (copy.outcome, scene.ask(A).outcome) == ([b"r"], [b"r"])
+    assert (scene.responder.in_flight, len(scene.client.calls)) == (0, 2)
+
+
+def test_a_copy_whose_answer_is_no_longer_kept_is_refused_not_run_again():
+    scene = Scene(kept_bytes=3)
+    scene.ask(A)
+    scene.answer(0, b"long answer")
+    assert scene.ask(A).outcome == ["refused forgotten"]
+    assert len(scene.client.calls) == 1
+
+
+def test_a_service_that_is_not_there_refuses_at_once():
+    scene = Scene()
+    scene.ready = False
+    assert scene.ask(A).outcome == ["refused not-ready"]
+
+
+def test_an_unknown_service_is_refused():
+    assert Scene().ask(A, service="/other").outcome == ["refused not-ready"]
+
+
+def test_more_than_the_window_is_refused():
+    scene = Scene(max_in_flight=1)
+    scene.ask(A)
+    assert scene.ask(B).outcome == ["refused overloaded"]
+    scene.answer(0)
+    assert scene.ask(b"c" * 16).outcome == []
+
+
+def test_no_more_is_passed_on_than_an_ordinary_service_keeps():
+    """A ROS service with the default queue silently loses what exceeds ten."""
+    scene = Scene()
+    asked = [scene.ask(bytes([n]) * 16) for n in range(25)]
+    assert len(scene.client.calls) == 10
+    for n in range(25):
+        scene.answer(n)
+        assert len(scene.client.calls) == min(25, 11 + n)
+    assert all(incoming.outcome == [b"r"] for incoming in asked)
+
+
+def test_what_waits_past_its_deadline_is_never_begun():
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=9.0)
+    waiting = scene.ask(B, remaining_s=1.0)
+    scene.clock.now += 2.0
+    scene.answer(0)
+    assert waiting.outcome == ["refused expired"]
+    assert len(scene.client.calls) == 1
+
+
+def test_a_copy_joins_what_waits():
+    scene = Scene(outstanding=1)
+    scene.ask(A)
+    first, copy = scene.ask(B), scene.ask(B)
+    scene.answer(0)
+    scene.answer(1, b"b")
+    assert (first.outcome, copy.outcome) == ([b"b"], [b"b"])
+
+
+def test_expired_work_keeps_its_room_until_the_service_is_done_with_it():
+    """The service still has it in its queue: passing on more would overflow that queue."""
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=1.0)
+    waiting = scene.ask(B, remaining_s=9.0)
+    scene.clock.now += 1.0
+    scene.responder.tick()
+    assert len(scene.client.calls) == 1
+    scene.answer(0, b"too late")
+    scene.answer(1, b"b")
+    assert waiting.outcome == [b"b"]
+
+
+def test_a_response_that_never_comes_frees_its_room_in_the_end():
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=1.0)
+    for _ in range(2):
+        scene.clock.now += 61.0
+        scene.responder.tick()
+    scene.ask(B)
+    assert len(scene.client.calls) == 2
+    assert scene.client.forgotten == [1]
+
+
+def test_a_crash_ends_what_waits_too_and_does_not_blame_it():
+    """A robot bars a replica that crashed on a request three times; this one was not begun."""
+    scene = Scene(outstanding=1)
+    asked = [scene.ask(A), scene.ask(B)]
+    scene.responder.crashed()
+    assert [incoming.outcome for incoming in asked] == [["refused crashed"], ["refused not-ready"]]
+    scene.ask(b"c" * 16)
+    assert scene.responder.in_flight == 1
+
+
+def test_a_request_past_its_deadline_is_never_begun():
+    scene = Scene()
+    assert scene.ask(A, remaining_s=0.0).outcome == ["refused expired"]
+    assert scene.client.calls == []
+
+
+def test_a_request_the_service_cannot_read_is_refused_and_can_be_sent_again():
+    scene = Scene()
+    scene.client.broken = Unreadable("too short")
+    assert scene.ask(A).outcome == ["refused malformed"]
+    assert scene.responder.in_flight == 0
+
+
+def test_a_request_that_ros_has_no_room_for_may_be_sent_again():
+    """Malformed would keep the robot from ever asking this replica again."""
+    scene = Scene()
+    scene.client.broken = RosError("its queue is full")
+    assert scene.ask(A).outcome == ["refused overloaded"]
+    scene.client.broken = None
+    again = scene.ask(A)
+    scene.answer(0, b"r")
+    assert again.outcome == [b"r"]
+
+
+def test_held_bytes_are_bounded():
+    """A robot whose requests others answer first goes on sending: its window is free again."""
+    scene = Scene(held_bytes=10)
+    big = scene.ask(A, payload=b"larger than allowed, but alone")
+    assert scene.ask(B, payload=b"q").outcome == ["refused overloaded"]
+    scene.answer(0, b"r")
+    assert big.outcome == [b"r"]
+    assert scene.ask(B, payload=b"q").outcome == []
+
+
+def test_a_service_that_was_lost_frees_its_room_and_no_other():
+    """A frozen or restarted service does not answer what it was given: others shall not wait."""
+    scene = Scene(outstanding=1)
+    other = FakeClient()
+    scene.responder.use({"/s": scene.client, "/other": other})
+    lost, spared = scene.ask(A), scene.ask(B, service="/other")
+    late = scene.ask(b"c" * 16, remaining_s=1.0)
+    scene.responder.crashed("/s")
+    assert (lost.outcome, spared.outcome) == (["refused crashed"], [])
+    assert late.outcome == ["refused not-ready"]
+    scene.ask(b"d" * 16)
+    assert len(scene.client.calls) == 2
+
+
+def test_a_lost_service_frees_the_room_of_expired_work_too():
+    scene = Scene(outstanding=1)
+    scene.ask(A, remaining_s=1.0)
+    scene.clock.now += 1.0
+    scene.responder.tick()
+    scene.responder.crashed("/s")
+    scene.ask(B)
+    assert len(scene.client.calls) == 2
+
+
+def test_a_crash_refuses_what_was_in_work_and_a_copy_is_run_anew():
+    scene = Scene()
+    incoming = scene.ask(A)
+    scene.responder.crashed()
+    assert incoming.outcome == ["refused crashed"]
+    assert scene.client.forgotten == [1]
+    again = scene.ask(A)
+    scene.answer(1, b"r")
+    assert again.outcome == [b"r"]
+
+
+def test_an_answer_after_the_crash_reaches_nobody():
+    scene = Scene()
+    incoming = scene.ask(A)
+    scene.responder.crashed()
+    scene.answer(0, b"ghost")
+    assert incoming.outcome == ["refused crashed"]
+
+
+def test_work_past_its_deadline_is_dropped():
+    scene = Scene()
+    incoming = scene.ask(A, remaining_s=2.0)
+    scene.clock.now += 2.0
+    scene.responder.tick()
+    assert incoming.outcome == ["refused expired"]
+    assert scene.responder.in_flight == 0
+
+
+def test_finished_ids_are_forgotten_at_their_deadline():
+    """Memory stays flat: nothing of a request outlives its deadline."""
+    scene = Scene()
+    for n in range(1000):
+        scene.ask(n.to_bytes(16, "big"), remaining_s=1.0)
+        scene.answer(n)
+    scene.clock.now += 1.0
+    scene.responder.tick()
+    assert len(scene.responder._work) == len(scene.responder._kept) == 0
+    assert scene.responder._kept_bytes == 0
+
+
+def test_the_number_of_ids_is_bounded():
+    scene = Scene(kept_ids=10)
+    for n in range(100):
+        scene.ask(n.to_bytes(16, "big"))
+        scene.answer(n)
+    assert len(scene.responder._work) <= 10
+
+
+def test_what_waits_and_is_no_longer_wanted_is_dropped_and_counted():
+    scene = Scene(outstanding=1)
+    scene.ask(A)
+    unwanted = scene.ask(B)
+    scene.responder.cancel([B, b"unknown id 12345"])
+    assert unwanted.outcome == ["refused cancelled"]
+    scene.answer(0)
+    assert len(scene.client.calls) == 1
+    assert (scene.responder.saved, scene.responder.in_flight) == (1, 0)
+
+
+def test_what_is_at_work_and_no_longer_wanted_is_counted_as_wasted_and_its_bytes_stay_here():
+    scene = Scene()
+    unwanted = scene.ask(A)
+    scene.responder.cancel([A])
+    scene.clock.now += 2.0
+    scene.answer(0, b"a large answer")
+    assert unwanted.outcome == ["refused late"]
+    assert (scene.responder.wasted, scene.responder.wasted_s) == (1, 2.0)
+
+
+def test_an_answer_after_the_deadline_is_counted_as_wasted():
+    scene = Scene()
+    scene.ask(A, remaining_s=1.0)
+    scene.clock.now += 1.5
+    scene.responder.tick()
+    scene.answer(0)
+    assert scene.responder.wasted == 1
+
+
+def test_what_is_answered_cannot_be_cancelled():
+    scene = Scene()
+    scene.ask(A)
+    scene.answer(0, b"r")
+    scene.responder.cancel([A])
+    assert scene.ask(A).outcome == [b"r"]
+    assert scene.responder.saved == 0
+
+
+def interruptible() -> tuple[Scene, FakeClient]:
+    scene = Scene(limits={"/s": 1})
+    stop = FakeClient()
+    scene.responder.use({"/s": scene.client}, {"/s": stop})
+    return scene, stop
+
+
+def test_a_cancel_service_is_called_for_what_is_at_work():
+    scene, stop = interruptible()
+    scene.ask(A)
+    scene.responder.cancel([A])
+    assert [payload for payload, _ in stop.calls] == [EMPTY_REQUEST]
+    assert scene.responder.interrupted == 1
+
+
+def test_nothing_is_begun_before_the_cancel_service_has_answered():
+    """It names no request: what it stopped might be the next one."""
+    scene, stop = interruptible()
+    scene.ask(A)
+    wanted = scene.ask(B)
+    scene.responder.cancel([A])
+    scene.answer(0, b"stopped")
+    assert len(scene.client.calls) == 1
+    stop.calls[0][1](b"ok")
+    scene.answer(1, b"b")
+    assert wanted.outcome == [b"b"]
+
+
+def test_a_cancel_service_that_is_dead_holds_nothing_up_for_long():
+    scene, stop = interruptible()
+    scene.ask(A)
+    scene.ask(B)
+    scene.responder.cancel([A])
+    scene.answer(0)
+    scene.clock.now += 3.0
+    scene.responder.tick()
+    assert len(scene.client.calls) == 2
+    scene.responder.cancel([B])
+    stop.broken = RosError("closed")
+    scene.answer(1)
+    scene.ask(b"c" * 16)
+    scene.clock.now += 3.0
+    scene.responder.tick()
+    assert len(scene.client.calls) == 3
+
+
+def test_a_service_without_a_cancel_service_works_on():
+    scene = Scene()
+    scene.ask(A)
+    scene.responder.cancel([A])
+    assert scene.responder.interrupted == 0
+
+
+def test_the_earliest_deadline_is_begun_first():
+    scene = Scene(outstanding=1)
+    scene.ask(A)
+    scene.ask(B, payload=b"later", remaining_s=9.0)
+    scene.ask(b"c" * 16, payload=b"sooner", remaining_s=2.0)
+    scene.answer(0)
+    assert scene.client.calls[1][0] == b"sooner"
+
+
+def test_a_chatty_robot_does_not_starve_another():
+    scene = Scene(outstanding=1)
+    for n in range(50):
+        scene.ask(n.to_bytes(16, "big"), payload=b"chatty", robot="chatty")
+    scene.ask(A, payload=b"quiet", robot="quiet")
+    for n in range(2):
+        scene.answer(n)
+    assert b"quiet" in [payload for payload, _ in scene.client.calls[:3]]
+
+
+def test_when_full_the_chatty_robot_gives_way_to_another():
+    scene = Scene(max_in_flight=4, outstanding=1)
+    chatty = [scene.ask(bytes([n]) * 16, robot="chatty", remaining_s=5.0 + n) for n in range(4)]
+    quiet = scene.ask(A, robot="quiet")
+    assert chatty[3].outcome == ["refused overloaded"]
+    assert quiet.outcome == []
+    assert scene.ask(B, robot="chatty").outcome == ["refused overloaded"]
+    assert scene.responder.in_flight == 4
+
+
+def test_a_request_that_would_wait_past_its_deadline_is_refused_at_once():
+    """The robot asks another replica while there is time."""
+    scene = Scene(limits={"/s": 1})
+    scene.ask(A)
+    scene.clock.now += 1.0
+    scene.answer(0)  # it takes a second
+    for n in range(3):
+        scene.ask(bytes([n]) * 16)
+    assert scene.ask(b"h" * 16, remaining_s=1.5).outcome == []  # the earliest deadline is next
+    assert scene.ask(b"i" * 16, remaining_s=1.6).outcome == ["refused overloaded"]
+    assert scene.ask(b"j" * 16, remaining_s=9.0).outcome == []
+
+
+def test_a_given_limit_is_kept():
+    scene = Scene(limits={"/s": 3})
+    for n in range(9):
+        scene.ask(bytes([n]) * 16)
+    assert len(scene.client.calls) == 3
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["ask", "answer", "crash", "wait", "cancel"]), st.integers(0, 3)),
+        max_size=50,
+    )
+)
+def test_every_copy_gets_exactly_one_outcome_and_runs_never_overlap(steps):
+    """Each incoming ends at most once; an id is never in two runs at the same time."""
+    scene = Scene(kept_bytes=8, outstanding=2)
+    asked: list[FakeIncoming] = []
+    finished: set[int] = set()
+    for step, n in steps:
+        if step == "ask":
+            asked.append(scene.ask(bytes([n]) * 16, payload=bytes([n]), remaining_s=5.0))
+        elif step == "answer" and n < len(scene.client.calls):
+            payload, _ = scene.client.calls[n]
+            scene.answer(n, b"to " + payload)
+            finished.add(n)
+        elif step == "crash":
+            scene.responder.crashed()
+        elif step == "cancel":
+            scene.responder.cancel([bytes([n]) * 16])
+        else:
+            scene.clock.now += n
+            scene.responder.tick()
+    for incoming in asked:
+        assert len(incoming.outcome) <= 1
+        if incoming.outcome and isinstance(incoming.outcome[0], bytes):
+            assert incoming.outcome == [b"to " + incoming.payload]
+    waiting = sum(1 for incoming in asked if not incoming.outcome)
+    assert (waiting == 0) == (scene.responder.in_flight == 0)
+    assert scene.responder._kept_bytes >= 0

@@ -1,0 +1,248 @@
+"""The replica is ready only while its command lives and its services are discovered."""
+
+from __future__ import annotations
+
+from fogft.link.port import Probe
+from fogft.model.replica import ReplicaId
+from fogft.model.spec import ServiceSpec
+from fogft.poolfile.service_form import REPLICA_KEYS, from_plain, to_plain
+from fogft.poolfile.topics import action_services
+from fogft.proxy.replica.server import ServerProxy
+from tests.proxy.fakes import UID, Clock, FakeIncoming, FakeListener, FakeNode, FakeSupervisor
+
+HEADER = b"\0\1\0\0"
+ACCEPTED, UNKNOWN, SUCCEEDED = HEADER + b"\1", HEADER + b"\0", HEADER + b"\4"
+
+
+class Scene:
+    def __init__(self, *services: ServiceSpec) -> None:
+        self.clock = Clock()
+        self.listener = FakeListener()
+        self.supervisor = FakeSupervisor()
+        self.nodes: list[FakeNode] = []
+        self.proxy = ServerProxy(
+            ReplicaId(UID, 2, 3),
+            services or (ServiceSpec("/s", "std_srvs/srv/SetBool"),),
+            self.listener,
+            self.make_node,
+            self.supervisor,  # type: ignore[arg-type]
+            orphan_after_s=60.0,
+            clock=self.clock,
+        )
+        self.proxy.start()
+
+    def make_node(self) -> FakeNode:
+        self.nodes.append(FakeNode())
+        return self.nodes[-1]
+
+    def client(self):
+        return self.nodes[-1].clients["/s"]
+
+    def probe(self, manager_age_s: float | None = 0.0):
+        return self.listener.on_probe(Probe("robot", manager_age_s))
+
+
+def test_ready_when_the_command_lives_and_the_service_is_discovered():
+    scene = Scene()
+    assert scene.probe().ready == frozenset()
+    scene.proxy.run_once()
+    assert scene.probe().ready == {"/s"}
+
+
+def test_not_ready_while_discovery_does_not_find_the_service():
+    scene = Scene()
+    scene.client().there = False
+    scene.proxy.run_once()
+    answer = scene.probe()
+    assert answer.ready == frozenset()
+    assert answer.detail == "`run` does not offer /s yet"
+
+
+def test_a_probe_names_slot_and_generation():
+    answer = Scene().probe()
+    assert (answer.slot, answer.generation) == (2, 3)
+
+
+def test_a_death_of_the_command_refuses_its_work_and_joins_ros_anew():
+    """Discovery lists a dead service for seconds: only a new node knows only the living."""
+    scene = Scene()
+    scene.proxy.run_once()
+    incoming = FakeIncoming(b"a" * 16)
+    scene.listener.on_request(incoming)
+    scene.supervisor.dies = True
+    scene.proxy.run_once()
+    assert incoming.outcome == ["refused crashed"]
+    assert [node.closed for node in scene.nodes] == [True, False]
+    assert scene.probe().restarts == 1
+
+
+def test_requests_after_a_death_are_refused_until_the_service_is_back():
+    scene = Scene()
+    scene.proxy.run_once()
+    scene.supervisor.dies = True
+    original = scene.make_node
+    scene.proxy._make_node = lambda: absent(original())
+    scene.proxy.run_once()
+    incoming = FakeIncoming(b"a" * 16)
+    scene.listener.on_request(incoming)
+    assert incoming.outcome == ["refused not-ready"]
+
+
+def test_a_node_whose_take_loop_ended_is_replaced():
+    """Nothing would ever be taken from it again, and the replica would still say ready."""
+    scene = Scene()
+    scene.proxy.run_once()
+    incoming = FakeIncoming(b"a" * 16)
+    scene.listener.on_request(incoming)
+    scene.nodes[0].alive = False
+    scene.proxy.run_once()
+    assert incoming.outcome == ["refused crashed"]
+    assert [node.closed for node in scene.nodes] == [True, False]
+    assert scene.probe().ready == {"/s"}
+
+
+def test_a_service_that_goes_while_the_command_lives_loses_its_work():
+    """A frozen service is dropped by discovery; what it was given will not be answered."""
+    scene = Scene()
+    scene.proxy.run_once()
+    incoming = FakeIncoming(b"a" * 16)
+    scene.listener.on_request(incoming)
+    scene.client().there = False
+    scene.proxy.run_once()
+    assert incoming.outcome == ["refused crashed"]
+    assert len(scene.nodes) == 1
+
+
+def test_a_service_that_the_command_restarts_by_itself_loses_its_work():
+    """Discovery lists the dead server for seconds: that there is one more tells of its end."""
+    scene = Scene()
+    scene.proxy.run_once()
+    incoming = FakeIncoming(b"a" * 16)
+    scene.listener.on_request(incoming)
+    scene.client().count = 2
+    scene.proxy.run_once()
+    assert incoming.outcome == ["refused crashed"]
+    later = FakeIncoming(b"b" * 16)
+    scene.listener.on_request(later)
+    scene.client().count = 1
+    scene.proxy.run_once()
+    assert later.outcome == []
+
+
+def absent(node: FakeNode) -> FakeNode:
+    make = node.client
+
+    def client(name, type_name):
+        made = make(name, type_name)
+        made.there = False
+        return made
+
+    node.client = client  # type: ignore[method-assign]
+    return node
+
+
+def test_orphaned_when_no_manager_was_heard_of_for_long():
+    scene = Scene()
+    scene.clock.now += 59.0
+    scene.probe(manager_age_s=0.0)
+    scene.clock.now += 59.0
+    assert not scene.proxy.orphaned
+    scene.clock.now += 2.0
+    assert scene.proxy.orphaned
+
+
+def test_a_robot_that_has_not_seen_the_manager_keeps_nobody_alive():
+    """Probes alone are no sign of a manager: they carry when it was last seen."""
+    scene = Scene()
+    for _ in range(61):
+        scene.clock.now += 1.0
+        scene.probe(manager_age_s=None)
+    assert scene.proxy.orphaned
+
+
+def test_an_old_sign_does_not_undo_a_newer_one():
+    scene = Scene()
+    scene.clock.now += 50.0
+    scene.probe(manager_age_s=0.0)
+    scene.probe(manager_age_s=49.0)
+    scene.clock.now += 30.0
+    assert not scene.proxy.orphaned
+
+
+def test_close_stops_the_command_and_leaves_the_wire_and_ros():
+    scene = Scene()
+    scene.proxy.run_once()
+    incoming = FakeIncoming(b"a" * 16)
+    scene.listener.on_request(incoming)
+    scene.proxy.close()
+    assert scene.supervisor.stopped
+    assert scene.listener.closed
+    assert scene.nodes[-1].closed
+    assert incoming.outcome == ["refused crashed"]
+
+
+def action() -> Scene:
+    """A replica that offers an action, of which it knows what the manager writes for it."""
+    parts = action_services("/count", "p/action/T", 5.0, 60.0)
+    told = [from_plain(to_plain(part, REPLICA_KEYS)) for part in parts]
+    scene = Scene(*told)
+    scene.proxy.run_once()
+    return scene
+
+
+def test_a_result_of_a_goal_that_is_not_known_yet_is_not_kept_for_copies():
+    scene = action()
+    name = "/count/_action/get_result"
+    for answer in (UNKNOWN, SUCCEEDED):
+        incoming = FakeIncoming(b"a" * 16, HEADER + b"g" * 16, service=name)
+        scene.listener.on_request(incoming)
+        scene.nodes[-1].clients[name].calls[-1][1](answer)
+        assert incoming.outcome == [answer]
+    kept = FakeIncoming(b"a" * 16, HEADER + b"g" * 16, service=name)
+    scene.listener.on_request(kept)
+    assert kept.outcome == [SUCCEEDED]
+    assert len(scene.nodes[-1].clients[name].calls) == 2
+
+
+def test_a_goal_is_given_once_to_each_life_of_the_command():
+    scene = action()
+    name = "/count/_action/send_goal"
+
+    def give(number: int) -> FakeIncoming:
+        incoming = FakeIncoming(bytes([number]) * 16, HEADER + b"g" * 16, service=name)
+        scene.listener.on_request(incoming)
+        return incoming
+
+    def calls() -> int:
+        return len(scene.nodes[-1].clients[name].calls)
+
+    first = give(1)
+    scene.nodes[-1].clients[name].calls[0][1](ACCEPTED)
+    assert first.outcome == give(2).outcome == [ACCEPTED]
+    assert calls() == 1
+    scene.nodes[-1].clients[name].there = False  # the server alone is gone for a moment
+    scene.proxy.run_once()
+    scene.nodes[-1].clients[name].there = True
+    scene.proxy.run_once()
+    give(3)
+    assert calls() == 2
+    scene.supervisor.dies = True
+    scene.proxy.run_once()
+    scene.proxy.run_once()
+    give(4)
+    assert (len(scene.nodes), calls()) == (2, 1)
+
+
+def test_the_end_of_our_own_node_gives_no_goal_a_second_time():
+    """The command lives on, with all goals that it has accepted."""
+    scene = action()
+    name = "/count/_action/send_goal"
+    scene.listener.on_request(FakeIncoming(b"a" * 16, HEADER + b"g" * 16, service=name))
+    scene.nodes[-1].clients[name].calls[0][1](ACCEPTED)
+    scene.nodes[-1].alive = False
+    scene.proxy.run_once()
+    scene.proxy.run_once()
+    again = FakeIncoming(b"b" * 16, HEADER + b"g" * 16, service=name)
+    scene.listener.on_request(again)
+    assert again.outcome == [ACCEPTED]
+    assert (len(scene.nodes), scene.nodes[-1].clients[name].calls) == (2, [])

@@ -1,0 +1,320 @@
+"""The client proxy follows the membership and routes each service to who can answer it."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.errors import RosError
+from fogft.link.port import ProbeAnswer, Refusal
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.model.spec import Part, ServiceSpec
+from fogft.model.type_definition import Definition
+from fogft.proxy.robot.client import ClientProxy
+from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.requests.advertising import HOLD_S
+from tests.proxy.fakes import UID, Clock, FakeDialer, FakeNode
+
+SET_BOOL = "std_srvs/srv/SetBool"
+OURS = {SET_BOOL: Definition(fields={"request": (("data", "boolean"),)})}
+
+
+def member(slot: int, generation: int = 1, *, port: int = 1, draining: bool = False) -> Member:
+    return Member(ReplicaId(UID, slot, generation), f"h{slot}:{port}", draining)
+
+
+def membership(*members: Member, version: int = 1, epoch: int = 1, uid: str = UID) -> Membership:
+    return Membership("pool", uid, epoch, version, members)
+
+
+class Scene:
+    def __init__(self, *names: str) -> None:
+        self.clock = Clock()
+        self.node = FakeNode()
+        self.dialer = FakeDialer()
+        self.proxy = ClientProxy(
+            UID,
+            self.node,
+            self.dialer,
+            lambda spec, respond, wake: Dispatcher(spec, respond, wake=wake, clock=self.clock),
+            clock=self.clock,
+            define=OURS.__getitem__,
+        )
+        self.proxy.serve([ServiceSpec(name, SET_BOOL) for name in names or ("/s",)])
+
+    def follow(self, *members: Member, **options) -> bool:
+        return self.proxy.follow(membership(*members, **options))
+
+    def ready(self, *links, service: str = "/s") -> None:
+        for link in links:
+            link.ready = frozenset({service})
+            self.proxy.changed(link)
+        self.proxy.run_once(0)
+
+    def ask(self, payload: bytes = b"q", service: str = "/s") -> None:
+        self.node.servers[service].on_request(payload, "caller")
+
+
+def test_one_link_a_member():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    assert [link.peer.endpoint for link in scene.dialer.links] == ["h0:1", "h1:1"]
+    assert scene.dialer.links[1].peer.certificate_name == f"replica.1.1.{UID}"
+
+
+def test_the_service_is_advertised_once_a_replica_can_answer():
+    scene = Scene()
+    scene.follow(member(0))
+    scene.proxy.run_once(0)
+    assert scene.node.servers == {}
+    scene.ready(*scene.dialer.links)
+    assert list(scene.node.servers) == ["/s"]
+
+
+def test_a_request_goes_to_every_ready_replica_and_the_answer_to_the_caller():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    first, second = scene.dialer.links
+    scene.proxy.answered(second, second.reply(b"r"))
+    scene.proxy.answered(first, first.reply(b"late"))
+    assert scene.node.servers["/s"].responses == [("caller", b"r")]
+
+
+def test_a_replica_that_is_not_ready_gets_nothing():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    scene.ready(scene.dialer.links[0])
+    scene.ask()
+    assert [len(link.offered) for link in scene.dialer.links] == [1, 0]
+
+
+@pytest.mark.parametrize("by", ["member", "link"])
+def test_a_draining_replica_is_spared_while_another_can_answer(by):
+    scene = Scene()
+    scene.follow(member(0, draining=by == "member"), member(1))
+    scene.dialer.links[0].draining = by == "link"
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    assert [len(link.offered) for link in scene.dialer.links] == [0, 1]
+
+
+def test_a_draining_replica_is_told_to_cancel_too():
+    """It may be the one that works on the goal."""
+    scene = Scene()
+    scene.proxy.serve([ServiceSpec("/s", SET_BOOL, part=Part.CANCEL)])
+    scene.follow(member(0, draining=True), member(1))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    assert [len(link.offered) for link in scene.dialer.links] == [1, 1]
+
+
+def test_a_draining_replica_answers_when_it_is_the_last():
+    scene = Scene()
+    scene.follow(member(0, draining=True))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    assert len(scene.dialer.links[0].offered) == 1
+
+
+def test_a_member_that_left_is_dropped_and_its_requests_move():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    old, other = scene.dialer.links
+    scene.ready(old)
+    scene.ask()
+    scene.follow(member(1), version=2)
+    assert old.closed
+    scene.proxy.answered(old, old.refusal(Refusal.LOST))
+    scene.ready(other)
+    assert old.offered[0][1] == other.offered[0][1]
+
+
+def test_a_new_endpoint_makes_a_new_link():
+    scene = Scene()
+    scene.follow(member(0))
+    scene.follow(member(0, port=2), version=2)
+    assert [link.closed for link in scene.dialer.links] == [True, False]
+
+
+def test_an_unchanged_member_keeps_its_link():
+    scene = Scene()
+    scene.follow(member(0))
+    scene.follow(member(0), version=2)
+    assert len(scene.dialer.links) == 1
+
+
+@pytest.mark.parametrize(
+    "old",
+    [
+        {"version": 1, "epoch": 2},
+        {"version": 9, "epoch": 1},
+        {"version": 9, "epoch": 9, "uid": "f" * 16},
+    ],
+)
+def test_an_older_membership_or_another_pools_never_wins(old):
+    scene = Scene()
+    scene.follow(member(0), version=2, epoch=2)
+    assert not scene.follow(member(5), **old)
+    assert [link.peer.id.slot for link in scene.dialer.links] == [0]
+
+
+def test_a_changed_policy_keeps_the_service_advertised_and_its_requests():
+    scene = Scene()
+    scene.follow(member(0))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    scene.proxy.serve([ServiceSpec("/s", SET_BOOL, timeout_s=1.0)])
+    scene.proxy.run_once(0)
+    link = scene.dialer.links[0]
+    scene.proxy.answered(link, link.reply(b"r"))
+    assert scene.node.servers["/s"].responses == [("caller", b"r")]
+    assert not scene.node.servers["/s"].closed
+    assert len(scene.dialer.links) == 1
+
+
+def test_a_removed_service_is_withdrawn():
+    scene = Scene("/s", "/t")
+    scene.follow(member(0))
+    scene.ready(*scene.dialer.links, service="/t")
+    scene.proxy.serve([ServiceSpec("/s", SET_BOOL)])
+    assert scene.node.servers["/t"].closed
+
+
+def test_an_added_service_is_dialled_with_its_own_key():
+    scene = Scene("/s")
+    scene.follow(member(0))
+    scene.proxy.serve([ServiceSpec("/s", SET_BOOL), ServiceSpec("/t", SET_BOOL)])
+    assert set(scene.dialer.links[-1].services) == {"/s", "/t"}
+
+
+def test_an_answer_to_a_service_that_is_no_longer_proxied_does_nothing():
+    scene = Scene()
+    scene.follow(member(0))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    link = scene.dialer.links[0]
+    scene.proxy.serve([])
+    scene.proxy.answered(link, link.reply(b"r"))
+    assert scene.node.servers["/s"].responses == []
+
+
+def test_all_links_silent_together_is_the_uplink():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    scene.ready(*scene.dialer.links)
+    assert not scene.proxy.uplink_suspected
+    for link in scene.dialer.links:
+        link.ready = frozenset()
+    assert scene.proxy.uplink_suspected
+    assert scene.proxy.report()["uplink_suspected"]
+
+
+def test_the_report_names_who_answered():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    link = scene.dialer.links[1]
+    scene.proxy.answered(link, link.reply(b"r"))
+    report = scene.proxy.report()
+    assert [entry["won"] for entry in report["links"]] == [0, 1]
+    assert report["services"]["/s"]["answered"] == 1
+
+
+def test_close_closes_every_link():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    scene.proxy.close()
+    assert all(link.closed for link in scene.dialer.links)
+
+
+def test_a_service_that_ros_refuses_does_not_take_the_others_with_it(caplog):
+    scene = Scene("/good", "/bad")
+    scene.node.refuses = "/bad"
+    scene.follow(member(0))
+    for _ in range(3):
+        scene.dialer.links[0].ready = frozenset({"/good", "/bad"})
+        scene.proxy.changed(scene.dialer.links[0])
+        scene.proxy.run_once(0)
+    assert list(scene.node.servers) == ["/good"]
+    assert caplog.text.count("service_not_advertised") == 1
+    scene.node.refuses = ""
+    scene.proxy.changed(scene.dialer.links[0])
+    scene.proxy.run_once(0)
+    assert set(scene.node.servers) == {"/good", "/bad"}
+
+
+def test_a_proxy_whose_take_loop_ended_says_so_and_does_not_go_on():
+    """It would take no request ever again; whoever supervises it starts another."""
+    scene = Scene()
+    scene.node.alive = False
+    with pytest.raises(RosError):
+        scene.proxy.run_once(0)
+
+
+def told(slot: int, kind: str) -> ProbeAnswer:
+    types = {SET_BOOL: Definition(fields={"request": (("data", kind),)})}
+    return ProbeAnswer(slot, 1, "i", frozenset({"/s"}), types=types)
+
+
+def test_a_replica_whose_type_differs_is_not_asked_and_says_which_field():
+    scene = Scene()
+    scene.follow(member(0), member(1))
+    for link, kind in zip(scene.dialer.links, ("boolean", "int64"), strict=True):
+        link.told = told(link.peer.id.slot, kind)
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    assert [len(link.offered) for link in scene.dialer.links] == [1, 0]
+    good, bad = scene.proxy.report()["links"]
+    assert (good["differs"], good["ready"], bad["differs"], bad["ready"]) == (
+        False,
+        ["/s"],
+        True,
+        [],
+    )
+    assert "field `request.data` is `boolean` here and `int64` on the replica" in bad["detail"]
+
+
+def test_where_every_type_differs_nothing_is_advertised():
+    scene = Scene()
+    scene.follow(member(0))
+    scene.dialer.links[0].told = told(0, "int64")
+    scene.ready(*scene.dialer.links)
+    assert scene.node.servers == {}
+
+
+def test_a_service_is_withdrawn_when_nobody_can_answer_and_offered_again():
+    scene = Scene()
+    scene.follow(member(0))
+    [link] = scene.dialer.links
+    scene.ready(link)
+    first = scene.node.servers["/s"]
+    link.ready = frozenset()
+    scene.proxy.changed(link)
+    scene.proxy.run_once(0)
+    assert not first.closed
+    scene.clock.now += HOLD_S
+    scene.proxy.run_once(0)
+    assert first.closed
+    scene.ready(link)
+    assert scene.node.servers["/s"] is not first
+    scene.ask()
+    scene.proxy.answered(link, link.reply(b"r"))
+    assert scene.node.servers["/s"].responses == [("caller", b"r")]
+
+
+def test_a_service_is_not_withdrawn_under_a_request_that_waits():
+    scene = Scene()
+    scene.follow(member(0))
+    [link] = scene.dialer.links
+    scene.ready(link)
+    scene.ask()
+    link.ready = frozenset()
+    scene.proxy.changed(link)
+    scene.proxy.run_once(0)
+    scene.clock.now += HOLD_S
+    scene.proxy.run_once(0)
+    assert not scene.node.servers["/s"].closed
+    scene.proxy.answered(link, link.reply(b"r"))
+    assert scene.node.servers["/s"].responses == [("caller", b"r")]

@@ -1,0 +1,103 @@
+"""What `/diagnostics` says of a pool, from reports of the client proxy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fogft.proxy.robot.diagnostics import WINDOW_S, Diagnosis
+from fogft.ros.port import Level
+
+
+def link(slot: int, **more: Any) -> dict[str, Any]:
+    usual = {
+        "slot": slot, "generation": 1, "state": "up", "ready": ["/plan"], "draining": False,
+        "at_risk": False, "disagrees": False, "silent_for_s": 0.0, "rtt_s": 0.0123,
+        "in_flight": 0, "won": 5, "restarts": 0, "reopened": 0, "detail": "",
+    }  # fmt: skip
+    return {**usual, **more}
+
+
+def report(*links: dict[str, Any], uplink: bool = False, **counts: Any) -> dict[str, Any]:
+    usual = {
+        "received": 9, "sent": 18, "answered": 9, "fallback": 0, "empty": 0, "silent": 0,
+        "turned_away": 0, "late": 3, "won": {"0.1": 5, "1.1": 4}, "refused": {"crashed": 2},
+        "p50_s": 0.021, "p99_s": None, "pending": 0,
+    }  # fmt: skip
+    services = {"/plan": {**usual, **counts}}
+    return {"links": list(links), "services": services, "uplink_suspected": uplink}
+
+
+def look(diagnosis: Diagnosis, told: dict[str, Any], now: float = 0.0) -> dict[str, Any]:
+    return {s.name.removeprefix("fogft arm: "): s for s in diagnosis.of(told, now)}
+
+
+def levels(told: dict[str, Any]) -> dict[str, Level]:
+    return {name: s.level for name, s in look(Diagnosis("arm", "r"), told).items()}
+
+
+def test_a_whole_pool_is_ok_and_says_who_answers_and_how_fast():
+    said = look(Diagnosis("arm", "r"), report(link(0), link(1)))
+    assert {s.level for s in said.values()} == {Level.OK}
+    assert list(said) == ["pool", "service /plan", "replica 0.1", "replica 1.1"]
+    values = said["service /plan"].values
+    assert (values["won by 0.1"], values["won by 1.1"]) == ("5", "4")
+    assert (values["p50_ms"], values["refused: crashed"]) == ("21", "2")
+    assert "p99_ms" not in values  # unknown is not zero
+    assert said["replica 0.1"].values["rtt_ms"] == "12.3"
+    assert (said["pool"].hardware_id, said["replica 1.1"].hardware_id) == ("r", "1.1")
+
+
+@pytest.mark.parametrize(
+    ("told", "worst", "pool"),
+    [
+        (report(link(0), link(1, state="suspect", ready=[])), "replica 1.1", Level.WARN),
+        (report(link(0, state="connecting", ready=[])), "service /plan", Level.ERROR),
+        (report(), "service /plan", Level.ERROR),
+        (report(link(0), link(1), uplink=True), "pool", Level.ERROR),
+    ],
+)
+def test_what_is_down_is_an_error_and_the_pool_is_as_bad_as_its_services(told, worst, pool):
+    said = levels(told)
+    assert said[worst] is Level.ERROR
+    assert said["pool"] is pool
+
+
+@pytest.mark.parametrize(
+    "state", [{"draining": True}, {"disagrees": True}, {"ready": []}, {"state": "connecting"}]
+)
+def test_a_replica_that_is_not_all_right_is_a_warning(state):
+    assert levels(report(link(0), link(1, **state)))["replica 1.1"] is Level.WARN
+
+
+@pytest.mark.parametrize("outcome", ["silent", "empty", "turned_away", "fallback"])
+def test_a_request_without_a_replicas_answer_is_a_warning_for_a_while(outcome):
+    diagnosis = Diagnosis("arm", "r")
+    assert look(diagnosis, report(link(0)))["service /plan"].level is Level.OK
+    for now, level in ((1.0, Level.WARN), (WINDOW_S, Level.WARN), (WINDOW_S + 2, Level.OK)):
+        said = look(diagnosis, report(link(0), **{outcome: 2}), now)["service /plan"]
+        assert said.level is level, now
+        assert ("2 " in said.message) is (level is Level.WARN)
+
+
+def test_a_topic_is_as_good_as_the_replicas_that_pass_it():
+    passing = link(0, ready=["/plan", "topic /map"])
+    told = {**report(passing, link(1)), "topics": {"/map": {"messages": 7, "passed": 0}}}
+    said = look(Diagnosis("arm", "r"), told)["topic /map"]
+    assert (said.level, said.values["messages"]) == (Level.WARN, "7")
+    told["links"] = [link(0)]
+    assert levels(told)["topic /map"] is Level.ERROR
+    broken = {**told, "topics": {"/map": {"trouble": "no such type"}}}
+    assert look(Diagnosis("arm", "r"), broken)["topic /map"].message == "no such type"
+
+
+def test_what_was_before_the_first_look_is_no_news():
+    """A proxy that is diagnosed from its start has seen it all; one that began later has not."""
+    assert levels(report(link(0), silent=7))["service /plan"] is Level.OK
+
+
+def test_counters_that_begin_anew_are_no_trouble():
+    diagnosis = Diagnosis("arm", "r")
+    look(diagnosis, report(link(0), silent=7))
+    assert look(diagnosis, report(link(0), silent=0), 1.0)["service /plan"].level is Level.OK

@@ -1,0 +1,404 @@
+"""One service on the robot: all replicas are asked, the first success is returned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.errors import RosError
+from fogft.link.port import Refusal
+from fogft.model.spec import OnTimeout, ServiceSpec
+from fogft.proxy.robot.dispatcher import Dispatcher
+from tests.proxy.fakes import Clock, FakeLink
+
+
+class Scene:
+    """A dispatcher, its clock, its links and what the caller received."""
+
+    def __init__(self, links: int = 2, **spec) -> None:
+        self.clock = Clock()
+        self.responses: list[tuple[object, bytes]] = []
+        options = {
+            key: spec.pop(key)
+            for key in ("empty_response", "max_pending_bytes", "max_pending")
+            if key in spec
+        }
+        if (is_ok := spec.pop("is_ok", None)) is not None:
+            spec["ok_field"] = "ok"
+            options["ok_of"] = {"ok": is_ok}.__getitem__
+        self.dispatcher = Dispatcher(
+            ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, **spec),
+            lambda handle, payload: self.responses.append((handle, payload)),
+            clock=self.clock,
+            **options,
+        )
+        self.links = [FakeLink(slot) for slot in range(links)]
+        self.dispatcher.route(self.links)
+
+    def answer(self, slot: int, payload: bytes, n: int = -1) -> None:
+        link = self.links[slot]
+        self.dispatcher.answered(link, link.reply(payload, n))
+
+    def refuse(self, slot: int, reason: str, n: int = -1) -> None:
+        link = self.links[slot]
+        self.dispatcher.answered(link, link.refusal(reason, n))
+
+    def pass_time(self, seconds: float) -> None:
+        self.clock.now += seconds
+        self.dispatcher.tick()
+
+
+def test_every_replica_gets_the_request_under_one_id():
+    scene = Scene(3)
+    scene.dispatcher.submit(b"q", "caller")
+    offers = [link.offered[0] for link in scene.links]
+    assert len({request for _, request, _, _ in offers}) == 1
+    assert all((name, payload) == ("/s", b"q") for name, _, payload, _ in offers)
+
+
+def test_a_burst_waits_for_its_end_on_every_link_and_no_longer():
+    scene = Scene(2)
+    scene.dispatcher.burst(True)
+    for number in range(3):
+        scene.dispatcher.submit(b"q", number)
+    assert [link.waits for link in scene.links] == [3, 3]
+    scene.dispatcher.burst(False)
+    assert [link.waits for link in scene.links] == [0, 0]
+    scene.dispatcher.submit(b"q", "alone")
+    assert [link.waits for link in scene.links] == [0, 0]
+    assert [len(link.offered) for link in scene.links] == [4, 4]
+
+
+def test_the_first_answer_is_returned_and_the_second_is_late():
+    scene = Scene()
+    scene.dispatcher.submit(b"q", "caller")
+    scene.answer(1, b"fast")
+    scene.answer(0, b"slow")
+    assert scene.responses == [("caller", b"fast")]
+    assert scene.dispatcher.report()["late"] == 1
+    assert scene.dispatcher.won(scene.links[1].peer.id) == 1
+
+
+def test_bytes_of_requests_and_of_first_answers_are_counted():
+    scene = Scene()
+    for payload in (b"four", b"q"):
+        scene.dispatcher.submit(payload, "caller")
+    scene.answer(1, b"three", 0)
+    scene.answer(0, b"late ones do not count", 0)
+    report = scene.dispatcher.report()
+    assert (report["request_bytes"], report["response_bytes"]) == (5, 5)
+
+
+def test_losers_are_told_to_forget():
+    scene = Scene(3)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.answer(1, b"fast")
+    request = scene.links[0].offered[0][1]
+    assert [link.forgotten for link in scene.links] == [[request], [], [request]]
+
+
+def test_two_requests_never_share_an_answer():
+    scene = Scene(1)
+    scene.dispatcher.submit(b"one", "first")
+    scene.dispatcher.submit(b"two", "second")
+    scene.answer(0, b"answer two", n=1)
+    scene.answer(0, b"answer one", n=0)
+    assert scene.responses == [("second", b"answer two"), ("first", b"answer one")]
+
+
+def test_a_refusal_waits_for_the_other_replica():
+    scene = Scene()
+    scene.dispatcher.submit(b"q", "caller")
+    scene.refuse(0, Refusal.CRASHED)
+    assert scene.responses == []
+    scene.answer(1, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_when_all_refuse_the_request_is_tried_again():
+    scene = Scene()
+    scene.dispatcher.submit(b"q", "caller")
+    scene.refuse(0, Refusal.OVERLOADED)
+    scene.refuse(1, Refusal.NOT_READY)
+    scene.pass_time(0.02)
+    assert [len(link.offered) for link in scene.links] == [2, 2]
+    scene.answer(0, b"late but good")
+    assert scene.responses == [("caller", b"late but good")]
+
+
+def test_a_request_that_crashes_a_replica_is_not_sent_there_for_ever():
+    scene = Scene(1)
+    scene.dispatcher.submit(b"poison", "caller")
+    for _ in range(10):
+        if len(scene.links[0].offered) and scene.dispatcher.report()["pending"]:
+            scene.refuse(0, Refusal.CRASHED)
+        scene.pass_time(0.02)
+    assert len(scene.links[0].offered) == 3
+
+
+@pytest.mark.parametrize("reason", [Refusal.FORGOTTEN, Refusal.MALFORMED])
+def test_a_replica_that_cannot_answer_is_not_asked_again(reason):
+    scene = Scene(1)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.refuse(0, reason)
+    scene.pass_time(0.02)
+    assert len(scene.links[0].offered) == 1
+
+
+def test_a_full_window_is_passed_over_and_tried_later():
+    scene = Scene(1)
+    scene.links[0].room = 0
+    scene.dispatcher.submit(b"q", "caller")
+    scene.links[0].room = 1
+    scene.pass_time(0.02)
+    scene.answer(0, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_a_request_waits_for_the_first_replica_to_come():
+    scene = Scene(0)
+    scene.dispatcher.submit(b"q", "caller")
+    link = FakeLink(0)
+    scene.links.append(link)
+    scene.dispatcher.route([link])
+    scene.answer(0, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_a_reopened_link_gets_what_was_in_flight_under_the_same_id():
+    scene = Scene(2)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.refuse(0, Refusal.LOST)
+    scene.dispatcher.route(scene.links[1:])
+    scene.dispatcher.route(scene.links)
+    first, again = scene.links[0].offered
+    assert first[1] == again[1]
+
+
+def test_remaining_time_shrinks_when_a_request_is_sent_again():
+    scene = Scene(1)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.refuse(0, Refusal.LOST)
+    scene.pass_time(2.0)
+    assert scene.links[0].offered[1][3] == pytest.approx(3.0)
+
+
+def test_the_default_at_the_deadline_is_silence_and_it_is_counted(caplog):
+    scene = Scene()
+    scene.dispatcher.submit(b"q", "caller")
+    scene.pass_time(5.0)
+    scene.answer(0, b"too late")
+    assert scene.responses == []
+    report = scene.dispatcher.report()
+    assert (report["silent"], report["late"], report["pending"]) == (1, 1, 0)
+    assert "request_timed_out service=/s outcome=silent" in caplog.text
+
+
+def test_empty_at_the_deadline_where_the_pool_file_says_so():
+    scene = Scene(on_timeout=OnTimeout.EMPTY, empty_response=b"empty")
+    scene.dispatcher.submit(b"q", "caller")
+    scene.pass_time(5.0)
+    assert scene.responses == [("caller", b"empty")]
+    assert scene.dispatcher.report()["empty"] == 1
+
+
+def not_bad(payload: bytes) -> bool:
+    return not payload.startswith(b"bad")
+
+
+def test_a_response_that_is_not_ok_waits_for_a_better_one():
+    scene = Scene(is_ok=not_bad)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.answer(0, b"bad")
+    assert scene.responses == []
+    scene.answer(1, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_a_response_that_is_not_ok_is_returned_when_nothing_better_can_come():
+    scene = Scene(is_ok=not_bad)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.answer(0, b"bad 0")
+    scene.answer(1, b"bad 1")
+    assert scene.responses == [("caller", b"bad 1")]
+
+
+def test_a_response_that_is_not_ok_beats_silence_at_the_deadline():
+    scene = Scene(is_ok=not_bad)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.answer(0, b"bad")
+    scene.pass_time(5.0)
+    assert scene.responses == [("caller", b"bad")]
+
+
+def test_pending_bytes_are_bounded():
+    scene = Scene(1, max_pending_bytes=10)
+    for _ in range(3):
+        scene.dispatcher.submit(b"12345", "caller")
+    report = scene.dispatcher.report()
+    assert (report["turned_away"], report["pending_bytes"]) == (1, 10)
+    scene.answer(0, b"a", n=0)
+    assert scene.dispatcher.report()["pending_bytes"] == 5
+
+
+def test_pending_requests_are_bounded_however_small():
+    scene = Scene(1, max_pending=2)
+    for _ in range(3):
+        scene.dispatcher.submit(b"", "caller")
+    assert scene.dispatcher.report()["turned_away"] == 1
+    scene.answer(0, b"a", n=0)
+    scene.dispatcher.submit(b"", "caller")
+    assert scene.dispatcher.report()["turned_away"] == 1
+
+
+def test_a_full_window_is_tried_again_while_a_frozen_replica_works_on_the_request():
+    """What only a frozen replica took must not wait until that one is suspected."""
+    scene = Scene()
+    scene.links[1].room = 0
+    scene.dispatcher.submit(b"q", "caller")
+    scene.links[1].room = 1
+    scene.pass_time(0.02)
+    scene.answer(1, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_an_overloaded_replica_is_asked_again_while_a_frozen_one_works_on_the_request():
+    scene = Scene()
+    scene.dispatcher.submit(b"q", "caller")
+    scene.refuse(1, Refusal.OVERLOADED)
+    scene.pass_time(0.02)
+    scene.answer(1, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_a_replica_that_comes_is_asked_what_a_frozen_one_works_on():
+    scene = Scene(1)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.links.append(FakeLink(1))
+    scene.dispatcher.route(scene.links)
+    scene.answer(1, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_a_response_that_ros_does_not_take_harms_no_other_request():
+    """A client that is frozen, or gone, must end neither the thread of a link nor the proxy."""
+
+    def respond(handle: object, payload: bytes) -> None:
+        raise RosError("its queue is full")
+
+    dispatcher = Dispatcher(
+        ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, on_timeout=OnTimeout.EMPTY),
+        respond,
+        empty_response=b"empty",
+        clock=(clock := Clock()),
+    )
+    links = [FakeLink(0), FakeLink(1)]
+    dispatcher.route(links)
+    dispatcher.submit(b"q", "caller")
+    dispatcher.answered(links[0], links[0].reply(b"r"))
+    assert links[1].forgotten
+    dispatcher.submit(b"q", "caller")
+    clock.now += 5.0
+    dispatcher.tick()
+    assert dispatcher.report()["undelivered"] == 2
+
+
+def test_an_answer_that_is_no_response_of_the_type_is_a_failure():
+    def is_ok(payload: bytes) -> bool:
+        if payload == b"garbage":
+            raise RosError("no response")
+        return True
+
+    scene = Scene(is_ok=is_ok)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.answer(0, b"garbage")
+    scene.answer(1, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+def test_a_request_that_is_answered_while_it_is_offered_is_forgotten_by_the_rest():
+    """An answer can come before the last link has the request: that one need not work on it."""
+    scene = Scene()
+    offer = scene.links[0].offer
+
+    def answered_at_once(*arguments, **options):
+        offer(*arguments, **options)
+        scene.answer(0, b"fast")
+        return True
+
+    scene.links[0].offer = answered_at_once  # type: ignore[method-assign]
+    scene.dispatcher.submit(b"q", "caller")
+    assert scene.links[1].offered[0][1] == scene.links[1].forgotten[-1]
+
+
+def test_two_generations_of_a_slot_are_two_replicas():
+    """While a replacement takes over, a refusal of the old one is not one of the new."""
+    scene = Scene(0)
+    scene.links = [FakeLink(0, generation=1), FakeLink(0, generation=2)]
+    scene.dispatcher.route(scene.links)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.refuse(0, Refusal.FORGOTTEN)
+    scene.answer(1, b"good")
+    assert scene.responses == [("caller", b"good")]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["submit", "answer", "refuse", "lose", "pass"]), st.integers(0, 2)
+        ),
+        max_size=60,
+    )
+)
+def test_each_caller_is_answered_at_most_once_and_nothing_is_lost(steps):
+    """Whatever happens: received = answered + silent + pending, and no caller hears twice."""
+    scene = Scene(3)
+    callers = 0
+    for step, slot in steps:
+        link = scene.links[slot]
+        if step == "submit":
+            callers += 1
+            scene.dispatcher.submit(b"q%d" % callers, callers)
+        elif step == "pass":
+            scene.pass_time(slot + 0.5)
+        elif link.offered:
+            if step == "answer":
+                _, _, payload, _ = link.offered[-1]
+                scene.answer(slot, b"to " + payload)
+            else:
+                scene.refuse(slot, Refusal.LOST if step == "lose" else Refusal.CRASHED)
+    report = scene.dispatcher.report()
+    assert report["received"] == report["answered"] + report["silent"] + report["pending"]
+    handles = [handle for handle, _ in scene.responses]
+    assert len(handles) == len(set(handles)) == report["answered"]
+    assert all(payload == b"to q%d" % handle for handle, payload in scene.responses)
+
+
+def test_a_changed_ok_field_counts_from_the_next_answer_on():
+    """Requests under way end by the check of now, and none is lost to the change."""
+    checks = {"ok": lambda payload: payload != b"bad", "fine": lambda payload: payload != b"poor"}
+    responses: list[tuple[object, bytes]] = []
+    spec = ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0)
+    dispatcher = Dispatcher(
+        spec, lambda *response: responses.append(response), ok_of=checks.__getitem__, clock=Clock()
+    )
+    links = [FakeLink(0), FakeLink(1)]
+    dispatcher.route(links)
+    for field, rejected in (("ok", b"bad"), ("fine", b"poor"), ("", b"")):
+        dispatcher.adopt(replace(spec, ok_field=field))
+        dispatcher.submit(b"q", field)
+        if rejected:
+            dispatcher.answered(links[0], links[0].reply(rejected))
+        dispatcher.answered(links[1], links[1].reply(b"good" if field else b"bad"))
+    assert responses == [("ok", b"good"), ("fine", b"good"), ("", b"bad")]
+
+
+def test_a_service_may_become_one_that_answers_empty_at_the_deadline():
+    scene = Scene(empty_response=b"empty")
+    scene.dispatcher.submit(b"q", "before")
+    scene.dispatcher.adopt(replace(scene.dispatcher.spec, on_timeout=OnTimeout.EMPTY))
+    scene.pass_time(6.0)
+    assert scene.responses == [("before", b"empty")]

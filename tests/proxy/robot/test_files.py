@@ -1,0 +1,170 @@
+"""Whatever a file of the proxies holds: a value, or one clear error; never another exception."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from fogft import disk
+from fogft.errors import FogftError
+from fogft.model import membership
+from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.proxy.config import read_client, read_server
+from fogft.proxy.robot import process
+from fogft.proxy.robot.process import ManagerSign
+from tests.proxy.fakes import UID, Clock
+
+CLIENT = f"""\
+pool: p
+pool_uid: "{UID}"
+robot: robot
+membership: membership.json
+status: proxy-status.json
+lease: lease.json
+lock: proxy.lock
+credentials: {{ca: ca.crt, certificate: robot.crt, key: robot.key}}
+services: [{{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 2.0}}]
+health: {{suspect_after_s: 2.0}}
+domain_id: 3
+"""
+REPLICA = f"""\
+pool: p
+pool_uid: "{UID}"
+slot: 0
+generation: 1
+listen: 127.0.0.1:7447
+services: [{{name: /plan, type: nav_msgs/srv/GetPlan}}]
+run: exec serve
+credentials: {{ca: ca.crt, certificate: replica.crt, key: replica.key}}
+orphan_after_s: 60
+"""
+MEMBERS = json.dumps(
+    membership.to_dict(Membership("p", UID, 1, 1, (Member(ReplicaId(UID, 0, 1), "h:1"),)))
+)
+
+
+def damaged(text: str) -> st.SearchStrategy[bytes]:
+    """The text cut off, with bytes struck out, or with bytes put in."""
+    whole = text.encode()
+    at = st.integers(0, len(whole))
+    scrap = st.binary(max_size=8) | st.sampled_from(
+        [b"[", b"{", b": ", b"null", b".nan", b"-1", b"&a ", b"*a", b"!!int ", b"1e999", b"\xff"]
+    )
+    cut = at.map(lambda end: whole[:end])
+    changed = st.tuples(at, st.integers(0, 20), scrap).map(
+        lambda c: whole[: c[0]] + c[2] + whole[c[0] + c[1] :]
+    )
+    return cut | changed | st.binary(max_size=60)
+
+
+def value_or_error(read, path: Path, content: bytes):
+    path.write_bytes(content)
+    with contextlib.suppress(FogftError):
+        return read(path)
+    return None
+
+
+@given(damaged(CLIENT))
+@example(b"a: 2020-13-45")
+@example(b"a: !!timestamp foo")
+@example(b"[" * 100_000)
+def test_a_damaged_proxy_yaml(tmp_path_factory, content):
+    value_or_error(read_client, tmp_path_factory.getbasetemp() / "proxy.yaml", content)
+
+
+@given(damaged(REPLICA))
+def test_a_damaged_replica_yaml(tmp_path_factory, content):
+    value_or_error(read_server, tmp_path_factory.getbasetemp() / "replica.yaml", content)
+
+
+@given(damaged(MEMBERS))
+@example(b"[" * 100_000)
+@example(b'{"epoch": 1e999}')
+def test_a_damaged_membership_names_nobody_else(tmp_path_factory, content):
+    """Its checksum tells: what is read is what was written, or nothing."""
+
+    def read(path: Path) -> Membership:
+        return membership.from_dict(disk.read_json(path))
+
+    found = value_or_error(read, tmp_path_factory.getbasetemp() / "membership.json", content)
+    assert found is None or membership.to_dict(found) == json.loads(MEMBERS)
+
+
+@given(damaged('{"epoch": 1, "pid": 4, "beat": 7}'))
+@example(b"[" * 100_000)
+def test_a_damaged_lease_is_no_error(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "lease.json"
+    path.write_bytes(content)
+    sign = ManagerSign(path, Clock())
+    sign.look()
+    assert sign.age_s() is None
+
+
+@pytest.mark.parametrize(
+    ("key", "wrong"),
+    [
+        ("timeout_s: 2.0", "timeout_s: -1"),
+        ("timeout_s: 2.0", "timeout_s: .nan"),
+        ("suspect_after_s: 2.0", "suspect_after_s: .inf"),
+        ("robot: robot", "robot: ''"),
+        ("robot: robot", "robot: " + "x" * 65),
+        (f'pool_uid: "{UID}"', "pool_uid: 0123456789"),
+    ],
+)
+def test_a_value_that_would_break_a_link_later_is_an_error_now(tmp_path, key, wrong):
+    (tmp_path / "proxy.yaml").write_text(CLIENT.replace(key, wrong))
+    with pytest.raises(FogftError, match="is not usable"):
+        read_client(tmp_path / "proxy.yaml")
+
+
+@pytest.mark.parametrize(
+    ("line", "source"),
+    [
+        ("", "auto"),
+        ("notice: null", "auto"),
+        ("notice: none", "none"),
+        ("notice: gcp", "gcp"),
+        ("notice: file:notice.json", "file:{folder}/notice.json"),
+        ("notice: file:/run/notice", "file:/run/notice"),
+    ],
+)
+def test_where_notices_come_from(tmp_path, line, source):
+    """A file is found from the configuration's own folder."""
+    (tmp_path / "replica.yaml").write_text(f"{REPLICA}{line}\n")
+    assert read_server(tmp_path / "replica.yaml").notice == source.format(folder=tmp_path)
+
+
+@pytest.mark.parametrize("line", ["notice: no", "notice: 'file:'", "notice: ibm", "notice: []"])
+def test_an_unknown_source_of_notices_is_an_error(tmp_path, line):
+    (tmp_path / "replica.yaml").write_text(f"{REPLICA}{line}\n")
+    with pytest.raises(FogftError, match="file:PATH"):
+        read_server(tmp_path / "replica.yaml")
+
+
+def test_a_file_that_stays_bad_is_logged_once(tmp_path, caplog):
+    """A full disk would else be told of twice a second, into a log on that disk."""
+
+    def fail() -> None:
+        raise FogftError("no space left")
+
+    for _ in range(5):
+        process._apply(fail, tmp_path / "x")
+    assert caplog.text.count("no space left") == 1
+    process._apply(lambda: None, tmp_path / "x")
+    process._apply(fail, tmp_path / "x")
+    assert caplog.text.count("no space left") == 2
+
+
+def test_a_replica_that_cannot_know_its_address_is_told(tmp_path: Path) -> None:
+    """`fogft serve --advertise` comes before the file; what is no endpoint is an error."""
+    path = tmp_path / "replica.yaml"
+    path.write_text(f"{REPLICA}advertise: 10.0.0.1:7447\n")
+    assert read_server(path).advertise == "10.0.0.1:7447"
+    assert read_server(path, advertise="vm.example.org:30001").advertise == "vm.example.org:30001"
+    with pytest.raises(FogftError, match="not `host:port`"):
+        read_server(path, advertise="vm.example.org")

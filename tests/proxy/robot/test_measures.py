@@ -1,0 +1,54 @@
+"""What proxies tell Prometheus: every outcome, by service, replica and reason."""
+
+from __future__ import annotations
+
+from fogft.metrics import proxies
+from fogft.metrics.exposition import text
+from fogft.model.spec import ServiceSpec
+from fogft.proxy.gateway.gateway import Forwarder, NoRos
+from fogft.proxy.robot.client import ClientProxy
+from fogft.proxy.robot.dispatcher import Dispatcher
+from tests.proxy.fakes import UID, Clock, FakeDialer, FakeLink
+
+
+def dispatcher(clock: Clock) -> Dispatcher:
+    made = Dispatcher(ServiceSpec("/s", "t", timeout_s=5.0), lambda handle, payload: None,
+                      clock=clock)  # fmt: skip
+    made.route([FakeLink(0)])
+    return made
+
+
+def test_every_outcome_of_a_service_is_told():
+    """One answered, one silent after a crash, each with its copies, its time and its reason."""
+    clock = Clock()
+    one = dispatcher(clock)
+    [link] = one._links.values()
+    one.submit(b"q", 1)
+    clock.now += 0.2
+    one.answered(link, link.reply(b"r"))
+    one.submit(b"q", 2)
+    one.answered(link, link.refusal("crashed"))
+    clock.now += 5.0
+    one.tick()
+    report = {"services": {"/s": one.report()}, "links": [], "uplink_suspected": False}
+    said = text(proxies.of_client(report)).splitlines()
+    assert 'fogft_requests_total{service="/s"} 2' in said
+    assert 'fogft_outcomes_total{service="/s",outcome="answered"} 1' in said
+    assert 'fogft_outcomes_total{service="/s",outcome="silent"} 1' in said
+    assert 'fogft_outcomes_total{service="/s",outcome="fallback"} 0' in said
+    assert 'fogft_answers_total{service="/s",replica="0.1"} 1' in said
+    assert 'fogft_refusals_total{service="/s",reason="crashed"} 1' in said
+    assert 'fogft_request_seconds_bucket{service="/s",le="0.1"} 0' in said
+    assert 'fogft_request_seconds_bucket{service="/s",le="0.25"} 1' in said
+    assert 'fogft_request_seconds_count{service="/s"} 1' in said
+
+
+def test_a_gateway_tells_of_its_robots_too():
+    clock = Clock()
+    proxy = ClientProxy(UID, NoRos(), FakeDialer(), lambda *_: dispatcher(clock), clock=clock)
+    proxy.serve([ServiceSpec("/s", "t")])
+    told = {**proxy.report(), "forwarded": Forwarder().report(), "listener": {"requests": 3}}
+    said = text(proxies.of_gateway(told)).splitlines()
+    assert 'fogft_gateway_requests_total{event="passed"} 0' in said
+    assert 'fogft_wire_events_total{event="requests"} 3' in said
+    assert 'fogft_pending_requests{service="/s"} 0' in said

@@ -1,0 +1,38 @@
+"""What is held against a replica's service, and what only against its load, link or start."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.link.port import Refusal
+from fogft.metrics.outcomes import Outcomes
+from fogft.model.replica import ReplicaId
+
+REPLICA = ReplicaId("0123456789abcdef", 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("reason", "held"),
+    [
+        (Refusal.CRASHED, 1),
+        (Refusal.MALFORMED, 1),
+        (Refusal.NOT_READY, 0),
+        (Refusal.OVERLOADED, 0),
+        (Refusal.LOST, 0),
+        (Refusal.CANCELLED, 0),
+    ],
+)
+def test_only_what_its_service_did_is_held_against_a_replica(reason, held):
+    """A replica that still starts, is full or cut off says nothing about its version."""
+    outcomes = Outcomes()
+    outcomes.refusal(reason, REPLICA)
+    outcomes.served(REPLICA)
+    assert outcomes.by(REPLICA) == (1, held)
+    assert outcomes.refused == {reason: 1}
+
+
+def test_a_refusal_of_no_request_is_counted_and_held_against_nobody():
+    outcomes = Outcomes()
+    outcomes.refusal(Refusal.CRASHED)
+    assert outcomes.refused == {Refusal.CRASHED: 1}
+    assert outcomes.by(REPLICA) == (0, 0)

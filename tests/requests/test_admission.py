@@ -1,0 +1,129 @@
+"""Who is next at a replica: by deadline within a robot, in fair shares between robots."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.requests.admission import AdmissionQueue
+
+
+def filled(*entries: tuple[str, float]) -> AdmissionQueue[str]:
+    """Return a queue of ``(robot, deadline)``; an item is its place, such as ``a1``."""
+    queue: AdmissionQueue[str] = AdmissionQueue()
+    for n, (robot, deadline) in enumerate(entries):
+        queue.put(bytes([n]), robot, deadline, f"{robot}{n}")
+    return queue
+
+
+def drained(queue: AdmissionQueue[str]) -> list[str]:
+    return list(iter(queue.take, None))
+
+
+def test_one_robot_is_served_by_deadline():
+    assert drained(filled(("a", 3.0), ("a", 1.0), ("a", 2.0))) == ["a1", "a2", "a0"]
+
+
+def test_a_chatty_robot_takes_turns_with_a_quiet_one():
+    queue = filled(*[("chatty", 1.0)] * 6, ("quiet", 9.0), ("quiet", 9.0))
+    served = drained(queue)
+    assert served.index("quiet6") <= 1
+    assert served.index("quiet7") <= 3
+
+
+def test_turns_cannot_be_saved_up():
+    """A robot that was silent for long gets its share from now on, not what it left."""
+    queue = filled(*[("a", 1.0)] * 10)
+    for _ in range(8):
+        queue.take()
+    for n in range(6):
+        queue.put(b"b%d" % n, "b", 1.0, f"b{n}")
+    assert drained(queue)[:4] in (["a8", "b0", "a9", "b1"], ["b0", "a8", "b1", "a9"])
+
+
+def test_when_full_the_robot_with_most_gives_way():
+    queue = filled(("chatty", 1.0), ("chatty", 7.0), ("chatty", 5.0))
+    assert queue.give_way("quiet", 9.0) == "chatty1"
+    assert len(queue) == 2
+
+
+def test_when_full_an_urgent_request_displaces_a_later_one_of_its_own_robot():
+    queue = filled(("a", 1.0), ("a", 7.0))
+    assert queue.give_way("a", 3.0) == "a1"
+    assert queue.give_way("a", 9.0) is None
+
+
+def test_equal_shares_displace_nobody():
+    assert filled(("a", 1.0), ("a", 1.0), ("b", 1.0)).give_way("b", 0.5) is None
+
+
+robots = st.sampled_from("abc")
+operations = st.lists(
+    st.one_of(
+        st.tuples(st.just("put"), robots, st.floats(0, 10)),
+        st.tuples(st.just("take"), robots, st.just(0.0)),
+        st.tuples(st.just("remove"), robots, st.floats(0, 1)),
+        st.tuples(st.just("give way"), robots, st.floats(0, 10)),
+    ),
+    max_size=120,
+)
+
+
+@given(operations)
+def test_each_comes_out_once_and_nobody_starves(operations):
+    """What is put in comes out once; with n robots waiting each is served every n-th time;
+    of two of one robot the earlier deadline goes first."""
+    queue: AdmissionQueue[int] = AdmissionQueue()
+    waiting: dict[int, tuple[str, float]] = {}
+    since: dict[str, int] = {}
+    for n, (operation, robot, value) in enumerate(operations):
+        if operation == "put":
+            queue.put(n.to_bytes(2, "big"), robot, value, n)
+            waiting[n] = (robot, value)
+            since.setdefault(robot, 0)
+        elif operation == "take":
+            taken = queue.take()
+            if taken is None:
+                assert not waiting
+                continue
+            who, deadline = waiting.pop(taken)
+            assert all(deadline <= d for other, d in waiting.values() if other == who)
+            for other in since:
+                since[other] += 1
+            since[who] = 0
+        elif operation == "remove" and waiting:
+            chosen = sorted(waiting)[int(value * (len(waiting) - 1))]
+            assert queue.remove(chosen.to_bytes(2, "big")) == chosen
+            del waiting[chosen]
+        elif operation == "give way":
+            gone = queue.give_way(robot, value)
+            if gone is not None:
+                del waiting[gone]
+        present = {who for who, _ in waiting.values()}
+        since = {who: count for who, count in since.items() if who in present}
+        assert all(count <= 3 for count in since.values())
+        assert len(queue) == len(waiting)
+    assert queue.ahead("a", 5.0) <= len(waiting)
+
+
+@given(st.lists(st.tuples(robots, st.floats(0, 100)), min_size=1, max_size=20))
+def test_where_the_latest_is_wanted_the_newest_of_each_robot_goes_first(entries):
+    """Everybody still gets a turn; what gives way when there is no room is the stalest."""
+    queue: AdmissionQueue[tuple[str, float]] = AdmissionQueue(latest=True)
+    for n, entry in enumerate(entries):
+        queue.put(bytes([n]), *entry, entry)
+    served = list(iter(queue.take, None))
+    assert sorted(served) == sorted(entries)
+    for robot in "abc":
+        deadlines = [deadline for name, deadline in served if name == robot]
+        assert deadlines == sorted(deadlines, reverse=True)
+
+
+def test_the_stalest_gives_way_to_a_newer_one_of_its_own_robot():
+    queue: AdmissionQueue[str] = AdmissionQueue(latest=True)
+    queue.put(b"old", "a", 1.0, "old")
+    queue.put(b"new", "a", 7.0, "new")
+    assert queue.give_way("a", 0.5) is None
+    assert queue.give_way("a", 9.0) == "old"
+    assert queue.ahead("a", 8.0) == 0
+    assert queue.ahead("a", 5.0) == 1

@@ -1,0 +1,73 @@
+"""How many requests a service gets at once: what is learned of simulated services."""
+
+from __future__ import annotations
+
+import heapq
+import random
+
+import pytest
+
+from fogft.requests.concurrency import ConcurrencyLimit
+
+
+def saturated(limit: ConcurrencyLimit, workers: int, median_s: float, sigma: float, answers: int):
+    """Keep a service of so many workers at its limit; return answers a second, and its idleness."""
+    source = random.Random(3)
+    free = [0.0] * workers
+    at_work: list[tuple[float, float, int]] = []
+    now = 0.0
+    for _ in range(answers):
+        while len(at_work) < limit.limit:
+            worker = min(range(workers), key=free.__getitem__)
+            end = max(now, free[worker]) + median_s * source.lognormvariate(0, sigma)
+            free[worker] = end
+            heapq.heappush(at_work, (end, now, len(at_work) + 1))
+        now, began, level = heapq.heappop(at_work)
+        limit.finished(level, now - began, now)
+    return answers / now
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.35])
+@pytest.mark.parametrize(("workers", "expected"), [(1, {1}), (2, {2}), (4, {4, 5}), (16, {10})])
+def test_it_learns_how_many_a_service_works_on(workers, expected, sigma):
+    limit = ConcurrencyLimit(10)
+    rate = saturated(limit, workers, 0.05, sigma, 3000)
+    assert limit.limit in expected
+    mean_s = 0.05 * (1.063 if sigma else 1.0)
+    assert rate > 0.93 * min(workers, 10) / mean_s  # what is learned costs no throughput
+
+
+def test_a_quick_service_is_not_limited():
+    limit = ConcurrencyLimit(10)
+    saturated(limit, 1, 0.001, 0.1, 1000)
+    assert limit.limit == 10
+
+
+def test_without_demand_nothing_is_limited():
+    limit = ConcurrencyLimit(10)
+    for n in range(1000):
+        limit.finished(1, 0.5, n * 1.0)
+    assert limit.limit == 10
+
+
+def test_a_given_limit_is_not_learned():
+    limit = ConcurrencyLimit(10, given=3)
+    saturated(limit, 1, 0.05, 0.0, 500)
+    assert limit.limit == 3
+
+
+def test_a_service_that_gets_more_workers_gets_more_requests():
+    limit = ConcurrencyLimit(10)
+    saturated(limit, 1, 0.05, 0.1, 500)
+    before = limit.limit
+    saturated(limit, 8, 0.05, 0.1, 8000)
+    assert before == 1
+    assert limit.limit >= 8
+
+
+def test_the_wait_is_what_is_ahead_at_the_pace_so_far():
+    limit = ConcurrencyLimit(10, given=2)
+    assert limit.wait_s(5, 2) == 0.0  # nothing is known
+    limit.finished(2, 0.4, 0.0)
+    assert limit.wait_s(4, 2) == pytest.approx(1.0)
+    assert limit.wait_s(0, 0) == 0.0

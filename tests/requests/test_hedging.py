@@ -1,0 +1,80 @@
+"""Whom a request is sent to: everybody, or one at a time."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.requests.hedging import NEVER, All, Failover
+
+A = b"a" * 16
+
+
+def test_all_go_to_everybody_and_all_but_the_winner_stop():
+    policy = All()
+    assert policy.first(A, (1, 2, 3), 0.0) == (1, 2, 3)
+    assert policy.more({1: 0.0}, (2, 3), 0.0) == (2, 3)
+    assert list(policy.answered(A, {1: 0.0, 2: 0.0, 3: 0.0}, 2, 1.0)) == [1, 3]
+    assert policy.look_at == NEVER
+
+
+def test_failover_keeps_one():
+    policy = Failover()
+    assert {tuple(policy.first(A, (3, 1, 2), n)) for n in range(5)} == {(3,)}
+    assert policy.more({3: 0.0}, (1, 2), 9.0) == ()
+    assert policy.switched == 0
+
+
+def test_failover_switches_when_its_replica_is_suspected():
+    policy = Failover()
+    policy.first(A, (1, 2), 0.0)
+    assert policy.first(A, (2,), 1.0) == (2,)
+    assert policy.first(A, (1, 2), 2.0) == (2,)
+    assert policy.switched == 1
+
+
+def test_failover_gives_a_failed_request_to_the_next():
+    policy = Failover()
+    policy.first(A, (1, 2), 0.0)
+    policy.failed(A, 1, 0.1)
+    assert policy.more({}, (2,), 0.1) == (2,)
+    assert policy.first(A, (1, 2), 0.2) == (2,)
+
+
+def test_failover_leaves_a_replica_that_lets_a_deadline_pass():
+    """Its service may hang while its server proxy goes on answering probes."""
+    policy = Failover()
+    policy.first(A, (1, 2), 0.0)
+    policy.expired(A, {1: 0.0}, 5.0)
+    assert policy.first(A, (1, 2), 5.0) == (2,)
+
+
+def test_failover_tries_every_replica_in_turn():
+    """Two that fail must not keep a third from being tried."""
+    policy = Failover()
+    tried = []
+    for n in range(4):
+        (replica,) = policy.first(A, (0, 1, 2), n)
+        policy.failed(A, replica, n)
+        tried.append(replica)
+    assert tried == [0, 1, 2, 0]
+
+
+def test_the_only_replica_is_asked_again_though_it_failed():
+    policy = Failover()
+    policy.first(A, (1,), 0.0)
+    policy.failed(A, 1, 0.1)
+    assert policy.first(A, (1,), 0.2) == (1,)
+
+
+@given(st.lists(st.tuples(st.sets(st.integers(0, 3)), st.booleans()), max_size=30))
+def test_failover_never_sends_two_copies_and_always_one_where_it_can(steps):
+    policy = Failover()
+    for n, (able, fails) in enumerate(steps):
+        chosen = policy.first(A, sorted(able), float(n))
+        assert len(chosen) == min(1, len(able))
+        assert set(chosen) <= able
+        for replica in chosen:
+            assert policy.more({replica: float(n)}, sorted(able - {replica}), n + 0.5) == ()
+            if fails:
+                policy.failed(A, replica, n + 0.5)

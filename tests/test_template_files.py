@@ -1,0 +1,225 @@
+"""Templates are found and filled in safely; examples are copied whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from fogft import template_files
+from fogft.errors import FogftError
+from fogft.pool.commands import init
+from fogft.poolfile import file
+
+EXAMPLES = ["detect", "echo", "motion", "pick", "planner", "segment", "words"]
+
+texts = st.text(st.characters(exclude_categories=["Cs"]))
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | texts
+    | st.floats(allow_nan=False, allow_infinity=False),
+    lambda child: st.lists(child, max_size=3) | st.dictionaries(texts, child, max_size=3),
+    max_leaves=8,
+)
+
+
+class TestFill:
+    @given(value=values)
+    @example(value=1e-07)
+    @example(value=1e16)
+    @example(value="\x85\u2028\ufeff\x7f\U0001f916")
+    @example(value='"\n${key}: x')
+    @example(value="no")
+    def test_a_value_comes_back_as_it_was_from_yaml_and_json(self, value):
+        """Whatever a value holds, it stays one value, and the line after it stays itself."""
+        text = template_files.fill("a: ${value}\nb: 1\n", {"value": value})
+        assert text.count("\n") == 2
+        assert yaml.safe_load(text) == {"a": value, "b": 1}
+        assert json.loads(template_files.literal(value)) == value
+
+    def test_a_dollar_is_written_twice(self):
+        assert template_files.fill("run: $$HOME ${a}", {"a": "$b ${a}"}) == 'run: $HOME "$b ${a}"'
+
+    @pytest.mark.parametrize(
+        ("text", "given_values", "message"),
+        [
+            ("${a}\n${b}", {"a": 1}, "t.yaml: missing values ['b'], unused values []"),
+            ("${a}", {"a": 1, "c": 2}, "t.yaml: missing values [], unused values ['c']"),
+            ("x\n$a", {"a": 1}, "t.yaml:2: a `$` that begins no `${key}`; write `$$`"),
+            ("${A}", {"A": 1}, "t.yaml:1: a `$` that begins no `${key}`; write `$$`"),
+            ("${a}", {"a": float("nan")}, "nan cannot be written into a template"),
+            ("${a}", {"a": {1: 2}}, "1 cannot be a key"),
+            ("${a}", {"a": b"x"}, "a bytes cannot be written into a template"),
+            ("${a}", {"a": Path("x")}, "a PosixPath cannot be written into a template"),
+        ],
+    )
+    def test_a_mistake_of_ours_is_an_error(self, text, given_values, message):
+        with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+            template_files.fill(text, given_values, "t.yaml")
+
+    def test_half_a_character_is_an_error(self):
+        with pytest.raises(ValueError, match="surrogates not allowed"):
+            template_files.literal("\ud800")
+
+
+class TestRender:
+    def test_by_name(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(template_files, "folder", lambda: tmp_path)
+        (tmp_path / "x.yaml").write_text("a: ${a}\n")
+        assert template_files.render("x.yaml", {"a": "ü"}) == 'a: "ü"\n'
+
+    def test_no_such_template(self):
+        with pytest.raises(FogftError, match=r"^the template `.*/none\.yaml` cannot be read: No "):
+            template_files.render("none.yaml", {})
+
+
+class TestFolder:
+    def test_of_this_checkout(self):
+        assert template_files.folder() == Path(__file__).parents[1] / "templates"
+
+    def test_of_an_installed_package(self, tmp_path, monkeypatch):
+        """A wheel carries the templates inside the package."""
+        shutil.copytree(template_files.folder(), tmp_path / "fogft" / "templates")
+        monkeypatch.setattr(template_files, "__file__", str(tmp_path / "fogft" / "pool" / "x.py"))
+        assert template_files.folder() == tmp_path / "fogft" / "templates"
+
+    def test_missing(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(template_files, "__file__", str(tmp_path / "fogft" / "pool" / "x.py"))
+        with pytest.raises(FogftError, match=r"^the templates are missing") as caught:
+            template_files.folder()
+        assert caught.value.hint == "install fogft again"
+
+
+def contents(folder):
+    """Return every path below, with the bytes of the files."""
+    return {
+        p.relative_to(folder): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")
+    }
+
+
+class TestExamples:
+    def test_each_is_named_and_described(self):
+        """The description is the first line of the example's pool file."""
+        found = init.examples()
+        assert list(found) == EXAMPLES
+        assert all(re.fullmatch(r"[A-Z].{20,100}\.", line) for line in found.values())
+        assert init.DEFAULT_EXAMPLE in found
+
+    @pytest.mark.parametrize("name", EXAMPLES)
+    def test_its_pool_file_is_right(self, name):
+        """Each example is a valid pool of its own name, on the local cloud, in three regions."""
+        folder = template_files.folder() / name
+        spec = file.read(folder / "pool.yaml")
+        assert spec.name == name
+        assert [each["infra"] for each in spec.task["resources"]["any_of"]] == [
+            "local/us-west-1",
+            "local/us-west-2",
+            "local/eu-central-1",
+        ]
+        script = re.fullmatch(r"exec python3 (\w+\.py)", spec.task["run"])
+        assert (folder / script[1]).is_file()
+
+    @pytest.mark.parametrize("name", EXAMPLES)
+    def test_its_nodes_know_nothing_of_fogft(self, name):
+        """The nodes are ordinary ROS 2 nodes: that is the point of the example."""
+        sources = list((template_files.folder() / name).glob("*.py"))
+        assert sources
+        for source in sources:
+            assert "fogft" not in source.read_text()
+
+    @pytest.mark.parametrize("name", EXAMPLES)
+    def test_all_its_files_are_copied(self, name, tmp_path):
+        target = tmp_path / "new" / "folder"
+        written = init.copy_example(name, target)
+        assert written[0] == target / "pool.yaml"
+        assert sorted(written) == sorted(p for p in target.rglob("*") if p.is_file())
+        source = template_files.folder() / name
+        for path in written:
+            assert path.read_bytes() == (source / path.relative_to(target)).read_bytes()
+        assert not [path for path in written if "__pycache__" in path.parts]
+
+    def test_beside_other_files(self, tmp_path):
+        (tmp_path / "mine.py").write_text("x")
+        init.copy_example("echo", tmp_path)
+        assert (tmp_path / "mine.py").read_text() == "x"
+
+
+class TestRefusals:
+    """An error changes nothing."""
+
+    def refuse(self, tmp_path, *args, **kwargs):
+        before = contents(tmp_path)
+        with pytest.raises(FogftError) as caught:
+            init.copy_example(*args, **kwargs)
+        assert contents(tmp_path) == before
+        return caught.value.message, caught.value.hint
+
+    def test_no_such_example(self, tmp_path):
+        assert self.refuse(tmp_path, "planer", tmp_path / "a") == (
+            "there is no example `planer`",
+            "did you mean `planner`?",
+        )
+        assert self.refuse(tmp_path, "xyz", tmp_path / "a")[1] == (
+            "known here: `detect`, `echo`, `motion`, `pick`, `planner`, `segment`, `words`"
+        )
+
+    def test_a_file_is_in_the_way(self, tmp_path):
+        (tmp_path / "echo_client.py").write_text("mine")
+        assert self.refuse(tmp_path, "echo", tmp_path) == (
+            f"`{tmp_path}/echo_client.py` exists already",
+            "choose another folder with `--into DIR`, or overwrite with `--force`",
+        )
+
+    def test_a_dangling_link_is_in_the_way(self, tmp_path):
+        (tmp_path / "pool.yaml").symlink_to(tmp_path / "elsewhere")
+        assert "pool.yaml` exists already" in self.refuse(tmp_path, "echo", tmp_path)[0]
+
+    @pytest.mark.parametrize("force", [False, True])
+    def test_a_folder_is_in_the_way(self, tmp_path, force):
+        (tmp_path / "pool.yaml").mkdir()
+        assert self.refuse(tmp_path, "echo", tmp_path, force=force) == (
+            f"`{tmp_path}/pool.yaml` is a folder",
+            "choose another place with `--into DIR`",
+        )
+
+    def test_the_target_is_a_file(self, tmp_path):
+        (tmp_path / "a").write_text("x")
+        assert self.refuse(tmp_path, "echo", tmp_path / "a") == (
+            f"`{tmp_path}/a` is not a folder",
+            "choose another with `--into DIR`",
+        )
+        assert self.refuse(tmp_path, "echo", tmp_path / "a" / "b")[0].endswith(
+            "cannot be written: Not a directory"
+        )
+
+    @pytest.mark.parametrize("broken", ["copyfile", "replace"])
+    def test_the_disk_fills_up(self, tmp_path, monkeypatch, broken):
+        """Folders made on the way go again, and nothing of the copy stays."""
+
+        def full(*_):
+            raise OSError(28, "No space left on device", "x")
+
+        monkeypatch.setattr(shutil if broken == "copyfile" else os, broken, full)
+        assert self.refuse(tmp_path, "echo", tmp_path / "a" / "b") == (
+            "`x` cannot be written: No space left on device",
+            "choose another folder with `--into DIR`",
+        )
+
+
+def test_force_overwrites_what_it_brings_and_nothing_else(tmp_path):
+    (tmp_path / "pool.yaml").write_text("mine")
+    (tmp_path / "other.yaml").write_text("mine")
+    init.copy_example("echo", tmp_path, force=True)
+    assert (tmp_path / "pool.yaml").read_bytes() == (
+        template_files.folder() / "echo" / "pool.yaml"
+    ).read_bytes()
+    assert (tmp_path / "other.yaml").read_text() == "mine"
