@@ -4,7 +4,7 @@ One function for each thing that the command line can ask. They take and return 
 never print; imports stand inside them so that a command loads only what it needs.
 
 Owns: which cloud, which reader of pool files, which store; what a command means.
-Not here: text (`fogft.cli`), decisions (`fogft.core`), the parts themselves.
+Not here: text (`fogft.cli`), decisions (`fogft.planning`), the parts themselves.
 """
 
 from fogft.app.chaos import chaos, machine_in

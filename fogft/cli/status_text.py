@@ -81,17 +81,12 @@ def notes(status: PoolStatus, *, colour: bool) -> list[str]:
 
 
 def _orders(rows: Sequence[ServiceStatus]) -> list[str]:
-    """Return who orders the requests of services that several robots share, and what is wrong."""
+    """Return which stateful services cannot be had, and why."""
     found = []
     for row in rows:
         order = row.counters.get("order") or {}
         if order.get("trouble"):
             found.append(f"`{row.name}` cannot be had: {order['trouble']}")
-        elif order.get("sequencer"):
-            found.append(
-                f"`{row.name}` is ordered by robot `{order['sequencer']}`, "
-                f"and {order['members']} replicas have a vote"
-            )
     return found
 
 

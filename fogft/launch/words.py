@@ -1,7 +1,7 @@
 """Turn what a launch file says of nodes and their pool into a pool file. Pure.
 
 Owns: the `run` command of a replica, and how a base file and a launch file's words merge.
-Not here: substitutions and conditions (`actions`), what a pool file may say (`fogft.core`).
+Not here: substitutions and conditions (`actions`), what a pool file may say (`fogft.poolfile`).
 """
 
 from __future__ import annotations

@@ -51,16 +51,6 @@ class CatchingUp(ABC):
         """Whether a replica's state is one that this term knows."""
         return at.epoch == self.epoch or at == self.base
 
-    def _to_bring(self, replica: int, payload: bytes) -> bytes:
-        """Return the bytes of an order that lets a replica join or restores it."""
-        return payload
-
-    def _wants_checkpoint(self, log: OrderedLog) -> bool:
-        """Whether a checkpoint is needed though the log is not half full."""
-        # A log that begins with the service's first state needs none; nor does one just taken.
-        waits = any(p.phase is Phase.CLAIMED for p in self._peers.values())
-        return waits or (log.checkpoint is None and log.start > 0)
-
     # -- what the owner asks --------------------------------------------------------------
 
     @property
@@ -165,11 +155,10 @@ class CatchingUp(ABC):
             return
         if may_join and from_index == at.index:
             peer.phase = Phase.ASKED
-            payload = self._to_bring(replica, orders.encode_join(at, log.last))
-            self._out.append(Order(replica, Op.JOIN, at.index, payload))
+            self._out.append(Order(replica, Op.JOIN, at.index, orders.encode_join(at, log.last)))
         elif kept is not None:
             peer.phase = Phase.ASKED
-            payload = self._to_bring(replica, orders.encode_snapshot(log.last, kept.state))
+            payload = orders.encode_snapshot(log.last, kept.state)
             self._out.append(Order(replica, Op.RESTORE, kept.index, payload))
 
     def _bring_all(self, *, waited: bool = False) -> None:
@@ -200,7 +189,10 @@ class CatchingUp(ABC):
         log = self.log
         if log is None or self._asked_for_checkpoint is not None or now < self._checkpoint_at:
             return
-        if not self._wants_checkpoint(log) and not log.half_full:
+        waits = any(p.phase is Phase.CLAIMED for p in self._peers.values())
+        # A log that begins with the service's first state needs none; nor does one just taken.
+        begins_later = log.checkpoint is None and log.start > 0
+        if not (waits or begins_later or log.half_full):
             return
         joined = [
             (not self._keeps_up(p), p.won, r)

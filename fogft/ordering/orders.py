@@ -41,13 +41,9 @@ class Op(IntEnum):
     SNAPSHOT = 4
     APPLY = 5
     RECALL = 6  # give the answer to a number that was applied; never applies it
-    # Where several robots share a sequencer; their bytes: `shared_orders`.
-    LISTEN = 7  # tell what robots have handed in; until there is something, wait
-    HAND_IN = 8  # have the sequencer number a request; of no term
-    LOOK = 9  # tell whom you obey; of no term
 
 
-OrderId = tuple[Op, int, int]  # operation, term (or a robot's session), index
+OrderId = tuple[Op, int, int]  # operation, term, index
 
 
 @dataclass(frozen=True, order=True)

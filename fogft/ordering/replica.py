@@ -162,7 +162,7 @@ class OrderedReplica(Generic[T]):
     def _claim(self, epoch: int, robot: str, to: T) -> list[Effect[T]]:
         if not self.serving:
             return [Refuse(to, NOT_READY)]
-        if not self._may_obey(robot):
+        if self.robot not in ("", robot):
             return [Refuse(to, orders.held(self.robot))]
         if epoch < self.promised:
             return [Refuse(to, orders.fenced(self.promised))]
@@ -174,9 +174,6 @@ class OrderedReplica(Generic[T]):
         self._claims.append(to)
         return [*out, *self._go_on()]
 
-    def _may_obey(self, robot: str) -> bool:
-        return self.robot in ("", robot)
-
     def _join(self, payload: bytes, to: T) -> list[Effect[T]]:
         if not self.joined:
             at, goal = orders.decode_join(payload)
@@ -186,19 +183,19 @@ class OrderedReplica(Generic[T]):
             if at.epoch != self.promised:
                 self._forget_answers()
                 self.position = Position(self.promised, at.index)
-        return [Reply(to, self._joined())]
+        return [self._has_joined(to)]
 
     def _is_behind(self, index: int) -> bool:
         """Whether the state after this number is one that has been left behind."""
         return self.joined and index < self._expected
 
-    def _joined(self) -> bytes:
-        """Return what a join or a restore is answered with."""
-        return orders.encode_index(self._expected)
+    def _has_joined(self, to: T) -> Reply[T]:
+        """Return the answer to a join or a restore."""
+        return Reply(to, orders.encode_index(self._expected))
 
     def _take_restore(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
         if self._is_behind(index):  # a copy, or not needed
-            return [Reply(to, self._joined())]
+            return [self._has_joined(to)]
         goal, state = orders.decode_snapshot(payload)
         out: list[Effect[T]] = self._give_up(NOT_JOINED) if self.joined else []
         self.joined = False
@@ -251,7 +248,7 @@ class OrderedReplica(Generic[T]):
             index, payload, to = self._restore
             self._restore = None
             if self._is_behind(index):
-                out.append(Reply(to, self._joined()))
+                out.append(self._has_joined(to))
             else:
                 # It may have joined by another restore since; what it was sent then is not for
                 # the state that comes now.
@@ -267,21 +264,13 @@ class OrderedReplica(Generic[T]):
         while self._queue and self._work is None:
             index, queued = self._queue.popitem(last=False)
             self._queued_bytes -= len(queued.payload)
-            out += self._start(index, queued.payload, queued.waiting)
+            out.append(self._begin(Op.APPLY, index, queued.waiting, queued.payload))
         return out
-
-    def _start(self, index: int, payload: bytes, waiting: list[T]) -> list[Effect[T]]:
-        """Begin to apply a number."""
-        return [self._begin(Op.APPLY, index, waiting, payload)]
 
     def _tell(self) -> list[Effect[T]]:
         claims, self._claims = self._claims, []
-        promise = self._promise()
+        promise = orders.encode_promise(Promise(self.position, self.sound))
         return [Reply(to, promise) for to in claims]
-
-    def _promise(self) -> bytes:
-        """Return what a claim is answered with."""
-        return orders.encode_promise(Promise(self.position, self.sound))
 
     def _begin(self, op: Op, index: int, waiting: list[T], payload: bytes = b"") -> Begin:
         self._serial += 1
@@ -301,40 +290,32 @@ class OrderedReplica(Generic[T]):
         out: list[Effect[T]]
         if work.op is Op.APPLY:
             self.applied += 1
-            out = self._has_applied(Position(work.epoch, work.index), answer, work.waiting)
+            self.position = Position(work.epoch, work.index)
+            self._keep(work.index, answer)
+            out = [
+                Refuse(to, MALFORMED) if answer is None else Reply(to, answer)
+                for to in work.waiting
+            ]
         elif work.op is Op.SNAPSHOT:
             out = [
                 Refuse(to, NOT_READY)
                 if answer is None
-                else Reply(to, orders.encode_snapshot(work.index, self._snapshot_of(answer)))
+                else Reply(to, orders.encode_snapshot(work.index, answer))
                 for to in work.waiting
             ]
         else:
             out = self._restored(work, answer is not None)
         return [*out, *self._go_on()]
 
-    def _has_applied(self, at: Position, answer: bytes | None, waiting: list[T]) -> list[Effect[T]]:
-        self.position = at
-        self._keep(at.index, answer)
-        return [Refuse(to, MALFORMED) if answer is None else Reply(to, answer) for to in waiting]
-
-    def _snapshot_of(self, state: bytes) -> bytes:
-        """Return a snapshot's bytes, given the service's own."""
-        return state
-
-    def _took_state(self, ok: bool) -> None:
-        """A restore has ended; one that failed has left nobody knows what."""
-
     def _restored(self, work: _Work[T], ok: bool) -> list[Effect[T]]:
-        self._took_state(ok)
-        if not ok:
+        if not ok:  # nobody knows what it has left
             return [Refuse(to, NOT_JOINED) for to in work.waiting]
         self.sound = True
         self.position = Position(work.epoch, work.index)
         if work.epoch != self.promised:  # fenced meanwhile
             return [Refuse(to, orders.fenced(self.promised)) for to in work.waiting]
         self.joined = True
-        return [Reply(to, self._joined()) for to in work.waiting]
+        return [self._has_joined(to) for to in work.waiting]
 
     def _keep(self, index: int, answer: bytes | None) -> None:
         _, _, kept, kept_bytes = self._limits

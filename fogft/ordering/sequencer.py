@@ -1,4 +1,4 @@
-"""A term of the one robot that orders a stateful service: the first answer counts. Pure.
+"""One term of a stateful service's order: the first answer counts. Pure.
 
 It begins from the state of one replica, never from one before the mark, and one replica is
 enough. When most of the replicas that stay run another version, that takes over at one point of

@@ -4,9 +4,9 @@ A term claims the replicas, begins from the state of one of them, and from then 
 requests to its log. The owner sends what `take` returns, and reports each order's end, once, by
 `replied`, `refused` or `declined`.
 
-Owns: how far each replica obeys. Not here: what each is to be sent (`catching_up`); from what a
-term may begin and when an answer counts: `sequencer` says it for one robot, `shared_sequencer`
-for several. Protocol and its argument: docs/design/state.md.
+Owns: how far each replica obeys. Not here: what each is to be sent (`catching_up`), from what a
+term may begin and when an answer counts (`sequencer`).
+Protocol and its argument: docs/design/state.md.
 """
 
 from __future__ import annotations
@@ -63,15 +63,6 @@ class OrderedTerm(CatchingUp):
     @abstractmethod
     def _recall(self, replica: int, before: int) -> None:
         """Ask a replica that has joined for answers that never came."""
-
-    def _read_promise(self, replica: int, payload: bytes) -> Promise:
-        """Read what a claim was answered with. Raises OrderError."""
-        return orders.decode_promise(payload)
-
-    def _read_joined(self, replica: int, payload: bytes) -> tuple[int, int]:
-        """Return which number a replica expects, and which it has applied. Raises OrderError."""
-        expected = orders.decode_index(payload)
-        return expected, expected - 1
 
     # -- what the owner asks --------------------------------------------------------------
 
@@ -171,9 +162,9 @@ class OrderedTerm(CatchingUp):
                 self._asked_for_checkpoint = None
             self._take_checkpoint(*orders.decode_snapshot(payload))
         elif peer is not None and op is Op.CLAIM:
-            self._promised(replica, peer, self._read_promise(replica, payload))
+            self._promised(replica, peer, orders.decode_promise(payload))
         elif peer is not None and op in (Op.JOIN, Op.RESTORE):
-            self._has_joined(replica, peer, *self._read_joined(replica, payload))
+            self._has_joined(replica, peer, orders.decode_index(payload))
         return False
 
     def _promised(self, replica: int, peer: Peer, promise: Promise) -> None:
@@ -191,7 +182,7 @@ class OrderedTerm(CatchingUp):
         else:
             self._lead(replica, peer)
 
-    def _has_joined(self, replica: int, peer: Peer, expected: int, applied: int) -> None:
+    def _has_joined(self, replica: int, peer: Peer, expected: int) -> None:
         log = self.log
         if peer.phase is not Phase.ASKED or log is None:
             return
@@ -203,7 +194,7 @@ class OrderedTerm(CatchingUp):
         peer.wait_s = RETRY_FIRST_S / 2
         peer.rewind = None
         peer.next = expected
-        peer.acked = applied
+        peer.acked = expected - 1
         # Applied there, and the answer never came: it is kept, and is asked for again.
         self._recall(replica, expected)
         self._feed(replica, peer)

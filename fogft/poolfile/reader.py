@@ -14,7 +14,6 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import PurePath
 
-from fogft.core.spec_shared import fewest_replicas, with_founders
 from fogft.model.middleware import Speaks
 from fogft.model.names import POOL_NAME_PATTERN
 from fogft.model.spec import MAX_REPLICAS, HealthSpec, PoolSpec, ServiceSpec
@@ -129,7 +128,6 @@ def pool_spec(
     sections = ours.sections("services", "") if services else ()
     for section, service in zip(sections, services, strict=True):
         _check_quorum(section, service, spec)
-    spec = with_founders(spec, sections)
     for section, service in zip(sections, services, strict=True):
         passes_through = spec.rmw.robot is Speaks.ZENOH and not service.needs_type
         if check_types is not None and not passes_through:
@@ -174,7 +172,8 @@ def _judge_topics(ours: Section, check_types: TypeCheck | None) -> None:
 
 def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> None:
     """Refuse a quorum that can never be reached, or at some time of the week cannot."""
-    fewest = fewest_replicas(spec)
+    windows = spec.schedule.windows if spec.schedule else ()
+    fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas is not None)])
     carry = max(fewest, service.replicas)
     if service.quorum > carry:
         where = " in a window of `schedule`" if fewest < spec.replicas else ""

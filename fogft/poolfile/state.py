@@ -7,7 +7,7 @@ Not here: the types themselves (`fogft.ros.state_bytes`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from fogft.model import ros_names
@@ -16,9 +16,14 @@ from fogft.poolfile.tree import Section, shown
 SNAPSHOT_TYPE = "nav_msgs/srv/GetMap"
 RESTORE_TYPE = "nav_msgs/srv/SetMap"
 FIELD = "map.data"
-STATE_KEYS = ("snapshot", "restore", "shared")
+STATE_KEYS = ("snapshot", "restore")
 STATE_SERVICE_KEYS = ("name", "type", "field")
 _HINT = "write `state: {snapshot: /svc/get_state, restore: /svc/set_state}`"
+_SHARED = "is no key any more: a service with `state` is for one robot"
+_SHARED_HINT = (
+    "for several robots remove `state` and let the service keep its state in a replicated store, "
+    "such as etcd; docs/state.md shows how"
+)
 
 
 @dataclass(frozen=True)
@@ -37,25 +42,14 @@ class StateService:
 
 @dataclass(frozen=True)
 class StateSpec:
-    """How a service's state is taken and given.
-
-    Attributes:
-        shared: Whether several robots may use it: a majority of the replicas then counts.
-        founders: How many replicas a shared service needs to begin; 0 where it is not shared.
-    """
+    """How a service's state is taken and given."""
 
     snapshot: StateService
     restore: StateService
-    shared: bool = field(default=False, repr=False)
-    founders: int = field(default=0, repr=False, compare=False)
-
-    def __str__(self) -> str:
-        return f"{self!r}, shared" if self.shared else repr(self)
 
     def to_plain(self) -> dict[str, Any]:
         """Return it as a configuration file has it."""
-        ends = {"snapshot": vars(self.snapshot).copy(), "restore": vars(self.restore).copy()}
-        return {**ends, "shared": self.founders} if self.shared else dict(ends)
+        return {"snapshot": vars(self.snapshot).copy(), "restore": vars(self.restore).copy()}
 
 
 def from_plain(raw: Mapping[str, Any] | None) -> StateSpec | None:
@@ -71,8 +65,7 @@ def from_plain(raw: Mapping[str, Any] | None) -> StateSpec | None:
         StateService(*(str(raw[end][k]) for k in STATE_SERVICE_KEYS))
         for end in ("snapshot", "restore")
     )
-    founders = int(raw.get("shared", 0))
-    return StateSpec(snapshot, restore, founders > 0, founders)
+    return StateSpec(snapshot, restore)
 
 
 def read_state(service: Section) -> StateSpec | None:
@@ -84,12 +77,13 @@ def read_state(service: Section) -> StateSpec | None:
     if "state" not in service.children:
         return None
     state = service.section("state", _HINT)
+    if "shared" in state.children:
+        raise state.error("shared", _SHARED, _SHARED_HINT, at_key=True)
     state.only(STATE_KEYS)
     for key in ("snapshot", "restore"):
         if key not in state.children:
             raise state.error(key, "is missing", _HINT)
-    ends = (_end(state, "snapshot", SNAPSHOT_TYPE), _end(state, "restore", RESTORE_TYPE))
-    return StateSpec(*ends, shared=state.flag("shared", False))
+    return StateSpec(_end(state, "snapshot", SNAPSHOT_TYPE), _end(state, "restore", RESTORE_TYPE))
 
 
 def _end(state: Section, key: str, default_type: str) -> StateService:

@@ -222,21 +222,6 @@ def test_a_changed_file_is_told_in_words(home, file, looks, capsys):
     ]
 
 
-@pytest.mark.parametrize("was_ready", [True, False])
-def test_a_shared_service_is_not_updated_while_it_runs(home, file, looks, capsys, was_ready):
-    """No sequencer takes in replicas of another version: an update would never be ready."""
-    state = "state: {snapshot: /get, restore: /set, shared: true}"
-    shared = POOL.replace("srv/GetPlan}", f"srv/GetPlan, {state}}}")
-    paths = lay_down(home)
-    paths.spec.write_text(shared)
-    if was_ready:
-        paths.good_spec.write_text(shared)
-    file.write_text(shared.replace("run: ", "run: nice "))
-    looks(updated(file))
-    assert main.run(["up", str(file)]) == int(was_ready)
-    assert ("`/plan` is shared by robots" in capsys.readouterr().err) == was_ready
-
-
 def updated(file: Path, state: str = "", fault: str = "", **others: object) -> PoolStatus:
     """Return a status of a pool whose manager has seen a file, and what became of it."""
     update = UpdateStatus(state, 1, 2, fault) if state else None

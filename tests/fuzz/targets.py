@@ -15,7 +15,6 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from fogft.core import shared_book, shared_orders
 from fogft.errors import CredentialError, StateError
 from fogft.link import batch_frames, compression, frame, probe_frames
 from fogft.link.frame import FrameError, Greeting
@@ -156,15 +155,6 @@ def _order(data: bytes) -> None:
         orders.decode_promise,
         orders.decode_index,
         orders.decode_snapshot,
-        shared_orders.decode_entry,
-        shared_orders.decode_vote,
-        shared_orders.decode_standing,
-        shared_orders.decode_handed,
-        shared_orders.decode_joined,
-        shared_orders.decode_applied,
-        shared_orders.decode_listen,
-        shared_orders.decode_answer,
-        shared_book.decode,
     ):
         with contextlib.suppress(orders.OrderError):
             read(data)

@@ -1,6 +1,6 @@
 """What the worlds of ordered services have in common: replicas with a service under each, letters
 that are lost, repeated and reordered, and what callers asked. Each step does one thing, chosen by
-whoever drives the world. Not here: who orders (`ordering_world`, `shared_world`).
+whoever drives the world. Not here: who orders (`ordering_world`).
 """
 
 from __future__ import annotations

@@ -53,27 +53,6 @@ def test_both_proxies_read_what_is_written(state):
     assert service_form.from_plain(for_replica).state == service.state
 
 
-SHARED = SHORT.replace("}", ", shared: true}")
-
-
-def test_a_shared_service_needs_every_replica_of_the_pool_to_begin():
-    """Both proxies read it, and replicas that run go on when only their number changes."""
-    five = parse(SHARED, "  replicas: 5\n")
-    (service,) = five.services
-    assert service.state.shared
-    assert service.state.founders == 5
-    read = service_form.from_plain(service_form.to_plain(service))
-    assert (read.state.shared, read.state.founders) == (True, 5)
-    three = parse(SHARED, "  replicas: 3\n")
-    assert three.replica_hash == five.replica_hash != parse(SHORT).replica_hash
-
-
-@pytest.mark.parametrize("more", ["", "  replicas: 1\n"])
-def test_a_shared_service_with_too_few_replicas_is_refused(more):
-    with pytest.raises(SpecError, match=r"p.yaml:8: .*shared.*: needs 3 replicas or more"):
-        parse(SHARED, more)
-
-
 def test_running_replicas_are_replaced_when_a_service_becomes_stateful():
     plain = pool_file.parse(FILE, file="p.yaml")
     assert plain.replica_hash != parse(SHORT).replica_hash != parse(LONG).replica_hash
@@ -86,6 +65,7 @@ def test_running_replicas_are_replaced_when_a_service_becomes_stateful():
         ("{snapshot: /a}", "state.restore", "is missing", "set_state"),
         ("{snapshot: /a, restor: /b}", "state.restor", "unknown key", "restore"),
         ("{snapshot: /a b, restore: /b}", "state.snapshot", "is not a service name", "/svc"),
+        ("{snapshot: /a, restore: /b, shared: true}", "state.shared", "one robot", "docs/state.md"),
         ("{snapshot: 3, restore: /b}", "state.snapshot", "must be text", "quotes"),
         ("{snapshot: {name: /a, type: x/srv/A}, restore: /b}", "field", "is missing", "type"),
         ("{snapshot: {name: /a, field: x}, restore: /b}", "type", "is missing", "type"),

@@ -27,17 +27,16 @@ NODE = ROOT / "tests/proxy/nodes/stateful_node.py"
 _END = "type: nav_msgs/srv/{}Map, field: map.data"
 
 
-def _stateful(name: str, type_name: str, more: str = "") -> str:
+def _stateful(name: str, type_name: str) -> str:
     ends = ", ".join(
         f"{end}: {{name: {name}/{verb}_state, {_END.format(verb.title())}}}"
         for end, verb in (("snapshot", "get"), ("restore", "set"))
     )
-    return f"{{name: {name}, type: {type_name}, timeout_s: {TIMEOUT_S}, state: {{{ends}{more}}}}}"
+    return f"{{name: {name}, type: {type_name}, timeout_s: {TIMEOUT_S}, state: {{{ends}}}}}"
 
 
 TYPES = {"/count": "std_srvs/srv/SetBool", "/store": "nav_msgs/srv/LoadMap"}
 SERVICES = f"[{', '.join(_stateful(*entry) for entry in TYPES.items())}]"
-SHARED = f"[{', '.join(_stateful(*entry, ', shared: 3') for entry in TYPES.items())}]"
 
 
 class Client:
@@ -306,49 +305,3 @@ def test_another_robot_is_refused_and_told_so(parts, clients):
     before = client.answered
     wait_for(lambda: client.answered > before + 5, "the first robot to go on")
     assert linearizable(client.history, counter, 0)
-
-
-@pytest.fixture
-def shared_parts(tmp_path: Path, ros_domains: Callable[[], int]) -> Iterator[Parts]:
-    made = Parts(tmp_path, ros_domains, services=SHARED, node=NODE)
-    yield made
-    made.close()
-
-
-def sequencer_of(robot: Robot) -> str:
-    """Return which robot orders the counter, as one of them reports it."""
-    order = robot.report().get("services", {}).get("/count", {}).get("order", {})
-    return str(order.get("sequencer", ""))
-
-
-def test_robots_share_a_service_and_one_goes_on_when_the_sequencer_is_killed(shared_parts, clients):
-    """No answer is lost or doubled on the other robot, and all replicas end in one state."""
-    source = random.Random(2)
-    replicas = [shared_parts.replica(slot) for slot in range(3)]
-    robots = {name: shared_parts.robot(name, *replicas) for name in ("one", "two")}
-    asking = {
-        name: clients(robot, "/count", lambda: (("add", 1), ("get", 0))[source.random() < 0.3])
-        for name, robot in robots.items()
-    }
-
-    def answered_more(*names: str, count: int = 15) -> None:
-        before = {name: asking[name].answered for name in names}
-        wait_for(lambda: all(asking[n].answered >= b + count for n, b in before.items()), "answers")
-
-    answered_more("one", "two")
-
-    def agreed() -> str:
-        named = {sequencer_of(robot) for robot in robots.values()}
-        return named.pop() if len(named) == 1 else ""
-
-    first = wait_for(agreed, "both to name one sequencer")
-    (other,) = robots.keys() - {first}
-    asking[first].patience_s = GIVE_UP_KILLED_S  # a proxy that was killed answers nothing
-    robots[first].kill()
-    answered_more(other)
-    wait_for(lambda: sequencer_of(robots[other]) == other, "the other to sequence")
-    for client in asking.values():
-        client.stop()
-    assert all(call.answered for call in asking[other].history)
-    assert linearizable([c for client in asking.values() for c in client.history], counter, 0)
-    wait_for(lambda: len({state_of(r) for r in replicas}) == 1, "equal states")

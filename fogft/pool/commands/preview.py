@@ -120,8 +120,7 @@ def order(
         far: Says how far the regions of offers are: ``cloud/region`` -> seconds.
 
     Raises:
-        SpecError: The cloud can never meet the file's resources, or it would replace replicas
-            of a pool whose robots share a service.
+        SpecError: The cloud can never meet the file's resources.
         CloudError: A new pool, and none of the clouds that it names can be used.
     """
     before, rolled_back = _before(store, source)
@@ -144,8 +143,6 @@ def order(
     observed = Observed(now, (), None, sold, rtt_s=far(spec, sold))
     planned = plan("0" * 16, spec, Intent(), observed, History())
     replaces = before is not None and not rolled_back and replaces_replicas(before, spec)
-    if replaces and store.good() is not None:
-        _check_shared(before, spec, file)
     usd_per_hour = sum(launch.offer.usd_per_hour for launch in planned.launches)
     cheapest = min((offer.usd_per_hour for offer in sold), default=0.0)
     preview = Preview(
@@ -163,18 +160,6 @@ def order(
         accounts=accounts,
     )
     return Order(preview, source, file)
-
-
-def _check_shared(before: PoolSpec | None, after: PoolSpec, file: Path) -> None:
-    """Refuse an update that would never be ready: its replicas are taken in by no sequencer."""
-    for service in (*(before.services if before else ()), *after.services):
-        if service.state is not None and service.state.shared:
-            raise SpecError(
-                f"{file}: services: `{service.name}` is shared by robots, and cannot be updated "
-                "while it runs: what replicas run has changed",
-                "`fogft down`, then `fogft up`: its state begins anew; or change nothing "
-                "that replicas run",
-            )
 
 
 def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:

@@ -1,8 +1,8 @@
 """What a pool remembers on disk, as the manager and the commands read and write it.
 
 Owns: identity, spec, intent and membership: their files.
-Not here: what to remember (`fogft.core`), what happened (`history_file`) and how a file is replaced
-(`fogft.disk`).
+Not here: what to remember (`fogft.planning`), what happened (`history_file`) and how a file is
+replaced (`fogft.disk`).
 """
 
 from __future__ import annotations

@@ -11,13 +11,11 @@ Not here: decisions (`fogft.ordering.replica`), what the bytes of a state servic
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fogft.core.shared_replica import SharedReplica
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming, Refusal
 from fogft.ordering import orders
@@ -67,7 +65,6 @@ class OrderedResponder:
         name: The service's name.
         state: How its state travels.
         clock: Monotonic seconds.
-        shared: Whether several robots may order it.
     """
 
     def __init__(
@@ -75,17 +72,12 @@ class OrderedResponder:
         name: str,
         state: StateBytes,
         clock: Callable[[], float] = time.monotonic,
-        *,
-        shared: bool = False,
     ) -> None:
         self._name = name
         self._state = state
         self._clock = clock
         self._lock = threading.Lock()
-        # Another process is another member: it knows nothing of what this one promised.
-        self._machine: OrderedReplica[Incoming] = (
-            SharedReplica(secrets.randbits(64)) if shared else OrderedReplica()
-        )
+        self._machine: OrderedReplica[Incoming] = OrderedReplica()
         self._clients: Clients | None = None
         self._begun: Begin | None = None
         self._begun_at = 0.0

@@ -95,9 +95,7 @@ class ServerProxy:
         for service in services:
             if service.state is not None and make_state is not None:
                 state = make_state(service.state)
-                self._ordered[service.name] = OrderedResponder(
-                    service.name, state, clock, shared=service.state.shared
-                )
+                self._ordered[service.name] = OrderedResponder(service.name, state, clock)
         self._draining = False
         self._at_risk = False
         self.responder = Responder(

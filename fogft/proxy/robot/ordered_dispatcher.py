@@ -28,9 +28,7 @@ from fogft.ordering.orders import Op, OrderError, OrderId
 from fogft.ordering.peer import Order
 from fogft.proxy.order_mark import MarkFile
 from fogft.proxy.robot.dispatcher import key_of
-from fogft.proxy.robot.own_order import OwnOrder
-from fogft.proxy.robot.service_order import Numbered, ServiceOrder
-from fogft.proxy.shared_order import SharedOrder
+from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.hedging import NEVER
 
 log = logging.getLogger(__name__)
@@ -61,7 +59,6 @@ class OrderedDispatcher:
         spec: The service and its policy.
         respond: Sends a response to the caller of a handle. Any thread.
         mark: What survives this process.
-        robot: This robot's name: others are told who orders a service that they share.
         empty_response: The serialised default response, for ``on_timeout: empty``.
         wake: Has `tick` called soon. Any thread.
         clock: Monotonic seconds.
@@ -76,7 +73,6 @@ class OrderedDispatcher:
         respond: Callable[[Any, bytes], None],
         mark: MarkFile,
         *,
-        robot: str = "",
         empty_response: bytes | None = None,
         wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
@@ -99,11 +95,7 @@ class OrderedDispatcher:
         self._early_bytes = 0
         self._outcomes = Outcomes()
         self._trouble = self._told = ""
-        shared = spec.state is not None and spec.state.shared
-        founders = spec.state.founders if spec.state is not None else 0
-        self._order: ServiceOrder = (
-            SharedOrder(spec.name, robot, mark, founders) if shared else OwnOrder(spec.name, mark)
-        )
+        self._order = ServiceOrder(spec.name, mark)
 
     # -- requests -------------------------------------------------------------------------
 
@@ -139,7 +131,7 @@ class OrderedDispatcher:
 
     def _number(self, caller: _Caller) -> bool:
         """Give a request its number, if a replica can take it now. Under the lock."""
-        number = self._order.submit(caller.payload, self._clock())
+        number = self._order.submit(caller.payload)
         if number is None:
             return False
         caller.payload = b""
@@ -175,44 +167,37 @@ class OrderedDispatcher:
             return
         with self._lock:
             now = self._clock()
-            numbered = self._take_end(link, id, answer, now)
-            if numbered is None:
+            if answer.payload is not None and not self._order.is_current(id):
                 return
-            callers = self._callers(numbered)
-            for caller, payload in callers:
+            payload = self._take_end(link, id, answer, now)
+            caller = None if payload is None else self._numbered.pop(id[2], None)
+            if caller is not None and payload is not None:
                 self._outcomes.won(link.peer.id, now - caller.arrived, len(payload))
             due = self._order.due
-        for caller, payload in callers:
+        if caller is not None and payload is not None:
             self._return(caller.handle, payload)
-        if not callers and id[0] is Op.APPLY and answer.payload is not None:
+        elif id[0] is Op.APPLY and answer.payload is not None:
             self._outcomes.late()
         if due:
             self._wake()
 
-    def _take_end(
-        self, link: Link, id: OrderId, answer: Answer, now: float
-    ) -> Sequence[Numbered] | None:
-        """Pass the end of an order on; return what is answered by it. Under the lock."""
+    def _take_end(self, link: Link, id: OrderId, answer: Answer, now: float) -> bytes | None:
+        """Pass the end of an order on; return the answer to its number if it is. Under the lock."""
         replica, applies = key_of(link), id[0] in _COPIES
         refusal = answer.refusal
         if answer.payload is not None:
             try:
-                numbered = self._order.replied(replica, id, answer.payload, now)
+                answers = self._order.replied(replica, id, answer.payload)
             except OrderError as error:
                 log.warning("order_unreadable service=%s reason=%r", self.spec.name, error)
                 refusal = Refusal.MALFORMED
             else:
-                if applies and numbered is not None:
+                if applies:
                     self._outcomes.served(link.peer.id)
-                return numbered
+                return answer.payload if answers else None
         self._outcomes.refusal(refusal.split(":")[0], link.peer.id if applies else None)
         self._order.refused(replica, id, refusal, now)
-        return ()
-
-    def _callers(self, numbered: Sequence[Numbered]) -> list[tuple[_Caller, bytes]]:
-        """Take out who waits for these answers. Under the lock."""
-        found = [(self._numbered.pop(number, None), answer) for number, answer in numbered]
-        return [(caller, answer) for caller, answer in found if caller is not None]
+        return None
 
     def late(self, link: Link, request: bytes) -> None:
         """Nothing is ever forgotten here, so no answer comes too late for its link."""
@@ -236,7 +221,6 @@ class OrderedDispatcher:
         """Follow another policy from now on; requests under way keep their deadlines."""
         with self._lock:
             self.spec = spec
-            self._order.adopt(spec.state)
 
     def route(
         self,
@@ -257,9 +241,7 @@ class OrderedDispatcher:
                 key: (versions or {}).get(link.peer.id, "") for key, link in self._links.items()
             }
             going = [key for key, link in self._links.items() if link.peer.id in leaving]
-            self._order.reach(
-                self._links, self._clock(), known, going, max(len(versions or {}), len(self._links))
-            )
+            self._order.reach(self._links, self._clock(), known, going)
         self._send()
 
     def tick(self) -> float:
@@ -270,17 +252,12 @@ class OrderedDispatcher:
         """
         now = self._clock()
         with self._lock:
-            answers = self._callers(self._order.tick(now))
-            for _, payload in answers:
-                self._outcomes.count["answered"] += 1
-                self._outcomes.count["response_bytes"] += len(payload)
+            self._order.tick(now)
             expired = self._expired(now)
             while self._early and self._number(self._early[0]):
                 self._early_bytes -= self._early.popleft().size
             self._look_for_trouble()
         self._send()
-        for caller, payload in answers:
-            self._return(caller.handle, payload)
         for caller in expired:
             self._time_out(caller)
         return NEVER

@@ -117,7 +117,6 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
         make_dispatcher,
         marks=config.status.with_suffix(".marks"),
         pool_uid=config.pool_uid,
-        robot=config.robot,
         actions=Actions(),
         speaks=config.rmw,
     )
@@ -188,7 +187,6 @@ def make_dispatcher(
     marks: Path,
     pool_uid: str,
     actions: Actions,
-    robot: str = "",
     speaks: Speaks = Speaks.RCLPY,
 ) -> Dispatcher | OrderedDispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
@@ -200,7 +198,6 @@ def make_dispatcher(
         marks: Folder of the stateful services' marks.
         pool_uid: Whose marks they are.
         actions: Makes those of actions.
-        robot: This robot's name.
         speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
 
     Raises:
@@ -217,7 +214,7 @@ def make_dispatcher(
         mark = MarkFile(
             marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}", pool_uid
         )
-        return OrderedDispatcher(spec, respond, mark, robot=robot, empty_response=empty, wake=wake)
+        return OrderedDispatcher(spec, respond, mark, empty_response=empty, wake=wake)
     if spec.quorum > 1:
         return VotingDispatcher(
             spec,

@@ -5,7 +5,7 @@ connection when it is lost or when probes go unanswered: never because a service
 `offer` only puts the attempt into the connection's queue.
 
 Owns: the state of a link. Not here: sessions (`zenoh_connection`), attempts (`attempts`), what a
-replica's silence means for the pool (`fogft.core`).
+replica's silence means for the pool (`fogft.planning`).
 """
 
 from __future__ import annotations
