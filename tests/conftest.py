@@ -15,7 +15,8 @@ import pytest
 
 from tests import own_process
 from tests.dealing import dealt
-from tests.link.namespaces import Namespaces, why_not
+from tests.link.namespaces import Namespaces
+from tests.needs import must_run, need, not_run
 from tests.rmw_zenoh.rmw_router import Router, running
 
 # No test asserts wall-clock time; Hypothesis would, by default.
@@ -69,6 +70,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         items[:] = dealt(items, limit_s, computes, workers)
 
 
+def pytest_configure() -> None:
+    """Refuse a misspelt `FOGFT_MUST_RUN` before anything runs."""
+    must_run()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave a test out, before its fixtures are made, where something that it needs is missing."""
+    for marker in item.iter_markers("needs"):
+        need(*marker.args, whole_file=False)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Close with what was not run, and why."""
+    for line in not_run(terminalreporter.stats.get("skipped", [])):
+        terminalreporter.write_line(line, yellow=True)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """Run a test that is marked so in a process of its own."""
@@ -116,10 +135,8 @@ def rmw_router() -> Iterator[Router]:
 
 @pytest.fixture
 def net() -> Iterator[Namespaces]:
-    """Network namespaces of the test's own; without root it is skipped."""
-    reason = why_not()
-    if reason:
-        pytest.skip(reason)
+    """Network namespaces of the test's own."""
+    need("namespaces", whole_file=False)
     made = Namespaces()
     try:
         yield made

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from datetime import datetime, timedelta, timezone
@@ -20,6 +19,7 @@ from fogft.doctor import checks, finding, leftovers, machine, pools, ros
 from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
+from tests.needs import needs
 
 UID = "0123456789abcdef"
 
@@ -103,7 +103,7 @@ def test_a_clock_from_before_the_installation_is_wrong(tmp_path):
     assert the_only(machine.clock(situation(tmp_path))).verdict is Verdict.OK
 
 
-@pytest.mark.skipif(os.getuid() == 0, reason="root may write anywhere")
+@needs("not-root")
 def test_a_state_folder_that_cannot_be_written_is_found(tmp_path):
     tmp_path.chmod(0o500)
     assert the_only(machine.state_folder(situation(tmp_path / "x"))).verdict is Verdict.FAIL

@@ -8,6 +8,7 @@ import pytest
 
 from fogft.cli import main
 from fogft.cli.simulate import duration, percent
+from tests.needs import needs
 
 POOL = """\
 name: planner
@@ -78,15 +79,16 @@ def test_markets_like_the_traces_are_made_up(file, traces, capsys):
     assert model["mttr_s"] == 900
 
 
+@needs("matplotlib")
 @pytest.mark.parametrize(("name", "magic"), [("a.png", b"\x89PNG"), ("a.svg", b"<?xml")])
 def test_a_plot_is_drawn(file, tmp_path, name, magic):
-    pytest.importorskip("matplotlib")
     assert main.run(["simulate", str(file), *SHORT, "--plot", str(tmp_path / name)]) == 0
     drawn = (tmp_path / name).read_bytes()
     assert drawn.startswith(magic)
     assert len(drawn) > 5_000
 
 
+@needs("matplotlib")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -99,7 +101,6 @@ def test_a_plot_is_drawn(file, tmp_path, name, magic):
     ],
 )
 def test_what_cannot_be_is_told_before_anything_runs(file, capsys, arguments, message):
-    pytest.importorskip("matplotlib")
     assert main.run(["simulate", str(file), *arguments]) == 1
     assert message in capsys.readouterr().err
 

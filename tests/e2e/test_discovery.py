@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
@@ -14,6 +13,7 @@ from collections.abc import Iterable
 import pytest
 
 from tests.e2e.pool import NODES, Pool
+from tests.needs import needs
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
 
@@ -91,10 +91,7 @@ def test_wait_for_service_is_true_only_while_a_replica_can_answer(pool: Pool):
     assert robot(pool, "/plan", "nav_msgs/srv/GetPlan", 60)["answer"]
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("ros2service") is None,
-    reason="ros2service is not installed here (PyPI has none)",
-)
+@needs("ros2service")
 def test_ros2_service_list_type_and_call_go_through_the_proxy(pool: Pool):
     """With the real `ros2` command."""
     pool.file.write_text(

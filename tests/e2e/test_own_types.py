@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -14,14 +13,11 @@ import pytest
 from fogft import template_files
 from fogft.pool.commands import init
 from tests.e2e.pool import Pool
+from tests.needs import needs
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
 
-NEEDED = ("gcc", "g++", "cmake", "ninja", "colcon")
 PATH = f"{Path(sys.prefix, 'bin')}:{os.environ.get('PATH', '')}"
-MISSING = [name for name in NEEDED if shutil.which(name, path=PATH) is None]
-if importlib.util.find_spec("rosidl_generator_py") is None:
-    MISSING.append("rosidl_default_generators")
 
 
 def build(folder: Path, environ: dict[str, str]) -> None:
@@ -51,7 +47,7 @@ def other_definition(folder: Path, into: Path) -> Path:
     return into
 
 
-@pytest.mark.skipif(bool(MISSING), reason=f"not installed here: {', '.join(MISSING)}")
+@needs("build")
 def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
     workspace = tmp_path / "workspace"
     init.copy_example("words", workspace)
@@ -82,7 +78,7 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
     pool.environ = bare
 
 
-@pytest.mark.skipif(bool(MISSING), reason=f"not installed here: {', '.join(MISSING)}")
+@needs("build")
 def test_what_was_built_elsewhere_is_not_trusted(pool: Pool, tmp_path: Path):
     """A workspace that travels with its `install` folder is built anew where it arrives."""
     fake = tmp_path / "bin"

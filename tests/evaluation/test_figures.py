@@ -18,8 +18,9 @@ from tests.evaluation import (
     uplink,
 )
 from tests.evaluation.samples import Store
+from tests.needs import need
 
-pytest.importorskip("matplotlib", reason="plots need matplotlib: scripts/setup plot")
+need("matplotlib")
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from tests.evaluation import (
 from tests.evaluation.comparing import CONDITIONS
 from tests.evaluation.samples import Samples, Store
 from tests.evaluation.statistics import mean, p50
+from tests.needs import needs
 
 RESULTS = ROOT / "docs" / "results"
 
@@ -81,9 +82,9 @@ class TestFindings:
         assert len(found) == 6
         assert all(each.why for each in found)
 
+    @needs("matplotlib")
     def test_the_pictures_hold_the_samples_and_nothing_else(self):
         samples = made_up(detection.EXPERIMENT, FAULTED)
-        pytest.importorskip("matplotlib", reason="plots need matplotlib: scripts/setup plot")
         figure = detection.EXPERIMENT.figures(samples)["latency"]
         healthy, faulted = figure.axes[2], figure.axes[5]
         drawn = {line.get_label(): line for axis in (healthy, faulted) for line in axis.lines}
@@ -217,12 +218,12 @@ class TestStory:
         row = story.story.row(55)
         assert (row["passed"], row["passed_failed"]) == (5, 1)
 
+    @needs("matplotlib")
     def test_the_timeline_draws_every_request(self):
         rows = [
             {"at_s": float(i), "latency_s": 0.01 + i / 1000, "phase": "ABCDE"[i // 4], "winner": w}
             for i, w in enumerate([0, 1] * 10)
         ]
-        pytest.importorskip("matplotlib", reason="plots need matplotlib: scripts/setup plot")
         figure = picking_figures.timeline(rows, picking.PHASES)
         points = {}
         for line in figure.axes[0].lines:

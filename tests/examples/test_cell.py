@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes.util
-import importlib.util
-
 import numpy as np
 import pytest
 
 from tests.examples.loading import modules
+from tests.needs import need, needs
 
 # Looked for, not imported: MuJoCo chooses how to draw when it is imported, by what `cell` says.
-for module in ("mujoco", "PIL"):
-    if importlib.util.find_spec(module) is None:
-        pytest.skip(f"no {module}: pip install 'fogft[vision]'", allow_module_level=True)
+need("mujoco", "pillow")
 with modules("pick", "cell", "tag") as found:
     cells, tag = found
 
@@ -56,12 +52,9 @@ def test_camera_and_world_are_inverse():
     assert cell.in_world(seen) == pytest.approx(cell.box_at)
 
 
-@pytest.mark.skipif(
-    not ctypes.util.find_library("EGL"), reason="no EGL: apt install libegl1 libgl1-mesa-dri"
-)
+@needs("egl", "apriltags")
 def test_the_camera_sees_the_tag_where_it_is():
     """Rendered by MuJoCo, found by the locator, within 2 mm."""
-    pytest.importorskip("pupil_apriltags", reason="not installed: pip install 'fogft[demo]'")
     cell = cells.Cell()
     list(cell.scan(1))
     image = cell.look()

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from fogft import template_files
 from tests.examples.loading import modules
+from tests.needs import need, needs
 
-pytest.importorskip("PIL", reason="not installed: pip install 'fogft[vision]'")
+need("pillow")
 with modules("detect", "ssd", "pictures", "fetch_weights") as found:
     ssd, pictures, fetch_weights = found
 
@@ -95,11 +96,8 @@ def test_other_weights_are_not_taken_for_the_right_ones(tmp_path):
     assert not fetch_weights.present(tmp_path)
 
 
-@pytest.mark.skipif(
-    not fetch_weights.present(WEIGHTS), reason="no weights: run templates/detect/fetch_weights.py"
-)
+@needs("weights", "litert")
 def test_what_was_drawn_is_found_where_it_was_drawn():
-    pytest.importorskip("ai_edge_litert", reason="not installed: pip install 'fogft[vision]'")
     detector, chance = ssd.Detector(WEIGHTS), random.Random(2)
     for _ in range(20):
         drawn = pictures.picture(chance)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.examples.loading import modules
+from tests.needs import need
 
-pytest.importorskip("torch", reason="not installed: pip install 'fogft[vision]'")
-pytest.importorskip("transformers", reason="not installed: pip install 'fogft[vision]'")
+need("torch")
 with modules("segment", "sam") as found:
     (sam,) = found
 

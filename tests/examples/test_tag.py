@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.examples.loading import modules
+from tests.needs import need
 
-pytest.importorskip("pupil_apriltags", reason="not installed: pip install 'fogft[demo]'")
+need("apriltags")
 with modules("pick", "locator", "rotation", "tag") as found:
     locator, rotation, tag = found
 

@@ -11,12 +11,11 @@ import pytest
 import yaml
 
 from fogft.errors import FogftError
+from tests.needs import need
 
-launch = pytest.importorskip(
-    "launch", reason="ROS 2'S launch IS NOT INSTALLED: launch files are not tried"
-)
-pytest.importorskip("launch_ros", reason="launch_ros IS NOT INSTALLED: launch files are not tried")
+need("launch")
 
+import launch  # noqa: E402
 from launch.launch_description_sources import (  # noqa: E402
     get_launch_description_from_any_launch_file,
 )

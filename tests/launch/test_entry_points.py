@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.needs import need, needs
+
 ROOT = Path(__file__).parents[2]
 AMENT = ROOT / "fogft" / "launch" / "ament"
 GROUPS = ("ros2cli.command", "fogft.ros2_verb", "ros2cli.extension_point",
@@ -17,7 +19,9 @@ GROUPS = ("ros2cli.command", "fogft.ros2_verb", "ros2cli.extension_point",
 
 
 def project() -> dict:
-    tomllib = pytest.importorskip("tomllib", reason="needs Python 3.11 to read pyproject.toml")
+    need("tomllib", whole_file=False)
+    import tomllib
+
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -56,9 +60,9 @@ def test_loading_fogft_launch_needs_no_ros() -> None:
     assert shown.stdout == "False False\n"
 
 
+@needs("colcon")
 def test_colcon_builds_what_pip_installs(tmp_path: Path) -> None:
     """The workspace's package has the entry points, the templates and every module."""
-    pytest.importorskip("colcon_core", reason="COLCON IS NOT INSTALLED: the build is not tried")
     wanted = project()
     source = tmp_path / "src" / "fogft"
     source.mkdir(parents=True)

@@ -21,17 +21,15 @@ def _run(*words: str) -> None:
 
 
 @functools.cache
-def why_not() -> str:
-    """Return why no namespace can be made here; empty where one can."""
-    if os.geteuid() != 0:
-        return "needs root: network namespaces"
+def can_make_namespaces() -> bool:
+    """Try whether a network namespace can be made here: that takes root and `ip`."""
     name = f"fogft-try-{os.getpid()}"
     try:
         _run("ip", "netns", "add", name)
         _run("ip", "netns", "del", name)
-    except (OSError, subprocess.CalledProcessError) as error:
-        return f"no network namespace can be made: {error}"
-    return ""
+    except (OSError, subprocess.CalledProcessError):
+        return False
+    return True
 
 
 class Namespaces:

@@ -25,11 +25,6 @@ _PACKET_BYTES = 65535
 _QUEUE_LIMIT = 2000  # packets on their way in one direction; what comes beyond is lost
 
 
-def why_not_rough() -> str:
-    """Return why there can be no such cable here; empty where there can."""
-    return "" if os.path.exists("/dev/net/tun") else "needs /dev/net/tun"
-
-
 def _tun(where: str, name: str, address: str, far_address: str) -> int:
     with inside(where):
         device = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)

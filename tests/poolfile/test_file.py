@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import os
 import re
 import textwrap
 from dataclasses import replace
@@ -18,6 +17,7 @@ from fogft.model.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
 from fogft.poolfile import file, yaml_tree
 from fogft.poolfile.keys import FOGFT_KEYS, LATER_KEYS
 from fogft.poolfile.tree import plain
+from tests.needs import needs
 
 GOOD = """\
 name: perception
@@ -619,7 +619,7 @@ class TestReading:
             f"name the file in it, such as `{tmp_path}/pool.yaml`",
         )
 
-    @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+    @needs("not-root")
     def test_no_permission(self, tmp_path):
         path = tmp_path / "a.yaml"
         path.touch(0)

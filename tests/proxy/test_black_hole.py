@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from tests.link.namespaces import why_not
+from tests.needs import needs
 from tests.proxy import black_hole
 
 pytestmark = pytest.mark.timeout(240)
-ROUTER = pytest.param(
-    "router", marks=pytest.mark.skipif(bool(why_not()), reason=why_not() or "root")
-)
+ROUTER = pytest.param("router", marks=needs("namespaces"))
 
 
 @pytest.mark.parametrize("way", ["relay", ROUTER])

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.needs import need
 from tests.proxy.by_hand import LIMIT_S, Parts, Replica, Robot, wait_for
 from tests.rmw_zenoh.rmw_router import Router
 
 pytestmark = pytest.mark.timeout(180)
-if importlib.util.find_spec("pyzeros") is None:
-    pytest.skip("pyzeros is not installed (Python 3.11 and `fogft[ros-test]`)",
-                allow_module_level=True)  # fmt: skip
+need("pyzeros")
 
 NODE = Path(__file__).parent / "nodes" / "echo_over_zenoh.py"
 SERVICES = "[{name: /words/echo, type: fogft_words/srv/Echo, timeout_s: 60.0, concurrency: 200}]"

@@ -10,16 +10,16 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.link.rough_cable import RoughCable, why_not_rough
+from tests.link.rough_cable import RoughCable
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import SERVICE, wait_for
+from tests.needs import needs
 from tests.proxy.gateway_pool import GatewayPool, Robot, ran
 
 ROBOT, CLOUD = "10.85.1.1", "10.85.1.2"
 LIMIT_S = 110.0
 SIZES = (8, 1000, 20_000, 60_000)
 pytestmark = pytest.mark.timeout(240)
-needs_tun = pytest.mark.skipif(bool(why_not_rough()), reason=why_not_rough() or "there is a TUN")
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def ask(pool: GatewayPool, robot: Robot) -> None:
         assert set(numbers.values()) <= {1}
 
 
-@needs_tun
+@needs("namespaces", "tun")
 def test_packets_that_are_late_out_of_order_and_lost_cost_no_request(pool, net):
     """40 to 80 ms each way, and three packets in a hundred lost."""
     robot_at, cloud = net.add("r"), net.add("c")

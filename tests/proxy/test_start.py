@@ -8,15 +8,15 @@ import os
 import subprocess
 import sys
 
-import pytest
-
 from fogft.proxy import start
+from tests.needs import needs
 
 _LOADED = """
 import json, os, sys
 from fogft.proxy import start
 start.load_numpy()
 import numpy
+
 threads = len(os.listdir("/proc/self/task"))
 print(json.dumps({"threads": threads, "said": os.environ.get("OPENBLAS_NUM_THREADS")}))
 """
@@ -28,14 +28,13 @@ def loaded(**environ: str) -> dict:
     return json.loads(ended.stdout)
 
 
+@needs("numpy")
 def test_numpy_starts_no_thread_and_others_may_have_theirs():
-    pytest.importorskip("numpy")
     assert loaded() == {"threads": 1, "said": None}
 
 
-@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="BLAS has one core here")
+@needs("numpy", "cores")
 def test_what_the_user_says_stays():
-    pytest.importorskip("numpy")
     assert loaded(OPENBLAS_NUM_THREADS="2") == {"threads": 2, "said": "2"}
 
 

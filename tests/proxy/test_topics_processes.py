@@ -15,10 +15,11 @@ from fogft.model.topic import Origin, TopicSpec
 from fogft.poolfile import service_form
 from fogft.poolfile.topics import action_services, action_topics
 from fogft.ros import environment
+from tests.needs import needs
 from tests.proxy.by_hand import Parts, Replica, Robot
 from tests.ros.person import Person
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(240), needs("test_msgs")]
 environment.prepare(os.environ)
 FIBONACCI = "test_msgs/action/Fibonacci"
 STRING = "std_msgs/msg/String"
@@ -35,7 +36,6 @@ NODE = Path(__file__).parent / "nodes" / "acting_node.py"
 
 @pytest.fixture
 def parts(tmp_path: Path, ros_domains: Callable[[], int]) -> Iterator[Parts]:
-    pytest.importorskip("test_msgs.action", reason="test_msgs is not installed (extra ros-test)")
     services = json.dumps([service_form.to_plain(service) for service in SERVICES])
     made = Parts(tmp_path, ros_domains, services=services, node=NODE)
     yield made

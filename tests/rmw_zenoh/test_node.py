@@ -5,7 +5,6 @@ What it promises as a node of ROS is tested with the others' (`tests/contract/te
 
 from __future__ import annotations
 
-import importlib.util
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from fogft.errors import RosError
 from fogft.rmw_zenoh import session as rmw_session
 from fogft.rmw_zenoh.naming import CLIENT, NO_HASH, SERVER, Token, request_attachment
 from fogft.rmw_zenoh.node import RmwZenohNode
+from tests.needs import needs
 from tests.rmw_zenoh.rmw_router import Router
 
 TYPE = "my_msgs/srv/Grasp"
@@ -218,7 +218,7 @@ def test_the_environment_s_mistakes_are_said(tmp_path: Path) -> None:
             RmwZenohNode("fogft_p", environ={name: value})
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pyzeros") is None, reason="pyzeros is not installed")
+@needs("pyzeros")
 def test_names_are_those_of_another_implementation(peer: zenoh.Session) -> None:
     """`pyzeros` and we write the same keys and tokens."""
     from pyzeros.pub import publisher_keyexpr

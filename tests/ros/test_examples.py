@@ -12,9 +12,9 @@ from contextlib import contextmanager
 import pytest
 
 from fogft import template_files
+from tests.needs import needs
 
-pytestmark = pytest.mark.ros
-pytest.importorskip("rclpy")
+pytestmark = [pytest.mark.ros, needs("rclpy")]
 LIMIT_S = 60
 
 
@@ -63,9 +63,9 @@ def test_echo_without_a_service(ros_domain):
     assert (done.returncode, done.stdout, done.stderr) == (1, "", "no service /echo\n")
 
 
+@needs("ompl")
 def test_planner(ros_domain):
     """Every plan is right, the score adds up, and OMPL keeps quiet to the end."""
-    pytest.importorskip("ompl")
     folder = template_files.folder() / "planner"
     with service(folder, ros_domain, "planner_service.py") as (environment, process):
         done = call(folder, environment, "planner_client.py", "--count", "8", "--period-s", "0.05")
@@ -80,9 +80,9 @@ def test_planner(ros_domain):
     assert process.returncode == 0
 
 
+@needs("ompl")
 def test_the_planners_client_finds_wrong_answers(ros_domain):
     """A service that plans in another scene is caught: the check can fail."""
-    pytest.importorskip("ompl")
     folder = template_files.folder() / "planner"
     arguments = ("planner_service.py", "--scene", "8", "--limit-s", "0.2")
     with service(folder, ros_domain, *arguments) as (environment, _):
@@ -94,10 +94,10 @@ def test_the_planners_client_finds_wrong_answers(ros_domain):
     assert summary["faults"]
 
 
+@needs("ompl")
 def test_the_planners_client_counts_what_is_never_answered(ros_domain):
     """A frozen service fails every request, and the client still ends."""
     folder = template_files.folder() / "planner"
-    pytest.importorskip("ompl")
     with service(folder, ros_domain, "planner_service.py") as (environment, process):
         process.stderr.readline()  # "ready to plan"
         ready = call(folder, environment, "planner_client.py", "--count", "1")

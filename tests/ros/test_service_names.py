@@ -10,10 +10,13 @@ from fogft.errors import SpecError
 from fogft.model import ros_names
 from fogft.poolfile import file
 from fogft.ros import types
+from tests.needs import need
 
 pytestmark = pytest.mark.ros
-validation = pytest.importorskip("rclpy.validate_full_topic_name")
-exceptions = pytest.importorskip("rclpy.exceptions")
+need("rclpy")
+
+from rclpy import exceptions  # noqa: E402
+from rclpy import validate_full_topic_name as validation  # noqa: E402
 
 nearly_names = st.from_regex(r"/?[a-zA-Z0-9_/-]{0,12}", fullmatch=True)
 

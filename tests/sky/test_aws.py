@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,12 +12,9 @@ from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.provider import NotAllowedError
 from fogft.errors import CloudUnreachable
 from fogft.model.replica import ReplicaId
+from tests.needs import needs
 from tests.sky.scripted_sky import replica
 
-needs_moto = pytest.mark.skipif(
-    importlib.util.find_spec("moto") is None or importlib.util.find_spec("boto3") is None,
-    reason="MOTO IS NOT INSTALLED: AWS's interface is not tried (`pip install 'moto[ec2]' boto3`)",
-)
 IMAGE = "ami-1e749f67"
 OTHER = replica(uid="00000000000000bb")
 
@@ -50,7 +46,7 @@ def account(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-@needs_moto
+@needs("moto")
 def test_machines_of_ours_are_found_in_every_region_and_nothing_else_is(account: None):
     spot = {"InstanceMarketOptions": {"MarketType": "spot"}}
     mine = launch("us-east-1", labels(replica(0)), **spot)
@@ -69,7 +65,7 @@ def test_machines_of_ours_are_found_in_every_region_and_nothing_else_is(account:
     assert not aws.instances([])
 
 
-@needs_moto
+@needs("moto")
 def test_a_machine_that_shut_itself_down_is_found_as_long_as_its_disk_costs(account: None):
     """One on demand is stopped by that, and not ended."""
     import boto3
@@ -83,7 +79,7 @@ def test_a_machine_that_shut_itself_down_is_found_as_long_as_its_disk_costs(acco
     assert not aws.instances(None, replica().pool_uid)
 
 
-@needs_moto
+@needs("moto")
 def test_terminate_ends_these_and_is_repeatable(account: None):
     launch("us-east-1", labels(replica(0)))
     launch("us-east-1", labels(replica(1)))
@@ -94,7 +90,7 @@ def test_terminate_ends_these_and_is_repeatable(account: None):
     assert [i.key for i in aws.instances(["us-east-1"])] == [second.key]
 
 
-@needs_moto
+@needs("moto")
 def test_live_prices_are_of_each_zone(account: None):
     prices = Aws().spot_prices("us-east-1", ["m5.large"])
     assert prices
@@ -143,7 +139,7 @@ def test_not_allowed_is_not_the_same_as_cannot_tell(code: str, expected: type, h
         assert not aws._clients, "renewed credentials are read from the disk again"
 
 
-@needs_moto
+@needs("moto")
 def test_a_region_that_may_not_be_asked_hides_no_other(account: None):
     """An organisation keeps its accounts out of most regions."""
     aws = Aws()

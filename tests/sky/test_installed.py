@@ -6,7 +6,6 @@ the calls behind it and every name that is matched by text are held to the real 
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import os
 import subprocess
@@ -24,14 +23,11 @@ from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
 from fogft.errors import CloudUnreachable
 from fogft.model.replica import Placement
+from tests.needs import needs
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, ScriptedSky
 
 SURFACE = [name for name in vars(Sky) if not name.startswith("_")]
-needs_skypilot = pytest.mark.skipif(
-    importlib.util.find_spec("sky") is None,
-    reason="SKYPILOT IS NOT INSTALLED: nothing here is held to it (`pip install '.[cloud]'`)",
-)
 
 
 @pytest.mark.parametrize("name", SURFACE)
@@ -127,7 +123,7 @@ def payload(**changes: Any) -> Any:
     return RequestPayload(**{**fields, **changes})
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any, Any]):
     """`create_autospec` refuses an argument that the real function does not take."""
     installed, sdk, _ = real
@@ -161,7 +157,7 @@ def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any,
     }
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_every_launch_asks_for_the_guard_once_after_the_users_own_commands(
     real: tuple[InstalledSky, Any, Any], monkeypatch: pytest.MonkeyPatch
 ):
@@ -185,7 +181,7 @@ def test_every_launch_asks_for_the_guard_once_after_the_users_own_commands(
         skypilot_config._set_loaded_config(before)
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_the_guard_is_what_cloud_init_reads(home: Path):
     """SkyPilot writes commands into its text for AWS as they are."""
     import jinja2
@@ -199,7 +195,7 @@ def test_the_guard_is_what_cloud_init_reads(home: Path):
     assert yaml.safe_load(written) == {"runcmd": ["echo mine", guard.command()]}
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_records_read_what_skypilot_says(home: Path):
     record = answers.cluster_of(status_record())
     assert (record.state, record.labels, record.launched_at) == (ClusterState.UP, {"a": "b"}, 5.0)
@@ -207,7 +203,7 @@ def test_records_read_what_skypilot_says(home: Path):
     assert (early.placement, early.head_ip, early.progress) == (None, "", "boots")
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_the_names_that_are_matched_by_text_exist(home: Path):
     """A SkyPilot that renames one of them must not turn "nobody knows" into "no"."""
     import requests
@@ -224,7 +220,7 @@ def test_the_names_that_are_matched_by_text_exist(home: Path):
         assert hasattr(exceptions, name)
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_what_skypilot_raises_becomes_ours(real: tuple[InstalledSky, Any, Any]):
     from sky import exceptions
 
@@ -258,7 +254,7 @@ def test_what_skypilot_raises_becomes_ours(real: tuple[InstalledSky, Any, Any]):
         installed.down("c")
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: Path):
     """The template and the merge, judged by SkyPilot's own schema and its catalogue."""
     import sky
@@ -291,7 +287,7 @@ def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: P
     assert made.envs["A"] == "b"
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_an_image_of_the_users_own_is_one_that_skypilot_takes(home: Path, tmp_path: Path):
     """A container's image, and an image of the cloud."""
     import sky
@@ -309,7 +305,7 @@ def test_an_image_of_the_users_own_is_one_that_skypilot_takes(home: Path, tmp_pa
         assert resources.ports == ["7447"], "SkyPilot's containers share the machine's network"
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: Path):
     """That of a replica that dials out."""
     import sky
@@ -322,7 +318,7 @@ def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: P
     assert resources.ports is None
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, Any, Any]):
     """With no network the catalogue's zones have ids, not names: then the region is the offer."""
     installed, _, _ = real
@@ -339,7 +335,7 @@ def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, An
         installed.offers({"infra": "aws", "cpus": "two"})
 
 
-@needs_skypilot
+@needs("skypilot")
 def test_the_clouds_that_a_pool_file_can_name_are_skypilots():
     import sky
 

@@ -7,7 +7,6 @@ moto; all on loopback.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import os
 import shutil
@@ -23,20 +22,11 @@ from typing import Any
 
 import pytest
 
+from tests.needs import needs
+
 HERE = Path(__file__).parent
 WITHIN_S = 300.0  # a busy machine takes minutes to start an API server
-QUEUE_PORT = 50011  # of every API server
-missing = [
-    name for name in ("sky", "moto", "boto3", "flask") if importlib.util.find_spec(name) is None
-]
-pytestmark = [
-    pytest.mark.skipif(
-        bool(missing),
-        reason="SKYPILOT OR MOTO IS NOT INSTALLED: a remote API server is not tried "
-        "(`pip install '.[cloud]' 'moto[ec2,server]'`)",
-    ),
-    pytest.mark.timeout(900),
-]
+pytestmark = [needs("skypilot", "moto", "skypilot-port"), pytest.mark.timeout(900)]
 
 
 def free_port() -> int:
@@ -160,16 +150,8 @@ class World:
         return found
 
 
-def is_taken(port: int) -> bool:
-    """Whether somebody listens on a port of this machine."""
-    with socket.socket() as one:
-        return one.connect_ex(("127.0.0.1", port)) == 0
-
-
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
-    if is_taken(QUEUE_PORT):
-        pytest.skip("ANOTHER SKYPILOT API SERVER RUNS HERE: it holds a port that cannot be chosen")
     made = World.__new__(World)
     made.started = []
     try:

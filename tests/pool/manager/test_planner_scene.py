@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft import template_files
+from tests.needs import needs
 
 
 def load(name):
@@ -110,11 +111,10 @@ class TestFault:
         assert world.fault([(math.nan, 1.0)], (1.0, 1.0), (1.0, 1.0)) != ""
 
 
+@needs("ompl", "rclpy")
 @pytest.mark.parametrize("seed", range(4))
 def test_the_planner_finds_right_ways(seed, monkeypatch):
     """The service's planner passes the client's check, in scenes of any seed."""
-    pytest.importorskip("ompl")
-    pytest.importorskip("rclpy")
     monkeypatch.setitem(sys.modules, "scene", scene)
     service = load("planner_service")
     world = scene.Scene(seed)
@@ -125,10 +125,9 @@ def test_the_planner_finds_right_ways(seed, monkeypatch):
         assert world.fault(planner.plan(start, goal), start, goal) == ""
 
 
+@needs("ompl", "rclpy")
 def test_a_start_inside_a_wall_has_no_way(monkeypatch):
     """The answer is an empty path, not an exception and not a way through the wall."""
-    pytest.importorskip("ompl")
-    pytest.importorskip("rclpy")
     monkeypatch.setitem(sys.modules, "scene", scene)
     service = load("planner_service")
     world = scene.Scene(1)
@@ -137,9 +136,9 @@ def test_a_start_inside_a_wall_has_no_way(monkeypatch):
     assert service.Planner(world, limit_s=0.2).plan(inside, (1.0, 1.0)) == []
 
 
+@needs("rclpy")
 def test_percentiles_are_values_that_occurred(monkeypatch):
     """The client's percentiles need no interpolation: each is a latency that was seen."""
-    pytest.importorskip("rclpy")
     monkeypatch.setitem(sys.modules, "scene", scene)
     client = load("planner_client")
     hundred = [float(n) for n in range(1, 101)]

@@ -1,0 +1,134 @@
+"""What some tests need that not every machine has.
+
+`@needs("moto")` marks a test; `need("launch")` stands at the top of a file that cannot be
+imported without. Where the thing is missing, the test is not run and the closing summary says
+so; where `FOGFT_MUST_RUN` names it (names joined by commas), the test fails instead.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.util
+import os
+import shutil
+import socket
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.link.namespaces import can_make_namespaces
+
+WEIGHTS = Path(__file__).parents[1] / "templates" / "detect" / "weights"
+SKYPILOT_QUEUE_PORT = 50011  # of every API server: it cannot be chosen
+
+
+class Need(NamedTuple):
+    """Whether a thing is here, and how to get it."""
+
+    is_here: Callable[[], bool]
+    hint: str
+
+
+def _installed(*modules: str) -> Callable[[], bool]:
+    """Look without importing: some of these are slow to import, or look at the environment."""
+    return lambda: all(map(importlib.util.find_spec, modules))
+
+
+def _can_build() -> bool:
+    path = f"{Path(sys.prefix, 'bin')}:{os.environ.get('PATH', '')}"
+    programs = ("gcc", "g++", "cmake", "ninja", "colcon")
+    return all(shutil.which(name, path=path) for name in programs) and bool(
+        importlib.util.find_spec("rosidl_generator_py")
+    )
+
+
+def _queue_port_is_free() -> bool:
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", SKYPILOT_QUEUE_PORT)) != 0
+
+
+NEEDS = {
+    "apriltags": Need(_installed("pupil_apriltags"), "scripts/setup demo"),
+    "build": Need(_can_build, "scripts/setup ros-test, apt install g++ cmake ninja-build"),
+    "colcon": Need(_installed("colcon_core"), "scripts/setup ros-test"),
+    "cores": Need(lambda: len(os.sched_getaffinity(0)) > 1, "a second processor"),
+    "egl": Need(
+        lambda: bool(ctypes.util.find_library("EGL")), "apt install libegl1 libgl1-mesa-dri"
+    ),
+    "launch": Need(_installed("launch", "launch_ros"), "a ROS 2 installation with launch_ros"),
+    "litert": Need(_installed("ai_edge_litert"), "scripts/setup vision"),
+    "matplotlib": Need(_installed("matplotlib"), "scripts/setup plot"),
+    "moto": Need(_installed("moto", "boto3", "flask"), "scripts/test-sky --quick"),
+    "mujoco": Need(_installed("mujoco"), "scripts/setup vision"),
+    "namespaces": Need(can_make_namespaces, "root and `ip`, for network namespaces"),
+    "not-root": Need(lambda: os.geteuid() != 0, "a user whom file permissions bind"),
+    "numpy": Need(_installed("numpy"), "scripts/setup demo"),
+    "ompl": Need(_installed("ompl"), "scripts/setup demo"),
+    "pillow": Need(_installed("PIL"), "scripts/setup demo"),
+    "pyzeros": Need(_installed("pyzeros"), "Python 3.11 and scripts/setup ros-test"),
+    "rclpy": Need(_installed("rclpy"), "scripts/setup ros, or a sourced ROS 2 installation"),
+    "ros2service": Need(_installed("ros2service"), "a ROS 2 installation with ros2service"),
+    "skypilot": Need(_installed("sky"), "scripts/test-sky --quick"),
+    "skypilot-port": Need(_queue_port_is_free, "no other API server of SkyPilot's here"),
+    "test_msgs": Need(_installed("test_msgs"), "scripts/setup ros-test"),
+    "tomllib": Need(_installed("tomllib"), "Python 3.11"),
+    "torch": Need(_installed("torch", "transformers"), "scripts/setup vision"),
+    "tun": Need(lambda: os.path.exists("/dev/net/tun"), "/dev/net/tun"),
+    "weights": Need(
+        lambda: WEIGHTS.is_dir() and bool(list(WEIGHTS.glob("*.tflite"))),
+        "templates/detect/fetch_weights.py",
+    ),
+}
+
+
+def must_run() -> set[str]:
+    """Return what `FOGFT_MUST_RUN` names.
+
+    Raises:
+        UsageError: It names what no test can need.
+    """
+    named = set(filter(None, os.environ.get("FOGFT_MUST_RUN", "").split(",")))
+    if unknown := named - set(NEEDS):
+        raise pytest.UsageError(f"FOGFT_MUST_RUN: unknown: {', '.join(sorted(unknown))}")
+    return named
+
+
+def need(*names: str, whole_file: bool = True) -> None:
+    """Leave out this test file, or this test, where something that it needs is missing."""
+    for name in names:
+        if NEEDS[name].is_here():
+            continue
+        reason = f"needs {name}: {NEEDS[name].hint}"
+        if name in must_run():
+            pytest.fail(f"must run here (FOGFT_MUST_RUN), and {reason}", pytrace=False)
+        pytest.skip(reason, allow_module_level=whole_file)
+
+
+def not_run(reports: Sequence[pytest.TestReport | pytest.CollectReport]) -> list[str]:
+    """Return a line for each reason for which tests were skipped."""
+    tests: Counter[str] = Counter()
+    files: Counter[str] = Counter()
+    for report in reports:
+        assert isinstance(report.longrepr, tuple)
+        reason = report.longrepr[2].removeprefix("Skipped: ")
+        (tests if "::" in report.nodeid else files)[reason] += 1
+    return [
+        f"not run: {_counted(tests[reason], files[reason])}: {reason}"
+        for reason in sorted({*tests, *files})
+    ]
+
+
+def _counted(tests: int, files: int) -> str:
+    counts = ((tests, "test"), (files, "whole file"))
+    return " and ".join(f"{n} {what}{'s' * (n > 1)}" for n, what in counts if n)
+
+
+def needs(*names: str) -> pytest.MarkDecorator:
+    """Mark a test, or a parameter's value, with what it needs."""
+    unknown = set(names) - set(NEEDS)
+    assert not unknown, f"unknown needs: {unknown}"
+    return pytest.mark.needs(*names)
