@@ -35,17 +35,7 @@ def run(folder: Path, must_run: str) -> tuple[int, str]:
     """Run the tests above where `tun` is missing."""
     (folder / "hidden.py").write_text(HIDDEN)
     (folder / "test_tried.py").write_text(TESTS)
-    command = [
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "hidden",
-        "-p",
-        "tests.conftest",
-    ]
+    plugins = ("-p", "no:cacheprovider", "-p", "hidden", "-p", "tests.conftest")
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", *plugins, "-c", ROOT / "pyproject.toml", folder],
         cwd=folder,
