@@ -106,8 +106,8 @@ def judge_domain(environ: Mapping[str, str]) -> Iterator[Finding]:
 
 
 def profile(_: Situation) -> Iterator[Finding]:
-    """Fast DDS gets a profile with a shared-memory segment large enough for images."""
-    name = environment.PROFILE_VARIABLE
+    """Fast DDS maps a shared-memory segment large enough for images."""
+    name = environment.profile_variable()
     theirs = os.environ.get(name)
     if theirs:
         try:
@@ -118,18 +118,43 @@ def profile(_: Situation) -> Iterator[Finding]:
                 f"{name} is `{theirs}`, which cannot be read: {error}",
                 "correct the path or unset the variable: fogft then uses its own profile",
             )
-        else:
-            yield ok("Fast DDS profile", f"yours, {theirs}")
-        return
+            return
     prepared = dict(os.environ)
-    if environment.prepare(prepared):
+    is_ours = environment.prepare(prepared)
+    measured = _self_test("segment")
+    if "segment_bytes" not in measured:
         yield warn(
-            "Fast DDS profile",
-            "your nodes have none: messages over 0.5 MB take ten times as long",
-            f"export {name}={prepared[name]} where your nodes start, as fogft's processes do",
+            "Fast DDS profile", f"could not be tried: {measured['error']}", "see `rclpy` above"
         )
-    else:
-        yield ok("Fast DDS profile", "chosen by you")
+        return
+    yield judge_segment(measured["segment_bytes"], name, prepared[name] if is_ours else "")
+
+
+def judge_segment(segment_bytes: int, variable: str, ours: str) -> Finding:
+    """Judge the shared memory that a node maps in fogft's environment.
+
+    Args:
+        segment_bytes: Size of its largest segment; 0 where its middleware maps none.
+        variable: Where the Fast DDS that is loaded looks for its profile.
+        ours: The shipped profile, where fogft sets it for its own processes.
+    """
+    if environment.profile_in_force(segment_bytes):
+        if ours:
+            return warn(
+                "Fast DDS profile",
+                "your nodes have none: messages over 0.5 MB take ten times as long",
+                f"export {variable}={ours} where your nodes start, as fogft's processes do",
+            )
+        return ok("Fast DDS profile", f"yours: a segment of {segment_bytes / 1e6:.0f} MB is mapped")
+    if not segment_bytes:
+        return ok("Fast DDS profile", "not used: your nodes map no shared memory of Fast DDS")
+    return warn(
+        "Fast DDS profile",
+        f"a node maps only {segment_bytes / 1e6:.1f} MB of shared memory: messages over 0.5 MB "
+        "take ten times as long",
+        f"let {variable} name a profile with a larger segment, such as "
+        f"{environment.profile_path()}, and give /dev/shm at least 140 MB",
+    )
 
 
 def discovery(_: Situation) -> Iterator[Finding]:

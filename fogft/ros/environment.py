@@ -10,7 +10,9 @@ Not here: judging what is found (`fogft doctor`).
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import shutil
 import sys
 from collections.abc import Mapping, MutableMapping
@@ -19,12 +21,16 @@ from pathlib import Path
 
 from fogft.errors import RosError
 
-PROFILE_VARIABLE = "FASTDDS_DEFAULT_PROFILES_FILE"
-_CHOSEN_BY_USER = (
-    PROFILE_VARIABLE,
-    "FASTRTPS_DEFAULT_PROFILES_FILE",  # its name before Fast DDS 2.12
-    "FASTDDS_BUILTIN_TRANSPORTS",
-)
+# Fast DDS 3 (Kilted and later) reads the first, Fast DDS 2 (Jazzy, Humble) the second only. Setting
+# both makes newer rmw_fastrtps warn. Libraries are named like their variable.
+_PROFILE_VARIABLES = {
+    "libfastdds.so": "FASTDDS_DEFAULT_PROFILES_FILE",
+    "libfastrtps.so": "FASTRTPS_DEFAULT_PROFILES_FILE",
+}
+_CHOSEN_BY_USER = (*_PROFILE_VARIABLES.values(), "FASTDDS_BUILTIN_TRANSPORTS")
+# A segment as small as Fast DDS's own default means that no profile is in force.
+_SEGMENT_BYTES = 32_000_000
+_SEGMENT = re.compile(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]+\b")
 # Each participant takes 35 MB for its segment: room for the two ends of a call, twice.
 _ROOM_NEEDED_BYTES = 140_000_000
 # Fast DDS reads these from the working folder where no variable names a file.
@@ -51,6 +57,37 @@ def profile_path() -> Path:
     raise RosError("fogft's own `templates/fastdds_shm.xml` is missing", "install fogft again")
 
 
+def profile_variable(environ: Mapping[str, str] = os.environ) -> str:
+    """Return the variable from which the Fast DDS that will be loaded reads its profile.
+
+    Looks at which library lies in the ROS installation that is sourced, else beside this Python;
+    rclpy need not be imported. Where there is none, the variable of the newest Fast DDS.
+    """
+    prefixes = [p for p in environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    for prefix in (*prefixes, sys.prefix):
+        for library, variable in _PROFILE_VARIABLES.items():
+            folder = Path(prefix, "lib")
+            if (folder / library).exists() or any(folder.glob(f"*-linux-gnu/{library}")):
+                return variable
+    return "FASTDDS_DEFAULT_PROFILES_FILE"
+
+
+def largest_segment_bytes(process: str = "self") -> int:
+    """Return the size of the largest Fast DDS segment that a process maps; 0 for none."""
+    largest = 0
+    with contextlib.suppress(OSError):
+        for line in Path("/proc", process, "maps").read_text().splitlines():
+            if _SEGMENT.search(line):
+                first, _, last = line.split(" ", 1)[0].partition("-")
+                largest = max(largest, int(last, 16) - int(first, 16))
+    return largest
+
+
+def profile_in_force(segment_bytes: int) -> bool:
+    """Whether a mapped segment is as large as the shipped profile asks for."""
+    return segment_bytes >= _SEGMENT_BYTES
+
+
 def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
     """Choose the shared-memory profile where the user has chosen none. Returns whether it did.
 
@@ -66,7 +103,7 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
         return False
     if _shared_memory_free_bytes() < _ROOM_NEEDED_BYTES:
         return False
-    environ[PROFILE_VARIABLE] = str(profile_path())
+    environ[profile_variable(environ)] = str(profile_path())
     return True
 
 

@@ -2,8 +2,9 @@
 
 ``python -m fogft.ros.self_test describe`` prints what ROS 2 there is. ``answer NAME`` and
 ``ask NAME`` are the two ends of one service call between two processes, in the
-environment as it stands: what a pool's robot side does. The last two need nothing but
-rclpy: every node offers its parameters as services.
+environment as it stands: what a pool's robot side does. ``segment`` makes a node and prints how
+large a shared-memory segment it maps. They need nothing but rclpy: every node offers its parameters
+as services.
 
 Each prints one JSON object on stdout. Exit status 0 when it worked.
 """
@@ -73,6 +74,20 @@ def ask(name: str) -> int:
         rclpy.try_shutdown(context=context)
 
 
+def segment() -> dict[str, int]:
+    """Make a node; return the size of the shared memory that its middleware maps for it."""
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node(f"fogft_doctor_{os.getpid()}", context=context, enable_rosout=False)
+    try:
+        return {"segment_bytes": environment.largest_segment_bytes()}
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
 def _call(name: str, node: Any, executor: Any) -> dict[str, float]:
     """Find the service and call it once.
 
@@ -110,11 +125,13 @@ def _tell_error(error: Exception) -> int:
 
 
 def main(arguments: list[str]) -> int:
-    """Run one of the three; it prints its result."""
+    """Run one of the four; it prints its result."""
     environment.prepare(os.environ)
     try:
         if arguments[0] == "describe":
             return _tell(environment.describe)
+        if arguments[0] == "segment":
+            return _tell(segment)
         if arguments[0] == "ask":
             return ask(arguments[1])
         answer(arguments[1])

@@ -19,6 +19,7 @@ from fogft.doctor import checks, finding, leftovers, machine, pools, ros
 from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
+from fogft.ros import environment
 from tests.needs import needs
 
 UID = "0123456789abcdef"
@@ -143,8 +144,22 @@ def test_the_domain_and_the_range_are_judged(environ, domain, reach):
 def test_a_profile_that_is_no_xml_is_found(tmp_path, monkeypatch):
     broken = tmp_path / "profile.xml"
     broken.write_text("<dds>")
-    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", str(broken))
+    monkeypatch.setenv(environment.profile_variable(), str(broken))
     assert the_only(ros.profile(situation(tmp_path))).verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(
+    ("segment_bytes", "ours", "verdict"),
+    [
+        (35_131_392, "", Verdict.OK),
+        (35_131_392, "/fogft/profile.xml", Verdict.WARN),
+        (549_408, "", Verdict.WARN),
+        (549_408, "/fogft/profile.xml", Verdict.WARN),
+        (0, "", Verdict.OK),
+    ],
+)
+def test_the_profile_is_judged_by_the_segment_that_is_mapped(segment_bytes, ours, verdict):
+    assert ros.judge_segment(segment_bytes, "A_VARIABLE", ours).verdict is verdict
 
 
 @pytest.mark.ros

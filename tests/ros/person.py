@@ -36,12 +36,13 @@ class Person:
 
     def watch_log(self) -> None:
         from rcl_interfaces.msg import Log
-        from rclpy.qos import qos_profile_rosout_default
+        from rclpy.qos import DurabilityPolicy, QoSProfile
 
         def heard(message: Any) -> None:
             self.log.append((message.level, message.name, message.msg))
 
-        self.node.create_subscription(Log, "/rosout", heard, qos_profile_rosout_default)
+        kept = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(Log, "/rosout", heard, kept)
 
     def wait(self, condition: Callable[[], Any], what: str) -> Any:
         """Spin until a condition holds; return what it gave."""

@@ -61,7 +61,7 @@ def answered(start: Start, limit_s: float = 20, **options: str) -> int:
         {"ROS_LOCALHOST_ONLY": "1"},
         {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
         {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": "127.0.0.1"},
-        {environment.PROFILE_VARIABLE: "", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
+        {environment.profile_variable(): "", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
     ],
     ids=["a domain", "localhost only", "range", "static peers", "the user's transports"],
 )
@@ -89,7 +89,7 @@ def test_static_peers_are_found_where_there_is_no_multicast(net: Namespaces, sta
         words = ["ip", "-n", space, "link", "set", cable, "multicast", "off"]
         subprocess.run(words, check=True)
     # Shared memory would join two namespaces of one machine behind the network's back.
-    only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.PROFILE_VARIABLE: ""}
+    only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.profile_variable(): ""}
     alone = {**only_udp, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     serving(start, where=there, ROS_STATIC_PEERS="10.99.7.1", **alone)
     assert answered(start, where=here, ROS_STATIC_PEERS="10.99.7.2", **alone) == IN_FLIGHT
@@ -98,7 +98,7 @@ def test_static_peers_are_found_where_there_is_no_multicast(net: Namespaces, sta
 def test_without_named_peers_and_multicast_nothing_is_found(net: Namespaces, start: Start) -> None:
     here, there = net.add("ros-here"), net.add("ros-there")
     net.join(here, "10.99.8.1", there, "10.99.8.2")
-    only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.PROFILE_VARIABLE: ""}
+    only_udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", environment.profile_variable(): ""}
     alone = {**only_udp, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     serving(start, where=there, **alone)
     assert answered(start, limit_s=3, where=here, **alone) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -22,7 +23,7 @@ def test_the_profile_is_chosen_where_nothing_is_set() -> None:
     assert environment.prepare(environ)
     assert environ == {
         "PATH": "/bin",
-        environment.PROFILE_VARIABLE: str(environment.profile_path()),
+        environment.profile_variable(): str(environment.profile_path()),
     }
     assert not environment.prepare(environ)
 
@@ -40,6 +41,46 @@ def test_the_users_choice_stands(name: str) -> None:
     environ = {name: "theirs"}
     assert not environment.prepare(environ)
     assert environ == {name: "theirs"}
+
+
+@pytest.mark.parametrize(
+    ("libraries", "variable"),
+    [
+        (["libfastdds.so", "libfastcdr.so"], "FASTDDS_DEFAULT_PROFILES_FILE"),
+        (["libfastrtps.so", "libfastcdr.so"], "FASTRTPS_DEFAULT_PROFILES_FILE"),
+        (["x86_64-linux-gnu/libfastrtps.so"], "FASTRTPS_DEFAULT_PROFILES_FILE"),
+    ],
+)
+def test_the_profile_goes_to_the_variable_that_the_sourced_fast_dds_reads(
+    tmp_path: Path, libraries: list[str], variable: str
+) -> None:
+    """Fast DDS 2 (Jazzy) and 3 (Kilted) read different ones, and each ignores the other's."""
+    overlay, sourced = tmp_path / "overlay", tmp_path / "ros"
+    for library in libraries:
+        (sourced / "lib" / library).parent.mkdir(parents=True, exist_ok=True)
+        (sourced / "lib" / library).touch()
+    environ = {"AMENT_PREFIX_PATH": f"{overlay}:{sourced}"}
+    assert environment.prepare(environ)
+    assert environ[variable] == str(environment.profile_path())
+    assert len(environ) == 2
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("prepared", [True, False])
+def test_a_node_maps_a_segment_as_large_as_its_profile_says(prepared: bool) -> None:
+    """What is in force is seen in the memory of a process, whatever its variables say."""
+    program = (
+        "import json, os; from fogft.ros import environment, self_test\n"
+        f"{'environment.prepare(os.environ)' if prepared else ''}\n"
+        "print(json.dumps(self_test.segment()))\n"
+    )
+    clean = {k: v for k, v in os.environ.items() if not k.endswith("_DEFAULT_PROFILES_FILE")}
+    out = subprocess.run(
+        [sys.executable, "-c", program], env=clean, capture_output=True, check=True, timeout=60
+    )
+    mapped = json.loads(out.stdout.splitlines()[-1])["segment_bytes"]
+    assert mapped > 0
+    assert environment.profile_in_force(mapped) == prepared
 
 
 def test_a_profile_in_the_working_folder_stands(

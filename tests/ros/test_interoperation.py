@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fogft.ros.environment import PROFILE_VARIABLE, profile_path
+from fogft.ros.environment import profile_path, profile_variable
 
 from .conftest import LIMIT_S, wait_for
 
@@ -28,10 +28,10 @@ def ordinary(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     started: list[subprocess.Popen[str]] = []
 
     def start(*arguments: object, profile: bool) -> subprocess.Popen[str]:
-        environ = {**os.environ, PROFILE_VARIABLE: str(profile_path())}
+        environ = {**os.environ, profile_variable(): str(profile_path())}
         environ["ROS_LOG_DIR"] = str(tmp_path)
         if not profile:
-            del environ[PROFILE_VARIABLE]
+            del environ[profile_variable()]
         process = subprocess.Popen(
             [sys.executable, str(SCRIPT), *map(str, arguments)],
             env=environ,
