@@ -71,6 +71,10 @@ class QuotaExceeded(CloudError):
     """The account may not have more here. Waiting does not help."""
 
 
+class FrameError(ValueError):
+    """Bytes from a peer are not a frame of this version. Not for users: the peer is told."""
+
+
 def told(error: FogftError) -> str:
     """Return an error in one sentence, with what to do about it."""
     return f"{error.message}; {error.hint}" if error.hint else error.message

@@ -9,9 +9,14 @@ Not here: text (`fogft.cli`), decisions (`fogft.planning`), the parts themselves
 
 from fogft.app.chaos import chaos, machine_in
 from fogft.app.clouds import CLOUDS, cloud_of, costs_money, make_cloud, make_store, pool_name, pools
-from fogft.app.credentials import certificates, join, rotate_replicas, rotate_robot
-from fogft.app.credentials import issue as issue_credentials
-from fogft.app.credentials import revoke as revoke_credentials
+from fogft.app.credentials import (
+    certificates,
+    issue_credentials,
+    join,
+    revoke_credentials,
+    rotate_replicas,
+    rotate_robot,
+)
 from fogft.app.lifecycle import down, order, start
 from fogft.app.looking import (
     doctor,

@@ -20,9 +20,9 @@ CLOUDS = (LOCAL, SKY)
 
 def pools() -> list[str]:
     """Return the names of the pools on this machine, sorted."""
-    from fogft.pool.folder import known_pools as known
+    from fogft.pool.folder import known_pools
 
-    return known.names(home())
+    return known_pools.names(home())
 
 
 def pool_name(name: str | None = None) -> str:
@@ -31,9 +31,9 @@ def pool_name(name: str | None = None) -> str:
     Raises:
         PoolNotFound: There is no such pool, none, or more than one to choose from.
     """
-    from fogft.pool.folder import known_pools as known
+    from fogft.pool.folder import known_pools
 
-    return known.meant(home(), name)
+    return known_pools.meant(home(), name)
 
 
 def make_cloud(name: str, base: Path) -> Cloud:
@@ -82,11 +82,11 @@ def costs_money(pool: str) -> bool:
 def make_store(pool: str) -> PoolStore:
     """Return the store of a pool."""
     from fogft.pool.folder.store import PoolStore
-    from fogft.poolfile import file as pool_file
+    from fogft.poolfile.file import parse
 
     return PoolStore(
         PoolPaths.of(pool),
-        lambda text, file: pool_file.parse(text, file=file),
+        lambda text, file: parse(text, file=file),
         time.time,
     )
 

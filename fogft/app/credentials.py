@@ -32,7 +32,7 @@ def certificates(pool: str) -> Sequence[Entry]:
     return Ledger(paths.credentials).entries()
 
 
-def issue(
+def issue_credentials(
     pool: str, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
 ) -> tuple[Issued, Path]:
     """Write a join bundle for the next generation of a holder; return both.
@@ -67,7 +67,7 @@ def join(file: Path, passphrase: str) -> Joined:
     return joining.join(file, passphrase, home(), time.time())
 
 
-def revoke(pool: str, role: Role, name: str) -> tuple[list[Holder], bool]:
+def revoke_credentials(pool: str, role: Role, name: str) -> tuple[list[Holder], bool]:
     """Take certificates back; return them, and whether the pool has been told.
 
     A replica that is revoked is replaced, too.

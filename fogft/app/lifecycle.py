@@ -34,14 +34,14 @@ def order(
     """
     from fogft.cloud.port import Accounts
     from fogft.pool.commands import preview
-    from fogft.poolfile import file as pool_file
     from fogft.poolfile import named_clouds
+    from fogft.poolfile.file import parse, read_text
     from fogft.ros.comparison import check_tolerances
     from fogft.ros.state_bytes import check_state
     from fogft.ros.types import check_ok_field, check_type
 
-    source = pool_file.text(file)
-    spec = pool_file.parse(
+    source = read_text(file)
+    spec = parse(
         source,
         file=str(file),
         check_types=check_type,

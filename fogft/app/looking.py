@@ -30,9 +30,9 @@ def file_of(pool: str) -> str:
 
 def status(pool: str) -> Seen:
     """Return what the manager last saw of a pool, how old it is, and who looks now."""
-    from fogft.pool.commands import status as seen
+    from fogft.pool.commands import status
 
-    return seen.read(PoolPaths.of(pool), time.time())
+    return status.read(PoolPaths.of(pool), time.time())
 
 
 def refresh(pool: str, limit_s: float = 15.0) -> Seen:
@@ -41,12 +41,12 @@ def refresh(pool: str, limit_s: float = 15.0) -> Seen:
     Raises:
         StateError: The manager did not look again within `limit_s`.
     """
-    from fogft.pool.commands import status as seen
+    from fogft.pool.commands import status
 
     if manager_alive(pool):
-        return seen.renewed(PoolPaths.of(pool), limit_s)
+        return status.renewed(PoolPaths.of(pool), limit_s)
     store = make_store(pool)
-    return seen.ask(store, cloud_of(store.identity()), time.time())
+    return status.ask(store, cloud_of(store.identity()), time.time())
 
 
 def slots(pool: str) -> list[int]:
@@ -81,7 +81,7 @@ def tail(path: Path, lines: int = 8) -> str:
 def doctor(file: Path | None = None) -> Iterator[Finding]:
     """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come."""
     from fogft.doctor import checks, finding
-    from fogft.poolfile import file as pool_file
+    from fogft.poolfile.file import read
 
-    spec = None if file is None else pool_file.read(file)
+    spec = None if file is None else read(file)
     yield from finding.run(checks.ALL, finding.situation(home(), pools(), spec))

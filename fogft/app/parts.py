@@ -19,10 +19,10 @@ def init(example: str, into: Path | None, *, force: bool = False) -> list[Path]:
     Raises:
         FogftError: There is no such example, or a file is in the way.
     """
-    from fogft.pool.commands import init as examples_
+    from fogft.pool.commands.init import DEFAULT_EXAMPLE, copy_example
 
-    name = example or examples_.DEFAULT_EXAMPLE
-    return examples_.copy_example(name, into or Path(name), force=force)
+    name = example or DEFAULT_EXAMPLE
+    return copy_example(name, into or Path(name), force=force)
 
 
 def examples() -> Sequence[str]:
@@ -50,9 +50,9 @@ def run_server(
     metrics: str | None = None,
 ) -> None:
     """Run a server proxy until a signal ends it."""
-    from fogft.proxy.replica import process as server_process
+    from fogft.proxy.replica import process
 
-    server_process.run(
+    process.run(
         config,
         listen=listen,
         domain_id=domain_id,
@@ -79,6 +79,6 @@ def run_rendezvous(config: Path, *, listen: str | None = None, metrics: str | No
 
 def run_gateway(config: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
     """Run a gateway until a signal ends it."""
-    from fogft.proxy.gateway import process as gateway_process
+    from fogft.proxy.gateway import process
 
-    gateway_process.run(config, listen=listen, metrics=metrics)
+    process.run(config, listen=listen, metrics=metrics)

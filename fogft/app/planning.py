@@ -70,11 +70,11 @@ def plan(
     from fogft.planning.observed.history import History
     from fogft.pool.manager import offers
     from fogft.pool.manager.traffic import is_stated, measured, with_measured
-    from fogft.poolfile import file as pool_file
     from fogft.poolfile import named_clouds
+    from fogft.poolfile.file import parse, read_text
 
-    source = pool_file.text(file)
-    spec = pool_file.parse(source, file=str(file), folder=file.parent)
+    source = read_text(file)
+    spec = parse(source, file=str(file), folder=file.parent)
     seller: Seller
     if prices is not None:
         name, seller = str(prices), PriceTable(prices)

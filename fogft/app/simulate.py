@@ -43,20 +43,20 @@ def simulate(
         FogftError: The file, the traces or the numbers are wrong.
     """
     from fogft.errors import FogftError
-    from fogft.poolfile import file as pool_file
     from fogft.poolfile import named_clouds
+    from fogft.poolfile.file import parse, read_text
     from fogft.simulation import fitting, report
-    from fogft.simulation import model as models
-    from fogft.simulation import traces as recorded
     from fogft.simulation.comparison import Scenario, spot_locations
     from fogft.simulation.market import remembered
+    from fogft.simulation.model import MARKET_KEYS, MarketModel, Timing, applied, read_values
+    from fogft.simulation.traces import located, read
 
-    source = pool_file.text(file)
-    spec = pool_file.parse(source, file=str(file), folder=file.parent)
+    source = read_text(file)
+    spec = parse(source, file=str(file), folder=file.parent)
     chosen = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL
     find = remembered(_pricing(make_cloud(chosen, file.resolve().parent).offers, source, file))
-    values = models.parse(model)
-    market, timing = models.MarketModel(), models.Timing()
+    values = read_values(model)
+    market, timing = MarketModel(), Timing()
     lines: Mapping[str, Any] = {}
     notes: list[str] = []
     if traces is None:
@@ -66,7 +66,7 @@ def simulate(
     else:
         usable = set(spot_locations(spec, find))
         everywhere = {p.location: p for p in _everything(spec, find)}
-        found = recorded.located(recorded.read(traces), list(everywhere.values()))
+        found = located(read(traces), list(everywhere.values()))
         lines = {place: line for place, line in found.items() if place in usable}
         if len(lines) < len(found):
             notes.append(f"{len(found) - len(lines)} traces are of locations outside this pool")
@@ -80,7 +80,7 @@ def simulate(
                 "none of the traces is of a location that the pool may use",
                 "name the traces' regions under `resources.any_of`",
             )
-        told_by_traces = sorted(set(values) & set(models.MARKET_KEYS))
+        told_by_traces = sorted(set(values) & set(MARKET_KEYS))
         if fit:
             market = fitting.fit(lines)
             lines = {}
@@ -89,7 +89,7 @@ def simulate(
                 f"--model: `{told_by_traces[0]}` is told by the traces",
                 "add `--fit` to change what was fitted to them",
             )
-    market, timing = models.applied(market, timing, values)
+    market, timing = applied(market, timing, values)
     scenario = Scenario(spec, find, timing, market, recorded=lines, days=days, seeds=tuple(seeds))
     return report.simulate(scenario, notes=notes, told=told)
 

@@ -41,17 +41,17 @@ def sweep(cloud: str) -> Swept:
         CloudError: There is no such cloud, or it is not usable here.
     """
     from fogft.cloud.port import Auditing
-    from fogft.pool.commands import sweep as sweeping
+    from fogft.pool.commands import sweep
 
     concrete = make_cloud(cloud, Path.cwd())
     if not isinstance(concrete, Auditing):
         raise FogftError(f"cloud `{cloud}` cannot be swept")
-    unowned, audit = sweeping.find(concrete, home())
+    unowned, audit = sweep.find(concrete, home())
     return Swept(cloud, unowned, audit.asked)
 
 
 def end_unowned(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
     """End what was found, but what a manager has taken over since; return what went wrong."""
-    from fogft.pool.commands import sweep as sweeping
+    from fogft.pool.commands import sweep
 
-    return sweeping.end(make_cloud(found.cloud, Path.cwd()), found.unowned, home(), told=told)
+    return sweep.end(make_cloud(found.cloud, Path.cwd()), found.unowned, home(), told=told)

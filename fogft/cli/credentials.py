@@ -77,10 +77,10 @@ def issue(
       fogft credentials issue robot ada
     """
     from fogft import app
-    from fogft.pool.credentials import bundle
+    from fogft.pool.credentials.bundle import new_passphrase
 
     own = None if passphrase_file is None else _read_passphrase(passphrase_file)
-    passphrase = own or bundle.new_passphrase()
+    passphrase = own or new_passphrase()
     issued, file = app.issue_credentials(
         app.pool_name(pool), _role(role), name, out, passphrase, open_for_s=hours * 3600
     )
@@ -212,9 +212,9 @@ def join(
     """
     from fogft import app
     from fogft.pool.commands import joining
-    from fogft.pool.credentials import bundle as bundles
+    from fogft.pool.credentials.bundle import read_label
 
-    label = bundles.read_label(joining.read(bundle))
+    label = read_label(joining.read(bundle))
     whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"
     output.say(f"this bundle is for {whom}")
     joined = app.join(bundle, _read_passphrase(passphrase_file))

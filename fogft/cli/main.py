@@ -29,11 +29,11 @@ from fogft.cli import (
     lifecycle,
     output,
     parts,
+    plan,
     simulate,
     sweep,
     watch,
 )
-from fogft.cli import plan as planning
 from fogft.cli.sections import Commands
 from fogft.errors import FogftError
 
@@ -57,7 +57,7 @@ app = typer.Typer(
 )
 lifecycle.register(app)
 sweep.register(app)
-planning.register(app)
+plan.register(app)
 watch.register(app)
 doctor.register(app)
 change.register(app)

@@ -16,7 +16,7 @@ from fogft.cli.sections import Command
 
 
 def _endpoint(value: str | None) -> str | None:
-    from fogft.model.membership import is_endpoint
+    from fogft.model.endpoint import is_endpoint
 
     if value is not None and not is_endpoint(value):
         raise typer.BadParameter(f"`{value}` is not HOST:PORT, such as 127.0.0.1:9464")

@@ -9,8 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from fogft.cloud.local import faults as local_faults
-from fogft.cloud.local import processes as local_processes
+from fogft.cloud.local import faults, processes
 from fogft.doctor.finding import Check, Finding, Situation, ok, warn
 from fogft.errors import FogftError
 from fogft.pool.folder.paths import PoolPaths
@@ -36,14 +35,14 @@ def segments(_: Situation) -> Iterator[Finding]:
     )
 
 
-def processes(situation: Situation) -> Iterator[Finding]:
+def orphaned_processes(situation: Situation) -> Iterator[Finding]:
     """No replica of the local cloud runs without a pool that it belongs to."""
     uids = []
     for pool in situation.pools:
         with contextlib.suppress(FogftError):
             uids.append(read_identity(PoolPaths.of(pool, situation.home)).uid)
-    owned = {pid for uid in uids for pid in local_processes.find(pool_uid=uid)}
-    orphans = [pid for pid in local_processes.find() if pid not in owned]
+    owned = {pid for uid in uids for pid in processes.find(pool_uid=uid)}
+    orphans = [pid for pid in processes.find() if pid not in owned]
     if not orphans:
         yield ok("leftovers", "no replicas without a pool")
         return
@@ -58,10 +57,10 @@ def processes(situation: Situation) -> Iterator[Finding]:
 
 def chaos(situation: Situation) -> Iterator[Finding]:
     """Nothing that `fogft chaos` did to locations lasts."""
-    faults = local_faults.read_cloud(situation.home / "local")
-    found = [f"`{place}` is out" for place in faults.out(situation.now)]
+    broken = faults.read_cloud(situation.home / "local")
+    found = [f"`{place}` is out" for place in broken.out(situation.now)]
     found += [
-        f"`{place}` has room for {n} machines" for place, n in sorted(faults.capacity.items())
+        f"`{place}` has room for {n} machines" for place, n in sorted(broken.capacity.items())
     ]
     if found:
         yield warn(
@@ -71,4 +70,4 @@ def chaos(situation: Situation) -> Iterator[Finding]:
         )
 
 
-CHECKS: tuple[Check, ...] = (segments, processes, chaos)
+CHECKS: tuple[Check, ...] = (segments, orphaned_processes, chaos)

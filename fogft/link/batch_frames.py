@@ -11,8 +11,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
+from fogft.errors import FrameError
 from fogft.link import frame
-from fogft.link.frame import NO_STAMP, STAMP_BYTES, FrameError, RequestHeader
+from fogft.link.frame import NO_STAMP, STAMP_BYTES, RequestHeader
 from fogft.link.port import Answer
 from fogft.model.names import REQUEST_ID_BYTES
 

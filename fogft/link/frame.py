@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+from fogft.errors import FrameError
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.poolfile.service_form import LONGEST_S
 
@@ -40,10 +41,6 @@ _ANSWER = struct.Struct(f">B{STAMP_BYTES}s{REQUEST_ID_BYTES}s")
 _TOKEN = struct.Struct(f">B{TOKEN_BYTES}s")
 _GREETING = struct.Struct(f">B{TOKEN_BYTES}sH")
 _ORIGIN_AT = _REQUEST.size
-
-
-class FrameError(ValueError):
-    """These bytes are not a frame of this version."""
 
 
 class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass costs thrice as much
@@ -186,7 +183,7 @@ def decode_answer(frame: bytes) -> tuple[bytes, bytes, bool]:
 
 
 def encode_refusal(stamp: bytes, request_id: bytes, reason: str) -> bytes:
-    """Return a refusal; `reason` is one of `port.Refusal`, or any short ASCII text."""
+    """Return a refusal; `reason` is one of `model.refusal`, or any short ASCII text."""
     return _ANSWER.pack(VERSION, stamp, request_id) + reason.encode("ascii")
 
 

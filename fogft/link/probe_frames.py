@@ -11,7 +11,8 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from fogft.link.frame import VERSION, FrameError, check_version
+from fogft.errors import FrameError
+from fogft.link.frame import VERSION, check_version
 from fogft.link.port import Behind, Probe, ProbeAnswer
 from fogft.model import type_definition
 from fogft.model.replica import LinkState

@@ -18,8 +18,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fogft.link.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer, Refusal
+from fogft.link.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer
 from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec
 from fogft.model.uplinks import UplinkPolicy, choose

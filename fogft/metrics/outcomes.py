@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from fogft.link.port import Refusal
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 
 _LATENCIES_KEPT = 2000

@@ -18,9 +18,9 @@ from enum import Enum
 from typing import Any
 
 from fogft.errors import StateError
-from fogft.model import topology as topologies
 from fogft.model.certificate_holder import holder_of
-from fogft.model.names import POOL_UID_PATTERN, replica_certificate_name
+from fogft.model.endpoint import is_endpoint
+from fogft.model.names import POOL_UID_PATTERN
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import Topology
@@ -68,7 +68,7 @@ def members_of(
         and (machine.endpoint is not None or found is not Found.BY_CLOUD)
         and machine.phase is not MachinePhase.FAILED
         and machine.id not in ending
-        and replica_certificate_name(machine.id) not in revoked
+        and machine.id.certificate_name not in revoked
     )
 
 
@@ -137,7 +137,7 @@ def to_dict(membership: Membership) -> dict[str, Any]:
             for m in membership.members
         ],
         "revoked": sorted(membership.revoked),
-        "topology": topologies.to_plain(membership.topology),
+        "topology": membership.topology.to_plain(),
     }
     return {**content, "checksum": _checksum(content)}
 
@@ -185,7 +185,7 @@ def from_parts(
             version=_count(version),
             members=tuple(_member(pool_uid, entry) for entry in members),
             revoked=frozenset(_revoked(pool_uid, name) for name in revoked),
-            topology=Topology() if topology is None else topologies.from_plain(topology),
+            topology=Topology() if topology is None else Topology.from_plain(topology),
         )
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error
@@ -193,15 +193,6 @@ def from_parts(
     if len(set(ids)) != len(ids):
         raise StateError("not a membership: a replica is listed twice")
     return membership
-
-
-def is_endpoint(text: str) -> bool:
-    """Whether this is ``host:port``; an IPv6 address stands in brackets."""
-    host, _, port = text.rpartition(":")
-    in_brackets = host.startswith("[") and host.endswith("]")
-    if not host or not (in_brackets or ":" not in host) or not host.isascii():
-        return False
-    return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
 
 
 def _member(uid: str, entry: Mapping[str, Any]) -> Member:

@@ -11,10 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from fogft.model.replica import Member, ReplicaId
 
 REQUEST_ID_BYTES = 16
 GATEWAY_SLOTS = 1 << 32  # from here on, slots are gateways
@@ -65,19 +61,6 @@ def records_key(pool_uid: str, slot: int) -> str:
 def cancel_key(pool_uid: str, slot: int) -> str:
     """Return the Zenoh key at which a slot hears which requests are no longer wanted."""
     return f"{slot_prefix(pool_uid, slot)}/cancel"
-
-
-def replica_certificate_name(id: ReplicaId) -> str:
-    """Return the common name of a replica's certificate: pool, slot and generation."""
-    return f"replica.{id.slot}.{id.generation}.{id.pool_uid}"
-
-
-def member_certificate_name(member: Member) -> str:
-    """Return the common name that a member of the membership must show."""
-    id = member.id
-    if member.gateway:
-        return gateway_certificate_name(id.pool_uid, member.gateway, id.generation)
-    return replica_certificate_name(id)
 
 
 def robot_certificate_name(pool_uid: str, robot: str, generation: int = 1) -> str:

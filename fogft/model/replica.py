@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 
+from fogft.model.names import gateway_certificate_name
 from fogft.model.topology import Topology
 
 
@@ -34,6 +35,11 @@ class ReplicaId:
     def short(self) -> str:
         """Slot and generation, as people see it: ``2.1``."""
         return f"{self.slot}.{self.generation}"
+
+    @property
+    def certificate_name(self) -> str:
+        """The common name of its certificate: slot, generation and pool."""
+        return f"replica.{self.slot}.{self.generation}.{self.pool_uid}"
 
     def __str__(self) -> str:
         return f"{self.pool_uid}-{self.slot}.{self.generation}"
@@ -254,6 +260,14 @@ class Member:
     draining: bool = False
     gateway: str = ""
     version: str = ""
+
+    @property
+    def certificate_name(self) -> str:
+        """The common name that its certificate must have."""
+        if self.gateway:
+            id = self.id
+            return gateway_certificate_name(id.pool_uid, self.gateway, id.generation)
+        return self.id.certificate_name
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,15 @@ class Select(str, Enum):
 
 
 @dataclass(frozen=True)
+class Quality:
+    """Quality of service of a topic: how many messages are kept, and for whom."""
+
+    depth: int = 10
+    reliable: bool = True
+    latched: bool = False
+
+
+@dataclass(frozen=True)
 class TopicSpec:
     """One proxied topic.
 
@@ -51,33 +60,37 @@ class TopicSpec:
         """Its name on the wire, and in what a replica says is ready."""
         return PREFIX + self.name
 
+    @property
+    def quality(self) -> Quality:
+        """The quality of service that both ends ask ROS for."""
+        return Quality(self.depth, self.reliable, self.latched)
 
-def to_plain(topic: TopicSpec) -> dict[str, Any]:
-    """Return what a configuration file says of a topic; defaults are left out."""
-    return {
-        field.name: getattr(value, "value", value)
-        for field in fields(TopicSpec)
-        if (value := getattr(topic, field.name)) != field.default
-    }
+    def to_plain(self) -> dict[str, Any]:
+        """Return what a configuration file says of it; defaults are left out."""
+        return {
+            field.name: getattr(value, "value", value)
+            for field in fields(TopicSpec)
+            if (value := getattr(self, field.name)) != field.default
+        }
 
+    @classmethod
+    def from_plain(cls, raw: Mapping[str, Any]) -> TopicSpec:
+        """Return the topic of a configuration file.
 
-def from_plain(raw: Mapping[str, Any]) -> TopicSpec:
-    """Return the topic of a configuration file.
-
-    Raises:
-        KeyError: Name, type or origin are missing.
-        ValueError: A value is out of range or unknown.
-        TypeError: A value is of the wrong type.
-    """
-    depth = int(raw.get("depth") or TopicSpec.depth)
-    if not 1 <= depth <= DEPTH_LIMIT:
-        raise ValueError(f"a depth of {depth}")
-    return TopicSpec(
-        name=str(raw["name"]),
-        type=str(raw["type"]),
-        origin=Origin(raw["origin"]),
-        select=Select(raw.get("select") or TopicSpec.select),
-        depth=depth,
-        reliable=bool(raw.get("reliable", True)),
-        latched=bool(raw.get("latched", False)),
-    )
+        Raises:
+            KeyError: Name, type or origin are missing.
+            ValueError: A value is out of range or unknown.
+            TypeError: A value is of the wrong type.
+        """
+        depth = int(raw.get("depth") or cls.depth)
+        if not 1 <= depth <= DEPTH_LIMIT:
+            raise ValueError(f"a depth of {depth}")
+        return cls(
+            name=str(raw["name"]),
+            type=str(raw["type"]),
+            origin=Origin(raw["origin"]),
+            select=Select(raw.get("select") or cls.select),
+            depth=depth,
+            reliable=bool(raw.get("reliable", True)),
+            latched=bool(raw.get("latched", False)),
+        )

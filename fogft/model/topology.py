@@ -16,6 +16,7 @@ from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.certificate_holder import NAME_PATTERN, Holder, Role
+from fogft.model.endpoint import is_endpoint
 
 GATEWAYS_LIMIT = 64
 ROBOTS_LIMIT = 512
@@ -75,6 +76,53 @@ class Topology:
             listed = self.of_robot(holder.name)
         return tuple(g for g in self.gateways if g.name in listed and g.generations)
 
+    def to_plain(self) -> dict[str, Any]:
+        """Return it as plain JSON data."""
+        return {
+            "gateways": [
+                {
+                    "name": g.name,
+                    "endpoint": g.endpoint,
+                    "through": list(g.through),
+                    "generations": list(g.generations),
+                }
+                for g in self.gateways
+            ],
+            "robots": {name: list(through) for name, through in self.robots.items()},
+            "through": list(self.through),
+        }
+
+    @classmethod
+    def from_plain(cls, raw: Any) -> Topology:
+        """Read a topology back.
+
+        Raises:
+            StateError: It is none, or its gateways form a loop.
+        """
+
+        try:
+            gateways = tuple(
+                Gateway(
+                    _name(one["name"]),
+                    one["endpoint"],
+                    _names(one["through"]),
+                    tuple(_generation(g) for g in one["generations"]),
+                )
+                for one in _list(raw["gateways"], GATEWAYS_LIMIT)
+            )
+            if not all(isinstance(g.endpoint, str) and is_endpoint(g.endpoint) for g in gateways):
+                raise ValueError("an endpoint that is not host:port")
+            if len(raw["robots"]) > ROBOTS_LIMIT:
+                raise ValueError("too many robots")
+            robots = {_name(name): _names(through) for name, through in raw["robots"].items()}
+            topology = cls(gateways, robots, _names(raw["through"]))
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            raise StateError(f"not a topology: {error}") from error
+        wrong = trouble(topology)
+        if wrong:
+            raise StateError(f"not a topology: {wrong}")
+        return topology
+
 
 def certified(topology: Topology, generations: Mapping[str, Iterable[int]]) -> Topology:
     """Return a topology with the generations of each gateway's certificates that are good."""
@@ -121,55 +169,6 @@ def find_loop(through: Mapping[str, Iterable[str]]) -> list[str]:
             else:
                 stack.append((following, iter(through.get(following, ()))))
     return []
-
-
-def to_plain(topology: Topology) -> dict[str, Any]:
-    """Return a topology as plain JSON data."""
-    return {
-        "gateways": [
-            {
-                "name": g.name,
-                "endpoint": g.endpoint,
-                "through": list(g.through),
-                "generations": list(g.generations),
-            }
-            for g in topology.gateways
-        ],
-        "robots": {name: list(through) for name, through in topology.robots.items()},
-        "through": list(topology.through),
-    }
-
-
-def from_plain(raw: Any) -> Topology:
-    """Read a topology back.
-
-    Raises:
-        StateError: It is none, or its gateways form a loop.
-    """
-    from fogft.model.membership import is_endpoint
-
-    try:
-        gateways = tuple(
-            Gateway(
-                _name(one["name"]),
-                one["endpoint"],
-                _names(one["through"]),
-                tuple(_generation(g) for g in one["generations"]),
-            )
-            for one in _list(raw["gateways"], GATEWAYS_LIMIT)
-        )
-        if not all(isinstance(g.endpoint, str) and is_endpoint(g.endpoint) for g in gateways):
-            raise ValueError("an endpoint that is not host:port")
-        if len(raw["robots"]) > ROBOTS_LIMIT:
-            raise ValueError("too many robots")
-        robots = {_name(name): _names(through) for name, through in raw["robots"].items()}
-        topology = Topology(gateways, robots, _names(raw["through"]))
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise StateError(f"not a topology: {error}") from error
-    wrong = trouble(topology)
-    if wrong:
-        raise StateError(f"not a topology: {wrong}")
-    return topology
 
 
 def _list(raw: Any, limit: int) -> list[Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fogft.model.choices import MetricsSpec
-from fogft.model.membership import is_endpoint
+from fogft.model.endpoint import is_endpoint
 from fogft.model.middleware import Middleware, Speaks
 from fogft.model.uplinks import is_interface
 from fogft.poolfile.keys import METRICS_KEYS, RMW_KEYS

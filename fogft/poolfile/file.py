@@ -39,7 +39,7 @@ def read(
         SpecError: The file cannot be read, or its first mistake: ``file:line: key: what``.
     """
     return parse(
-        text(path),
+        read_text(path),
         file=str(path),
         check_types=check_types,
         check_fields=check_fields,
@@ -86,7 +86,7 @@ def parse(
     )
 
 
-def text(path: Path | str) -> str:
+def read_text(path: Path | str) -> str:
     """Return a pool file's text, as it stands on disk but for a byte order mark.
 
     Raises:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from fogft.model import schedule as schedules
+from fogft.model import schedule
 from fogft.model.choices import (
     AvailabilitySpec,
     GroupSpec,
@@ -175,7 +175,7 @@ def read_schedule(ours: Section) -> ScheduleSpec | None:
     section.only(SCHEDULE_KEYS)
     zone = section.text("time_zone", "write a time zone, such as `time_zone: Europe/Berlin`")
     try:
-        schedules.zone(zone)
+        schedule.zone(zone)
     except ValueError:
         raise section.error(
             "time_zone",

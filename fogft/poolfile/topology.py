@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fogft.model.certificate_holder import NAME_PATTERN
-from fogft.model.membership import is_endpoint
+from fogft.model.endpoint import is_endpoint
 from fogft.model.names import gateway_slot
 from fogft.model.spec import ServiceSpec
 from fogft.model.topology import GATEWAYS_LIMIT, ROBOTS_LIMIT, Gateway, Topology, find_loop

@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fogft.cloud.notice import SOURCES as NOTICE_SOURCES
+from fogft.cloud import notice
 from fogft.errors import StateError
 from fogft.link.frame import ROBOT_BYTES_LIMIT
-from fogft.link.zenoh.settings import CredentialPaths
-from fogft.model import membership, names
-from fogft.model import topic as topics
+from fogft.model import names
+from fogft.model.credentials import CredentialPaths
+from fogft.model.endpoint import is_endpoint
 from fogft.model.middleware import Speaks
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
@@ -148,7 +148,7 @@ def _client(raw: Mapping[str, Any], base: Path) -> ClientProxyConfig:
         dial_in_listen=_endpoint(raw.get("dial_in_listen") or ""),
         uplinks=_interfaces(raw.get("uplinks")),
         metrics=_endpoint(raw.get("metrics") or ""),
-        topics=tuple(topics.from_plain(t) for t in raw.get("topics") or ()),
+        topics=tuple(TopicSpec.from_plain(t) for t in raw.get("topics") or ()),
         rmw=_speaks(raw),
     )
 
@@ -197,7 +197,7 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
             records=base / raw["records"] if raw.get("records") else None,
             dial_out=_endpoints(raw.get("dial_out")),
             metrics=_endpoint(raw.get("metrics") or ""),
-            topics=tuple(topics.from_plain(t) for t in raw.get("topics") or ()),
+            topics=tuple(TopicSpec.from_plain(t) for t in raw.get("topics") or ()),
             rmw=_speaks(raw),
         )
     raise AssertionError("unreachable")
@@ -254,7 +254,7 @@ def _interfaces(raw: Any) -> tuple[str, ...]:
 
 
 def _endpoint(raw: Any) -> str:
-    if not isinstance(raw, str) or (raw and not membership.is_endpoint(raw)):
+    if not isinstance(raw, str) or (raw and not is_endpoint(raw)):
         raise ValueError(f"{raw!r:.40} is not `host:port`")
     return raw
 
@@ -277,8 +277,8 @@ def _notice(raw: Any, base: Path) -> str:
     kind, colon, path = source.partition(":")
     if colon and kind == "file" and path:
         return f"file:{base / path}"
-    if source != "none" and source not in NOTICE_SOURCES:
-        known = ", ".join(("file:PATH", "none", *NOTICE_SOURCES))
+    if source != "none" and source not in notice.SOURCES:
+        known = ", ".join(("file:PATH", "none", *notice.SOURCES))
         raise ValueError(f"notice: {raw!r:.40} is none of {known}")
     return source
 

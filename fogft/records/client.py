@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from fogft.errors import StateError, WireError
-from fogft.link.zenoh.settings import CredentialPaths
-from fogft.model.membership import is_endpoint
-from fogft.records import cache as record_cache
+from fogft.model.credentials import CredentialPaths
+from fogft.model.endpoint import is_endpoint
+from fogft.records.cache import read, write
 from fogft.records.dialling import Caller
 from fogft.records.exchange import Exchange
 from fogft.records.record import Record, RecordError, RecordKind, sign_record
@@ -285,7 +285,7 @@ class RendezvousClient:
         if self._cache is None:
             return
         try:
-            records = record_cache.read(self._cache)
+            records = read(self._cache)
         except StateError as error:
             log.error("cache_damaged reason=%r", error.message)
             return
@@ -306,7 +306,7 @@ class RendezvousClient:
             return
         self._cached = True
         try:
-            record_cache.write(self._cache, self._records.lacking({}))
+            write(self._cache, self._records.lacking({}))
         except StateError as error:
             log.error("cache_not_written reason=%r", error.message)
 

@@ -16,7 +16,7 @@ import ssl
 from typing import Any
 
 from fogft.errors import CredentialError, WireError
-from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
 from fogft.records.exchange import SILENCE_S, Connection
 from fogft.records.record import RecordError

@@ -189,7 +189,7 @@ def expected_writer(record: Record) -> tuple[str, str]:
         if not subject.isdecimal() or str(int(subject)) != subject:
             raise RecordError("malformed", "a slot that is not a number")
         id = ReplicaId(uid, int(subject), record.generation)
-        return "replica", names.replica_certificate_name(id)
+        return "replica", id.certificate_name
     if not subject:
         raise RecordError("malformed", "a record about nobody")
     if record.kind is RecordKind.ROBOT:

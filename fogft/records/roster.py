@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fogft.errors import StateError
-from fogft.model import membership as memberships
 from fogft.model.certificate_holder import Holder, holder_of
+from fogft.model.endpoint import is_endpoint
+from fogft.model.membership import from_parts, to_dict
 from fogft.model.names import gateway_slot
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import COUNT_LIMIT, Record, RecordError, RecordKind
@@ -99,7 +100,7 @@ def dial_in(record: Record) -> str:
 
 def admission_content(membership: Membership) -> dict[str, Any]:
     """Return a membership as the content of the manager's admission record."""
-    whole = memberships.to_dict(membership)
+    whole = to_dict(membership)
     content = {"name": whole["pool"], "members": whole["members"]}
     return {**content, "topology": whole["topology"]} if membership.topology else content
 
@@ -111,7 +112,7 @@ def admission(record: Record) -> Membership:
         RecordError: Its content is none.
     """
     try:
-        return memberships.from_parts(
+        return from_parts(
             pool=record.content.get("name"),
             pool_uid=record.pool_uid,
             epoch=record.generation,
@@ -203,7 +204,7 @@ def _located(member: Member, state: SlotState | None) -> Member:
 def _endpoint(value: Any) -> str:
     if not isinstance(value, str) or len(value) > NAME_LIMIT or not value.isprintable():
         raise RecordError("malformed", "an endpoint that is none")
-    if value and not memberships.is_endpoint(value):
+    if value and not is_endpoint(value):
         raise RecordError("malformed", "an endpoint that is not host:port")
     return value
 

@@ -23,8 +23,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from fogft.errors import CredentialError, WireError
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.log_limits import worth_logging
+from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
 from fogft.records.exchange import Connection, Exchange
 from fogft.records.record import RecordError, Verify, Writer

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from fogft.errors import RosError
-from fogft.link.zenoh import settings as config
+from fogft.link.zenoh import settings
 
 if TYPE_CHECKING:
     import zenoh
@@ -52,10 +52,10 @@ def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
 
     path = environ.get(FILE)
     try:
-        made = zenoh.Config.from_file(path) if path else config.to_zenoh(SETTINGS)
+        made = zenoh.Config.from_file(path) if path else settings.to_zenoh(SETTINGS)
     except Exception as error:
         raise RosError(f"`{FILE}={path}` cannot be used: {error}") from error
-    config.to_zenoh({})  # the runtime's own wish, whoever configures the session
+    settings.to_zenoh({})  # the runtime's own wish, whoever configures the session
     for key, value in _overrides(environ.get(OVERRIDE, "")):
         try:
             made.insert_json5(key, value)

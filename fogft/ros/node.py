@@ -18,9 +18,10 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.model import ros_names
+from fogft.model.topic import Quality
 from fogft.ros import topic_ends, transfer
 from fogft.ros.entities import Client, Server
-from fogft.ros.port import OnBurst, Quality
+from fogft.ros.port import OnBurst
 from fogft.ros.topic_ends import Publisher, Reader, Subscription
 from fogft.ros.visible import VisibleNode
 

@@ -16,6 +16,7 @@ from enum import IntEnum
 from typing import Any, Protocol
 
 from fogft.errors import RosError
+from fogft.model.topic import Quality
 
 OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where it has ended
 
@@ -59,15 +60,6 @@ class RosClient(Protocol):
 
     def close(self) -> None:
         """Withdraw the client."""
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Quality of service of a topic: how many messages are kept, and for whom."""
-
-    depth: int = 10
-    reliable: bool = True
-    latched: bool = False
 
 
 class RosPublisher(Protocol):

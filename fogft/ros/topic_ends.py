@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.ros.port import Quality
+from fogft.model.topic import Quality
 
 log = logging.getLogger(__name__)
 

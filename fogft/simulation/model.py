@@ -118,7 +118,7 @@ MARKET_KEYS = ("correlation", *(f.name for f in fields(MarketModel)))
 TIMING_KEYS = tuple(f.name for f in fields(Timing))
 
 
-def parse(text: str) -> dict[str, float]:
+def read_values(text: str) -> dict[str, float]:
     """Read ``KEY=VALUE,...``; empty for no keys.
 
     Raises:

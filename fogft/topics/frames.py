@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from fogft.link.frame import FrameError
+from fogft.errors import FrameError
 
 SESSION_BYTES = 8
 BATCH_LIMIT = 1000

@@ -28,8 +28,8 @@ class Graph:
     """Says, hears, and sends goals in one ROS domain."""
 
     def __init__(self, domain_id: int, name: str) -> None:
+        from fogft.model.topic import Quality
         from fogft.ros.node import SerialisedNode
-        from fogft.ros.port import Quality
 
         self._node = SerialisedNode(name, domain_id)
         said, heard = TOPICS

@@ -25,7 +25,6 @@ from typing import Any
 from fogft import disk
 from fogft.model import membership as memberships
 from fogft.model import names
-from fogft.model import topic as topics
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.poolfile.service_form import to_plain
@@ -136,7 +135,7 @@ class Rig:
         self._rmw = rmw
         self._environ = environ
         self._action = ACTION_SERVICES if graph else ()
-        self._topics = [topics.to_plain(topic) for topic in TOPICS] if graph else []
+        self._topics = [topic.to_plain() for topic in TOPICS] if graph else []
         self._stateful = stateful
         self._policy: dict[str, Any] = policy or {}
         self.robot_domain, self.bare_domain, *domains = free_domains(2 + 2 * replicas)
@@ -214,7 +213,7 @@ class Rig:
         id = ReplicaId(self._uid, slot, 1)
         port, dial_port = free_ports(2)
         name = f"replica-{slot}"
-        self._issue(name, "replica", names.replica_certificate_name(id), authority.Role.REPLICA)
+        self._issue(name, "replica", id.certificate_name, authority.Role.REPLICA)
         config = {
             "pool": "bench",
             "pool_uid": self._uid,
@@ -283,7 +282,7 @@ class Rig:
         id = ReplicaId(self._uid, 99, 1)
         folder = self.floor_folder
         for stem, name, role in (
-            ("replica", names.replica_certificate_name(id), authority.Role.REPLICA),
+            ("replica", id.certificate_name, authority.Role.REPLICA),
             ("robot", names.robot_certificate_name(self._uid, "floor"), authority.Role.ROBOT),
         ):
             self._issue(folder.name, stem, name, role)

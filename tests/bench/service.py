@@ -100,7 +100,7 @@ def _offer_graph(node: Any) -> None:
     from rclpy.serialization import serialize_message
     from test_msgs.action import Fibonacci
 
-    from fogft.ros.port import Quality
+    from fogft.model.topic import Quality
 
     heard, said = TOPICS
     again = node.publisher(said.name, said.type, Quality(said.depth))

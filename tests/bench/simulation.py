@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.local.catalogue import BUILT_IN
-from fogft.cloud.local.resources import offers
+from fogft.cloud.local.resources import offers_for
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.simulation.comparison import Scenario, policies, unlogged
 from fogft.simulation.market import remembered
@@ -36,7 +36,7 @@ def simulation(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
                     replicas=replicas,
                     task={"run": "plan", "resources": {"use_spot": True}},
                 ),
-                remembered(lambda resources: offers(BUILT_IN, resources)),
+                remembered(lambda resources: offers_for(BUILT_IN, resources)),
                 Timing(),
                 model,
                 days=5.0,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.cloud.local.catalogue import BUILT_IN, Catalogue, Instance, Zone
-from fogft.cloud.local.resources import offers
+from fogft.cloud.local.resources import offers_for
 from fogft.errors import SpecError
 
 SMALL = Instance("small", 2, 8, 0.2, 0.1)
@@ -31,7 +31,7 @@ def found(resources: dict) -> list[tuple[str, str, bool, float]]:
             o.placement.spot,
             o.usd_per_hour,
         )
-        for o in offers(CATALOGUE, resources)
+        for o in offers_for(CATALOGUE, resources)
     ]
 
 
@@ -174,7 +174,7 @@ def test_what_is_nothing_to_this_cloud_is_accepted():
 )
 def test_what_can_never_be_met_is_told_with_its_key(resources, message, hint):
     with pytest.raises(SpecError) as error:
-        offers(CATALOGUE, resources)
+        offers_for(CATALOGUE, resources)
     assert error.value.message == message
     assert hint in error.value.hint
 
@@ -194,7 +194,7 @@ KEYS = (
 def test_whatever_a_file_says_there_are_offers_or_one_error(resources):
     """No input makes the cloud break: it is met, or it is the file's mistake."""
     try:
-        found = offers(BUILT_IN, resources)
+        found = offers_for(BUILT_IN, resources)
     except SpecError as error:
         message = error.message
     else:
@@ -209,7 +209,7 @@ def test_the_built_in_regions_are_those_of_the_documentation():
     assert set(BUILT_IN.regions) >= {
         *("us-west-1", "us-west-2", "us-east-1", "eu-central-1", "ap-northeast-1")
     }
-    spot = {o.placement.location: o.usd_per_hour for o in offers(BUILT_IN, {"use_spot": True})}
-    on_demand = {o.placement.location: o.usd_per_hour for o in offers(BUILT_IN, {})}
+    spot = {o.placement.location: o.usd_per_hour for o in offers_for(BUILT_IN, {"use_spot": True})}
+    on_demand = {o.placement.location: o.usd_per_hour for o in offers_for(BUILT_IN, {})}
     assert len(spot) == 10
     assert all(spot[place] < price for place, price in on_demand.items())

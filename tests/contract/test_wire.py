@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 from fogft.errors import WireError
-from fogft.link.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer, Refusal
+from fogft.link.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer
 from fogft.link.window import ATTEMPTS_LIMIT
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.model import names
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId, doubted_after_s
 from fogft.model.type_definition import Definition
 from tests.fakes.link import MemoryWire

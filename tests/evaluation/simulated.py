@@ -7,14 +7,14 @@ replicas that stay where they are and wait there for room.
 from __future__ import annotations
 
 from fogft.cloud.local.catalogue import BUILT_IN
-from fogft.cloud.local.resources import offers
+from fogft.cloud.local.resources import offers_for
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.simulation.comparison import SETTLE_S, Scenario, policies, unlogged
 from fogft.simulation.market import remembered
 from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.world import World
 
-_FIND = remembered(lambda resources: offers(BUILT_IN, resources))
+_FIND = remembered(lambda resources: offers_for(BUILT_IN, resources))
 
 
 def unavailable(

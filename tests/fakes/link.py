@@ -14,9 +14,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from fogft.errors import WireError
-from fogft.link.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnswer, Refusal
+from fogft.link.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnswer
 from fogft.link.send_options import Ways
-from fogft.model import names
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.records.record import SignedRecord
 from tests.fakes.link_ends import MemoryIncoming, MemoryLink, Session
@@ -169,7 +169,7 @@ class MemoryListener:
         self._on_request: Callable[[Incoming], None] | None = None
         self._on_probe: Callable[[Probe], ProbeAnswer] | None = None
         self._on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None
-        self.certificate_name = names.replica_certificate_name(id)
+        self.certificate_name = id.certificate_name
         self.frozen = False
         self.count: Counter[str] = Counter()
 

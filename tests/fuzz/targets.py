@@ -15,9 +15,9 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from fogft.errors import CredentialError, StateError
+from fogft.errors import CredentialError, FrameError, StateError
 from fogft.link import batch_frames, compression, frame, probe_frames
-from fogft.link.frame import FrameError, Greeting
+from fogft.link.frame import Greeting
 from fogft.link.port import Behind, Probe, ProbeAnswer
 from fogft.link.zenoh.replica.sessions import Guests, NotAdmittedError
 from fogft.model import certificate_holder, membership

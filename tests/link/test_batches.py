@@ -11,9 +11,10 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.errors import FrameError
 from fogft.link import batch_frames, frame
-from fogft.link.frame import NO_STAMP, FrameError
-from fogft.link.port import Incoming, Probe, ProbeAnswer, Refusal
+from fogft.link.frame import NO_STAMP
+from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.replica.query_ends import QueryEnd
@@ -23,6 +24,7 @@ from fogft.link.zenoh.robot.attempt import OpenAttempt
 from fogft.link.zenoh.robot.batch_buffer import Held
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from tests.link.wire_pool import (
     POOL_UID,

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.errors import FrameError
 from fogft.link import frame, probe_frames
-from fogft.link.frame import FrameError
 from fogft.link.port import Probe, ProbeAnswer
 from fogft.model.type_definition import Definition
 

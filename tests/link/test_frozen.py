@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from fogft.link.credit import SMALL_BYTES
-from fogft.link.port import Refusal
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState
 from tests.freezing import freeze
 from tests.link.wire_pool import (

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.port import Answer, Peer, Refusal
+from fogft.link.port import Answer, Peer
 from fogft.link.uplinks import UplinkDialer
 from fogft.model.choices import Freshness
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.uplinks import UplinkPolicy, choose, is_interface

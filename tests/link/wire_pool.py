@@ -15,8 +15,9 @@ from pathlib import Path
 import zenoh
 
 from fogft.link.port import Answer, Link, Peer
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Role
@@ -58,7 +59,7 @@ class Authority:
 
     def replica(self, slot: int = 0, generation: int = 1) -> CredentialPaths:
         id = ReplicaId(POOL_UID, slot, generation)
-        return self.issue(names.replica_certificate_name(id), Role.REPLICA)
+        return self.issue(id.certificate_name, Role.REPLICA)
 
 
 def keys(slot: int) -> dict[str, str]:
@@ -67,7 +68,7 @@ def keys(slot: int) -> dict[str, str]:
 
 def peer(endpoint: str, slot: int = 0, generation: int = 1) -> Peer:
     id = ReplicaId(POOL_UID, slot, generation)
-    return Peer(id, endpoint, names.replica_certificate_name(id))
+    return Peer(id, endpoint, id.certificate_name)
 
 
 def hears(session: zenoh.Session, key: str) -> None:

@@ -42,7 +42,7 @@ def test_any_text_is_a_holder_or_a_value_error(text: str) -> None:
 
 
 def test_the_names_that_both_ends_derive_are_holders() -> None:
-    assert holder_of(names.replica_certificate_name(ReplicaId(UID, 3, 7))).short == "3.7"
+    assert holder_of(ReplicaId(UID, 3, 7).certificate_name).short == "3.7"
     assert holder_of(names.robot_certificate_name(UID, "ada", 2)).short == "ada.2"
     assert holder_of(names.gateway_certificate_name(UID, "edge")).role is Role.GATEWAY
     assert holder_of(names.rendezvous_certificate_name(UID, "port")).role is Role.RENDEZVOUS

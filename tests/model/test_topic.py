@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.model.topic import Origin, Select, TopicSpec, from_plain, to_plain
+from fogft.model.topic import Origin, Select, TopicSpec
 from fogft.topics.queues import Outbox, Ring, Seen
 from fogft.topics.select import QUIET_LIMIT_S, QUIET_S, Selection
 
@@ -160,9 +160,9 @@ def test_feedback_has_a_leader_for_each_goal():
 @pytest.mark.parametrize("select", Select)
 def test_a_configuration_says_all_of_a_topic(select):
     topic = TopicSpec("/a", "p/msg/T", Origin.REPLICAS, select, 3, reliable=False, latched=True)
-    assert from_plain(to_plain(topic)) == topic
-    assert to_plain(TopicSpec("/a", "p/msg/T", Origin.ROBOT)) == {
+    assert TopicSpec.from_plain(topic.to_plain()) == topic
+    assert TopicSpec("/a", "p/msg/T", Origin.ROBOT).to_plain() == {
         "name": "/a", "type": "p/msg/T", "origin": "robot",
     }  # fmt: skip
     with pytest.raises(ValueError):
-        from_plain({**to_plain(topic), "depth": 0.5})
+        TopicSpec.from_plain({**topic.to_plain(), "depth": 0.5})

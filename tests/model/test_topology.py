@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import StateError
-from fogft.model import topology as topologies
 from fogft.model.certificate_holder import Holder, Role
 from fogft.model.topology import Gateway, Topology, find_loop
 
@@ -50,12 +49,12 @@ def test_a_loop_is_found_where_there_is_one(graph):
 def test_what_is_written_is_read_unless_it_loops(graph):
     """A topology survives JSON; one with a loop is refused by every reader."""
     topology = made(graph)
-    raw = json.loads(json.dumps(topologies.to_plain(topology)))
+    raw = json.loads(json.dumps(topology.to_plain()))
     if find_loop(graph):
         with pytest.raises(StateError, match="loop"):
-            topologies.from_plain(raw)
+            Topology.from_plain(raw)
     else:
-        assert topologies.from_plain(raw) == topology
+        assert Topology.from_plain(raw) == topology
 
 
 @given(
@@ -75,7 +74,7 @@ def test_what_is_written_is_read_unless_it_loops(graph):
 def test_anything_else_is_an_error(raw):
     """Whatever JSON comes, a reader returns a topology or raises `StateError`."""
     try:
-        topologies.from_plain(raw)
+        Topology.from_plain(raw)
     except StateError:
         return
     assert set(raw) >= {"gateways", "robots", "through"}

@@ -105,7 +105,7 @@ class Replica:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.endpoint = f"127.0.0.1:{free.getsockname()[1]}"
-        parts.issue(names.replica_certificate_name(self.id), authority.Role.REPLICA, stem)
+        parts.issue(self.id.certificate_name, authority.Role.REPLICA, stem)
         config = parts.folder / f"replica{slot}.{generation}.yaml"
         notice = "auto" if environ else "none"
         config.write_text(

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from fogft.child import tied
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.model import membership, names
 from fogft.model.certificate_holder import Role
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Gateway, Topology
 from tests.link.namespaces import inside

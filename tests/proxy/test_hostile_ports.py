@@ -20,8 +20,9 @@ import zenoh
 from fogft.link import frame
 from fogft.link.port import Peer
 from fogft.link.zenoh import settings
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records import frames
 from fogft.records.record import Record, RecordKind

@@ -6,7 +6,8 @@ import random
 
 import pytest
 
-from fogft.link.port import Answer, Refusal
+from fogft.link.port import Answer
+from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, TopicSpec
 from fogft.proxy.replica.topics import HOLD_S, TopicsOnReplica
 from fogft.proxy.robot.topics import TopicsOnRobot

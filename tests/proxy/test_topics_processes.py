@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from fogft.model import topic as topics
 from fogft.model.topic import Origin, TopicSpec
 from fogft.poolfile import service_form
 from fogft.poolfile.topics import action_services, action_topics
@@ -30,7 +29,7 @@ PASSED = (
     *action_topics("/count", FIBONACCI),
 )
 SERVICES = action_services("/count", FIBONACCI, 30.0, 100.0)
-EXTRA = f"topics: {json.dumps([topics.to_plain(topic) for topic in PASSED])}\n"
+EXTRA = f"topics: {json.dumps([topic.to_plain() for topic in PASSED])}\n"
 NODE = Path(__file__).parent / "nodes" / "acting_node.py"
 
 

@@ -15,8 +15,8 @@ import zenoh
 
 from fogft.link import frame
 from fogft.link.dial_out.robot import PURPOSE
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import ReplicaId
 from fogft.pool.credentials.authority import Role
 from fogft.records import frames
@@ -152,14 +152,14 @@ def impostors(authority: Authority, folder: Path) -> Sequence[tuple[CredentialPa
     elsewhere = ReplicaId("f" * 16, 0, 1)
     return (
         (authority.robot(), "greeting_role"),
-        (authority.issue(names.replica_certificate_name(id), Role.ROBOT), "greeting_role"),
+        (authority.issue(id.certificate_name, Role.ROBOT), "greeting_role"),
         (Authority(folder / "stranger").replica(), "greeting_authority"),
         (
-            authority.issue(names.replica_certificate_name(elsewhere), Role.REPLICA),
+            authority.issue(elsewhere.certificate_name, Role.REPLICA),
             "greeting_pool",
         ),
         (
-            authority.issue(names.replica_certificate_name(id), Role.REPLICA, days=-0.5),
+            authority.issue(id.certificate_name, Role.REPLICA, days=-0.5),
             "greeting_expired",
         ),
     )

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.pool.credentials.authority import Role
 from fogft.records.client import RendezvousClient

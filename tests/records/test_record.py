@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model import names
-from fogft.model.membership import is_endpoint
+from fogft.model.endpoint import is_endpoint
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import (
     BODY_LIMIT,
@@ -101,9 +101,9 @@ def test_a_writer_that_contradicts_itself_is_settled_alike_everywhere():
 @pytest.mark.parametrize(
     ("role", "common_name"),
     [
-        ("replica", names.replica_certificate_name(ReplicaId(UID, 1, 5))),  # another slot
-        ("replica", names.replica_certificate_name(ReplicaId(UID, 0, 4))),  # an older launch
-        ("robot", names.replica_certificate_name(ReplicaId(UID, 0, 5))),  # the right name only
+        ("replica", ReplicaId(UID, 1, 5).certificate_name),  # another slot
+        ("replica", ReplicaId(UID, 0, 4).certificate_name),  # an older launch
+        ("robot", ReplicaId(UID, 0, 5).certificate_name),  # the right name only
         ("robot", names.robot_certificate_name(UID, "r")),
         ("manager", names.manager_certificate_name(UID)),
         ("rendezvous", names.rendezvous_certificate_name(UID, "a")),
@@ -126,7 +126,7 @@ def test_only_the_manager_admits_and_revokes(kind):
     assert held.get(kind) == record
     newer = replace(record, sequence=10)
     for role, name in [
-        ("replica", names.replica_certificate_name(ReplicaId(UID, 0, 1))),
+        ("replica", ReplicaId(UID, 0, 1).certificate_name),
         ("robot", names.manager_certificate_name(UID)),
         ("gateway", names.gateway_certificate_name(UID, "g")),
     ]:
@@ -147,7 +147,7 @@ def test_a_changed_body_is_forged_and_another_pools_is_refused():
 
 def test_revocation_takes_back_what_was_signed_and_admits_no_more():
     """The next launch of the slot has a name of its own, and is let in."""
-    bad = names.replica_certificate_name(ReplicaId(UID, 0, 1))
+    bad = ReplicaId(UID, 0, 1).certificate_name
     held = merged(world.slot(0, 1, 1), world.slot(1, 1, 1))
     held.offer(world.revocation(1, bad))
     assert [r.subject for r in held.of(RecordKind.SLOT)] == ["1"]

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Membership
 from fogft.pool.credentials.authority import Role
 from fogft.records import cache as record_cache

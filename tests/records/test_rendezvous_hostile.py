@@ -17,8 +17,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Membership
 from fogft.pool.credentials.authority import Role
 from fogft.records import frames

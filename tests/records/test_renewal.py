@@ -10,8 +10,8 @@ import pytest
 
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState
 from fogft.pool.credentials.authority import Role
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record

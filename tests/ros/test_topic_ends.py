@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import RosError, Unreadable
-from fogft.ros.port import Quality
+from fogft.model.topic import Quality
 
 from .conftest import wait_for
 

@@ -6,7 +6,7 @@ import random
 from typing import Any
 
 from fogft.cloud.local.catalogue import BUILT_IN
-from fogft.cloud.local.resources import offers
+from fogft.cloud.local.resources import offers_for
 from fogft.model.choices import MigrationSpec, OnDemandSpec, ScheduleSpec, WindowSpec
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.simulation.comparison import Scenario
@@ -29,7 +29,7 @@ def spec(replicas: int = 2, **changes: Any) -> PoolSpec:
 
 def scenario(pool: PoolSpec | None = None, **changes: Any) -> Scenario:
     """A short simulation, at the local cloud's prices."""
-    find = remembered(lambda resources: offers(BUILT_IN, resources))
+    find = remembered(lambda resources: offers_for(BUILT_IN, resources))
     chosen: dict[str, Any] = {"timing": Timing(), "model": MarketModel(), "days": 1.0}
     return Scenario(pool or spec(), find, **{**chosen, "seeds": (0,), **changes})
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from fogft.cli.simulate import duration, percent
 from fogft.cloud.local.catalogue import BUILT_IN
-from fogft.cloud.local.resources import offers
+from fogft.cloud.local.resources import offers_for
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.planning.reliability import replicas_needed
 from fogft.poolfile import file
@@ -28,7 +28,7 @@ from fogft.simulation.world import World
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "simulation"
-FIND = remembered(lambda resources: offers(BUILT_IN, resources))
+FIND = remembered(lambda resources: offers_for(BUILT_IN, resources))
 
 # Name -> market; the first has the picture.
 MARKETS = {

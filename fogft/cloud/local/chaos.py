@@ -15,11 +15,10 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.cloud.local import ending, faults, processes
-from fogft.cloud.local import folder as folders
 from fogft.cloud.local.catalogue import CLOUD
 from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.local.faults import CloudFaults, LinkFaults
-from fogft.cloud.local.folder import Life, MachineFolder
+from fogft.cloud.local.folder import LINK, Life, MachineFolder
 from fogft.errors import CloudError, StateError
 from fogft.model.replica import Placement, ReplicaId
 from fogft.poolfile.tree import nearest, shown
@@ -180,7 +179,7 @@ class Chaos:
                 f"the link to replica `{id.short}` has no relay",
                 "remove `relay: false` from `regions.yaml` and replace the machine",
             )
-        path = folder.path / folders.LINK
+        path = folder.path / LINK
         with disk.locked(folder.path / "link.lock"):
             faults.write(path, change(faults.read_link(path)))
 

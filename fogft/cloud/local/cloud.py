@@ -20,10 +20,9 @@ from typing import Any
 
 from fogft.child import detached
 from fogft.cloud.local import ending, faults, processes, regions_file
-from fogft.cloud.local import folder as folders
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Zone
-from fogft.cloud.local.folder import Life, MachineFolder, Record, State
-from fogft.cloud.local.resources import offers as offers_for
+from fogft.cloud.local.folder import NOTICE, Life, MachineFolder, Record, State, remove, write_new
+from fogft.cloud.local.resources import offers_for
 from fogft.cloud.port import Audit, Launch
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, StateError
 from fogft.model.replica import Machine, MachinePhase, Offer, Placement, ReplicaId
@@ -96,11 +95,11 @@ class LocalCloud:
                 return
             if not folder.exists:
                 self._check_room(zone, order.id)
-                folders.write_new(folder, self._record(order, zone), order.files)
+                write_new(folder, self._record(order, zone), order.files)
             try:
                 self._spawn(folder)
             except OSError as error:
-                folders.remove(folder.path)
+                remove(folder.path)
                 raise CloudError(
                     f"machine `{order.id.short}` cannot be started: {error}",
                     "check free memory and the limit of processes (`ulimit -u`)",
@@ -272,7 +271,7 @@ def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machi
         phase=state.phase,
         launched_at=record.launched_at,
         endpoint=state.endpoint,
-        notice=(folder.path / folders.NOTICE).exists(),
+        notice=(folder.path / NOTICE).exists(),
         usd_per_hour=record.usd_per_hour,
         spec_hash=record.spec_hash,
         failure=state.failure,

@@ -15,9 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fogft import disk
-from fogft.cloud.local import folder as folders
 from fogft.cloud.local import processes
-from fogft.cloud.local.folder import Life, MachineFolder
+from fogft.cloud.local.folder import LOCK, STATE, Life, MachineFolder, remove
 from fogft.errors import CloudUnreachable, StateError
 from fogft.model.replica import ReplicaId
 
@@ -55,7 +54,7 @@ def bury(root: Path, folder: MachineFolder) -> bool:
 
     The caller holds the cloud's lock.
     """
-    lock = disk.Lock(folder.path / folders.LOCK)
+    lock = disk.Lock(folder.path / LOCK)
     try:
         if not lock.acquire(wait=False):
             return False  # it lives, or somebody looks at it just now
@@ -65,7 +64,7 @@ def bury(root: Path, folder: MachineFolder) -> bool:
         processes.end_machine(str(folder.id))
         # One whose process never ran may be ordered again.
         ran = folder.log.exists() and folder.log.stat().st_size > 0
-        _remove(root, folder, keep_log=ran or (folder.path / folders.STATE).exists())
+        _remove(root, folder, keep_log=ran or (folder.path / STATE).exists())
     except CloudUnreachable as error:
         log.warning("machine_not_gone replica=%s reason=%r", folder.id.short, error.message)
         return False
@@ -121,7 +120,7 @@ def _remove(root: Path, folder: MachineFolder, *, keep_log: bool) -> None:
             disk.make_folder(root / "logs")
             os.replace(folder.log, kept_log(root, folder.id))
             _prune(root / "logs")
-        folders.remove(folder.path)
+        remove(folder.path)
     except OSError as error:
         raise CloudUnreachable(f"`{folder.path}` cannot be removed: {error}") from error
 

@@ -22,9 +22,8 @@ from pathlib import Path
 
 from fogft import child, disk, logfile
 from fogft.cloud.local import faults, guard, processes, task_commands
-from fogft.cloud.local import folder as folders
 from fogft.cloud.local.ending import sweep_shared_memory
-from fogft.cloud.local.folder import MachineFolder, Record, State
+from fogft.cloud.local.folder import LINK, LOCK, NOTICE, MachineFolder, Record, State
 from fogft.cloud.local.relay import Relay
 from fogft.cloud.local.reservations import Reservation, reserve_domain, reserve_port
 from fogft.errors import FogftError, StateError
@@ -58,7 +57,7 @@ def main(arguments: list[str]) -> int:
         format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
         datefmt="%Y-%m-%dT%H:%M:%S",
     )
-    lock = disk.Lock(folder.path / folders.LOCK)
+    lock = disk.Lock(folder.path / LOCK)
     if not _acquire(lock):
         return 0  # it runs already
     if folder.end_at() == 0:
@@ -196,7 +195,7 @@ class Machine:
             *("--listen", f"127.0.0.1:{port.number}"),
             *("--domain-id", str(domain.number)),
             *("--workdir", str(workdir)),
-            *("--notice-file", str(folder / folders.NOTICE)),
+            *("--notice-file", str(folder / NOTICE)),
         ]
         environ = {**os.environ, "ROS_DOMAIN_ID": str(domain.number)}
         return self._spawn(task_commands.sourced(command, workdir), folder, environ)
@@ -265,7 +264,7 @@ class Machine:
     def _look_at_link(self) -> None:
         if self._relay is None:
             return
-        path = self._folder.path / folders.LINK
+        path = self._folder.path / LINK
         try:
             stat = path.stat()
             mark = (stat.st_mtime_ns, stat.st_ino)

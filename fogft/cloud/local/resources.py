@@ -34,7 +34,7 @@ _PER_CPU = re.compile(r"(\d+(?:\.\d+)?)x")
 _ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
 
 
-def offers(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
+def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
     """Return one offer for each zone that can meet the resources, the cheapest first.
 
     In each zone it is the cheapest instance that suffices. Where alternatives overlap the

@@ -13,8 +13,8 @@ import ssl
 
 from fogft.errors import CredentialError
 from fogft.link.port import Peer
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.link.zenoh.validity import judged_here, judged_there, validity_of
+from fogft.model.credentials import CredentialPaths
 
 # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
 _OUT_OF_TIME = (9, 10)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fogft.link.port import Peer
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import ReplicaId
 
 if TYPE_CHECKING:
@@ -22,15 +22,6 @@ MESSAGE_BYTES_LIMIT = 256 << 20
 _SESSIONS_LIMIT = 128  # robots, and gateways, at one replica
 _HANDSHAKES_LIMIT = 32
 _SIGN_OF_LIFE_EVERY_S = 2.0
-
-
-@dataclass(frozen=True)
-class CredentialPaths:
-    """Where a process finds its certificate, its key and the pool's CA."""
-
-    ca: Path
-    certificate: Path
-    key: Path
 
 
 @dataclass(frozen=True)

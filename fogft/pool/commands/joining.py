@@ -23,11 +23,11 @@ from typing import Any
 
 from fogft import disk, template_files
 from fogft.errors import CredentialError, FogftError
-from fogft.link.zenoh.settings import CredentialPaths
-from fogft.model import membership as memberships
 from fogft.model.certificate_holder import Holder, Role
+from fogft.model.credentials import CredentialPaths
+from fogft.model.endpoint import is_endpoint
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
-from fogft.model.membership import Found
+from fogft.model.membership import Found, to_dict
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.pool.credentials import bundle, claiming
@@ -149,7 +149,7 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
         )
         membership = store.membership()
         if membership is not None:
-            files["membership.json"] = disk.to_json(memberships.to_dict(membership))
+            files["membership.json"] = disk.to_json(to_dict(membership))
     # Last: once it stands, all else does too.
     return {**files, f"{folder}{stem}.crt": credential.certificate_pem.decode()}
 
@@ -227,7 +227,7 @@ def _rendezvous(content: dict[str, Any]) -> list[str]:
     """
     listed = content.get("rendezvous", [])
     if not isinstance(listed, list) or not all(
-        isinstance(one, str) and memberships.is_endpoint(one) for one in listed
+        isinstance(one, str) and is_endpoint(one) for one in listed
     ):
         raise CredentialError("the bundle names a rendezvous that is none")
     return listed

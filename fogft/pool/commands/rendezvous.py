@@ -20,10 +20,10 @@ from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
-from fogft.link.zenoh.settings import CredentialPaths
 from fogft.metrics.scrape import Scrape
+from fogft.model.credentials import CredentialPaths
 from fogft.model.names import POOL_UID_PATTERN
-from fogft.pool.manager import metrics as measures
+from fogft.pool.manager.metrics import of_rendezvous
 from fogft.records import cache
 from fogft.records.exchange import Exchange
 from fogft.records.record_set import RecordSet
@@ -127,7 +127,7 @@ class _Rendezvous:
             loop.add_signal_handler(number, stop.set)
         self._server.bind()
         log.info("rendezvous_listening endpoint=%s pid=%d", self._server.endpoint, os.getpid())
-        scrape = Scrape(lambda: measures.of_rendezvous(self._server.report()))
+        scrape = Scrape(lambda: of_rendezvous(self._server.report()))
         scrape.at(self._config.metrics)
         serving = loop.create_task(self._server.serve())
         try:

@@ -20,7 +20,7 @@ from pathlib import Path
 from fogft import disk, logfile
 from fogft.child import detached
 from fogft.errors import FogftError, PoolBusy, PoolNotFound, SpecError
-from fogft.model import intent as intents
+from fogft.model import intent
 from fogft.model.intent import Intent
 from fogft.model.spec import PoolSpec
 from fogft.planning import lifetime
@@ -75,7 +75,7 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
             before, old_source = store.spec(), paths.spec.read_text()
         except FogftError:  # written by a version that knew other keys
             before, old_source = spec, ""
-        after = intents.file_changed(store.intent(), before, spec)
+        after = intent.file_changed(store.intent(), before, spec)
         begun_at = lifetime.begun_at(after, identity.created_at, store.history())
         store.write_intent(lifetime.revived(before, after, begun_at, time.time()))
         if old_source != source:

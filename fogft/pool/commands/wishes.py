@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 from fogft import disk
 from fogft.errors import FogftError, PoolBusy, known_slots
-from fogft.model import intent as intents
+from fogft.model import intent
 from fogft.model.intent import Intent
-from fogft.pool.commands import status as seen
+from fogft.pool.commands.status import read
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
 
@@ -23,7 +23,7 @@ from fogft.pool.folder.store import PoolStore
 def scale(store: PoolStore, by: int) -> tuple[int, int]:
     """Want `by` more replicas (fewer when negative); return how many before and after."""
     spec = store.spec()
-    before, after = _change(store, lambda intent: intents.scale(intent, spec, by))
+    before, after = _change(store, lambda now: intent.scale(now, spec, by))
     return before.wanted(spec), after.wanted(spec)
 
 
@@ -34,13 +34,13 @@ def drain(store: PoolStore, slot: int, now: float) -> str:
         FogftError: There is none.
     """
     generation = generation_in(store.paths, slot, now)
-    _change(store, lambda intent: intents.drain(intent, slot, generation))
+    _change(store, lambda now: intent.drain(now, slot, generation))
     return f"{slot}.{generation}"
 
 
 def exclude(store: PoolStore, location: str) -> bool:
     """Keep out of a location; return whether that is new."""
-    before, after = _change(store, lambda intent: intents.exclude(intent, location))
+    before, after = _change(store, lambda now: intent.exclude(now, location))
     return before != after
 
 
@@ -50,7 +50,7 @@ def include(store: PoolStore, location: str) -> None:
     Raises:
         FogftError: It is not excluded.
     """
-    _change(store, lambda intent: intents.include(intent, location))
+    _change(store, lambda now: intent.include(now, location))
 
 
 def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
@@ -59,7 +59,7 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
     Raises:
         FogftError: There is none (the hint lists those there are).
     """
-    status = seen.read(paths, now).status
+    status = read(paths, now).status
     found = [replica.generation for replica in status.replicas if replica.slot == slot]
     if not found and any(replica.slot == slot for replica in status.by_hand):
         raise FogftError(

@@ -14,8 +14,7 @@ from fogft.model import ros_names
 from fogft.model.middleware import Speaks
 from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
-from fogft.planning.observed import services as discovery
-from fogft.planning.observed.services import Discovered
+from fogft.planning.observed.services import Discovered, grown, offered
 
 
 def read(path: Path) -> Discovered:
@@ -50,14 +49,14 @@ class Discovery:
         self.notes = []
         if spec.services:
             return False
-        told = discovery.offered(spec.replica_hash, observed.machines or (), observed.links or ())
+        told = offered(spec.replica_hash, observed.machines or (), observed.links or ())
         usable = {name: kind for name, kind in told.items() if not self._refusal(spec, name, kind)}
-        grown = discovery.grown(self._known, spec.replica_hash, usable)
-        if grown == self._known:
+        more = grown(self._known, spec.replica_hash, usable)
+        if more == self._known:
             return False
-        plain = {"spec_hash": grown.spec_hash, "services": dict(grown.services)}
+        plain = {"spec_hash": more.spec_hash, "services": dict(more.services)}
         disk.write_json(self._path, plain)
-        self._known = grown
+        self._known = more
         return True
 
     def _refusal(self, spec: PoolSpec, name: str, kind: str) -> str:

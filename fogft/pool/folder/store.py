@@ -14,9 +14,8 @@ from typing import Protocol
 
 from fogft import disk
 from fogft.errors import PoolNotFound, SpecError, StateError
-from fogft.model import intent as intents
-from fogft.model import membership as memberships
-from fogft.model.intent import Intent
+from fogft.model.intent import Intent, from_json, to_json
+from fogft.model.membership import from_dict, to_dict
 from fogft.model.names import POOL_UID_PATTERN
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
@@ -204,11 +203,11 @@ class PoolStore:
     def intent(self) -> Intent:
         """Return what the user wants besides the file; nothing where nothing was asked."""
         raw = disk.read_json(self.paths.intent)
-        return Intent() if raw is None else intents.from_json(raw)
+        return Intent() if raw is None else from_json(raw)
 
     def write_intent(self, intent: Intent) -> None:
         """Store the user's wishes; the caller holds `intent_lock`."""
-        disk.write_json(self.paths.intent, intents.to_json(intent))
+        disk.write_json(self.paths.intent, to_json(intent))
 
     def history(self) -> History:
         """Return what happened so far."""
@@ -230,13 +229,13 @@ class PoolStore:
         """Return the membership as last written; None where it is missing or damaged."""
         try:
             raw = disk.read_json(self.paths.membership)
-            return None if raw is None else memberships.from_dict(raw)
+            return None if raw is None else from_dict(raw)
         except StateError:
             return None
 
     def write_membership(self, membership: Membership) -> None:
         """Publish a membership."""
-        disk.write_json(self.paths.membership, memberships.to_dict(membership))
+        disk.write_json(self.paths.membership, to_dict(membership))
 
 
 def digest(source: bytes) -> str:

@@ -17,8 +17,7 @@ from typing import Any
 from fogft import disk, template_files
 from fogft.cloud.port import Launch
 from fogft.errors import CredentialError
-from fogft.model import certificate_holder, names
-from fogft.model import topic as topics
+from fogft.model import certificate_holder
 from fogft.model.certificate_holder import Holder, holder_of
 from fogft.model.groups import FIRST_BY_HAND, replica_hash, services_at, task_at
 from fogft.model.replica import ReplicaId
@@ -105,7 +104,7 @@ def proxy_config(
                 {
                     "revocations": paths.revocations.name,
                     "rmw": spec.rmw.robot.value,
-                    "topics": [topics.to_plain(topic) for topic in spec.topics],
+                    "topics": [topic.to_plain() for topic in spec.topics],
                 }
                 if file == "proxy.yaml"
                 else {}
@@ -161,7 +160,7 @@ def build_order(
         CredentialError: The pool's CA cannot be used.
     """
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
-    holder = holder_of(names.replica_certificate_name(id))
+    holder = holder_of(id.certificate_name)
     issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
     return Launch(
         id=id,
@@ -194,7 +193,7 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
             "slot": id.slot,
             "generation": id.generation,
             "services": [to_plain(service, REPLICA_KEYS) for service in services],
-            "topics": [topics.to_plain(topic) for topic in spec.topics],
+            "topics": [topic.to_plain() for topic in spec.topics],
             "run": str(spec.task.get("run") or ""),
             "envs": {str(k): "" if v is None else str(v) for k, v in envs.items()},
             "orphan_after_s": spec.health.orphan_after_s,

@@ -32,9 +32,9 @@ from fogft.pool.folder.lease import Lease
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import clocks, configuration, proxy_report, shutdown, status, teardown
-from fogft.pool.manager import metrics as measures
 from fogft.pool.manager.announcing import ManagerRecords
 from fogft.pool.manager.distances import Distances, Latencies
+from fogft.pool.manager.metrics import of_pool
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 from fogft.pool.manager.reconciler import Reconciler, Tick
 
@@ -90,7 +90,7 @@ class Manager:
         self._digest: object = None
         self._trouble: list[str] = []
         self._told: status.PoolStatus | None = None
-        self._scrape = Scrape(lambda: measures.of_pool(self._told))
+        self._scrape = Scrape(lambda: of_pool(self._told))
         self._metrics = metrics
         self._replicas: Sequence[status.ReplicaStatus] = ()
         self._reconciler = Reconciler(

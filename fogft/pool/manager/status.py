@@ -221,14 +221,13 @@ def _update(tick: Tick) -> UpdateStatus | None:
 
 
 def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
-    from fogft.model import topology
 
     here = tick.membership.topology if tick.membership is not None else tick.spec.topology
     if not here:
         return {}
     links = [dict(one) for one in report.gateways] if report is not None else []
     robot = report.robot if report is not None else ""
-    return {"robot": robot, **topology.to_plain(here), "links": links}
+    return {"robot": robot, **here.to_plain(), "links": links}
 
 
 def _without_certificate(tick: Tick) -> list[str]:

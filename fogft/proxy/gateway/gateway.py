@@ -22,7 +22,8 @@ from queue import SimpleQueue
 from typing import Any, Protocol
 
 from fogft.errors import RosError
-from fogft.link.port import Incoming, Refusal
+from fogft.link.port import Incoming
+from fogft.model.refusal import Refusal
 from fogft.ros.port import OnBurst, RosClient
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,8 @@ from collections.abc import Callable, Collection, Mapping
 from functools import partial
 
 from fogft.errors import RosError, Unreadable
-from fogft.link.port import Incoming, Refusal
+from fogft.link.port import Incoming
+from fogft.model.refusal import Refusal
 from fogft.model.spec import Part
 from fogft.proxy.replica.responder import OUTSTANDING
 from fogft.ros.port import RosClient

@@ -17,7 +17,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from fogft.errors import RosError, Unreadable
-from fogft.link.port import Incoming, Refusal
+from fogft.link.port import Incoming
+from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.orders import Op, OrderError
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply

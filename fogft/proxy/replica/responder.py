@@ -24,7 +24,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 
 from fogft.errors import RosError, Unreadable
-from fogft.link.port import Incoming, Refusal
+from fogft.link.port import Incoming
+from fogft.model.refusal import Refusal
 from fogft.proxy.replica.interruption import Interruptions
 from fogft.proxy.replica.service_queue import Line, Work
 from fogft.ros.port import RosClient

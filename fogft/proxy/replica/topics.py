@@ -18,11 +18,11 @@ import time
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 
-from fogft.errors import RosError, Unreadable
-from fogft.link.frame import FrameError
-from fogft.link.port import Incoming, Refusal
+from fogft.errors import FrameError, RosError, Unreadable
+from fogft.link.port import Incoming
+from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, TopicSpec
-from fogft.ros.port import Quality, RosPublisher, RosSubscription, RosTopics
+from fogft.ros.port import RosPublisher, RosSubscription, RosTopics
 from fogft.topics import frames
 from fogft.topics.queues import Ring, Seen
 
@@ -32,11 +32,6 @@ HOLD_S = 2.0
 LOOK_EVERY_S = 2.0  # whether publishers are heard
 _HELD_LIMIT = 64  # pulls of one topic; beyond it the oldest is answered with nothing
 _BATCH_BYTES = 8 << 20
-
-
-def quality(topic: TopicSpec) -> Quality:
-    """Return a topic's quality of service, the same at both ends."""
-    return Quality(topic.depth, topic.reliable, topic.latched)
 
 
 class _Pull:
@@ -151,11 +146,11 @@ class TopicsOnReplica:
         for name, topic in self._topics.items():
             try:
                 if topic.origin is Origin.ROBOT:
-                    self._publishers[name] = node.publisher(topic.name, topic.type, quality(topic))
+                    self._publishers[name] = node.publisher(topic.name, topic.type, topic.quality)
                 else:
                     heard = self._outgoing[name].heard
                     self._subscriptions[name] = node.subscribe(
-                        topic.name, topic.type, quality(topic), heard
+                        topic.name, topic.type, topic.quality, heard
                     )
             except RosError as error:
                 self._note(name, error.message)

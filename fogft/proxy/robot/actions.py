@@ -17,8 +17,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from fogft.link.port import Answer, Link, Refusal
+from fogft.link.port import Answer, Link
 from fogft.model.names import REQUEST_ID_BYTES
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.action_cancel import CancelDispatcher

@@ -230,7 +230,7 @@ class ClientProxy:
     def _redial(self, id: ReplicaId) -> None:
         member = self._members[id]
         old = self._links.get(id)
-        peer = Peer(id, member.endpoint, names.member_certificate_name(member))
+        peer = Peer(id, member.endpoint, member.certificate_name)
         keys = {
             s.spec.name: names.service_key(self._pool_uid, id.slot, s.spec.name, s.spec.type)
             for s in self._services.values()
@@ -451,7 +451,7 @@ def _good_members(membership: Membership) -> dict[ReplicaId, Member]:
     return {
         member.id: member
         for member in membership.members
-        if names.member_certificate_name(member) not in membership.revoked
+        if member.certificate_name not in membership.revoked
     }
 
 

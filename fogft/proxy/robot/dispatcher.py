@@ -22,11 +22,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.link.port import Answer, Link, Refusal
+from fogft.link.port import Answer, Link
 from fogft.log_limits import worth_logging
 from fogft.metrics.outcomes import Outcomes
 from fogft.model.choices import Freshness
 from fogft.model.names import REQUEST_ID_BYTES
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import HedgingMode, OnTimeout, ServiceSpec
 from fogft.proxy.robot.fallback_caller import Rescuer, Shared, note_end

@@ -18,8 +18,8 @@ from typing import Any
 
 from fogft import disk
 from fogft.link.dial_out.robot import DialIn
-from fogft.model import membership as memberships
 from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.membership import from_dict, is_newer
 from fogft.model.replica import Member, Membership
 from fogft.proxy.config import ClientProxyConfig
 from fogft.proxy.process import Watched
@@ -136,10 +136,8 @@ class Following:
     def _read(self) -> None:
         raw = disk.read_json(self._config.membership)
         if raw is not None:
-            read = memberships.from_dict(raw)
-            if read.pool_uid == self._config.pool_uid and memberships.is_newer(
-                read, self._from_file
-            ):
+            read = from_dict(raw)
+            if read.pool_uid == self._config.pool_uid and is_newer(read, self._from_file):
                 self._from_file = read
 
     def _reached(self, membership: Membership) -> tuple[Member, ...]:
@@ -182,6 +180,6 @@ def _latest(from_file: Membership | None, known: Known) -> Membership | None:
     latest = from_file
     for record in known.of(RecordKind.ADMISSION):
         admitted = roster.admission(record)
-        if memberships.is_newer(admitted, latest):
+        if is_newer(admitted, latest):
             latest = admitted
     return latest

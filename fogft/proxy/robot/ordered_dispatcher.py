@@ -18,13 +18,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.link.port import Answer, Link, Refusal
+from fogft.link.port import Answer, Link
 from fogft.log_limits import worth_logging
 from fogft.metrics.outcomes import Outcomes
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
-from fogft.ordering import orders as ordering
-from fogft.ordering.orders import Op, OrderError, OrderId
+from fogft.ordering.orders import Op, OrderError, OrderId, decode, encode
 from fogft.ordering.peer import Order
 from fogft.proxy.order_mark import MarkFile
 from fogft.proxy.robot.dispatcher import key_of
@@ -148,7 +148,7 @@ class OrderedDispatcher:
 
     def _offer(self, order: Order, epoch: int, links: dict[int, Link]) -> None:
         link = links.get(order.replica)
-        id = ordering.encode(order.op, epoch, order.index)
+        id = encode(order.op, epoch, order.index)
         limit_s = max(_ATTEMPT_S, 4 * self.spec.timeout_s)
         if link is not None and link.offer(self.spec.name, id, order.payload, limit_s):
             if order.op in _COPIES:
@@ -162,7 +162,7 @@ class OrderedDispatcher:
     def answered(self, link: Link, answer: Answer) -> None:
         """Take the end of an order from a link's thread."""
         try:
-            id = ordering.decode(answer.request_id)
+            id = decode(answer.request_id)
         except OrderError:  # of the time before this service was stateful
             return
         with self._lock:

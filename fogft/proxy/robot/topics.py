@@ -14,13 +14,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
-from fogft.errors import RosError
-from fogft.link.frame import FrameError
-from fogft.link.port import Answer, Link, Refusal
+from fogft.errors import FrameError, RosError
+from fogft.link.port import Answer, Link
 from fogft.model import names
 from fogft.model.names import REQUEST_ID_BYTES
+from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, Select, TopicSpec
-from fogft.proxy.replica.topics import LOOK_EVERY_S, quality
+from fogft.proxy.replica.topics import LOOK_EVERY_S
 from fogft.ros.port import RosPublisher, RosSubscription, RosTopics
 from fogft.topics import frames
 from fogft.topics.queues import Numbered, Outbox
@@ -79,9 +79,9 @@ class RobotTopic:
         """Publish or subscribe here. Raises RosError."""
         topic = self.topic
         if topic.origin is Origin.ROBOT:
-            self._subscription = node.subscribe(topic.name, topic.type, quality(topic), self.heard)
+            self._subscription = node.subscribe(topic.name, topic.type, topic.quality, self.heard)
         else:
-            self._publisher = node.publisher(topic.name, topic.type, quality(topic))
+            self._publisher = node.publisher(topic.name, topic.type, topic.quality)
 
     def close(self) -> None:
         """Leave ROS."""

@@ -14,7 +14,8 @@ from collections.abc import Iterable
 from typing import Any, Protocol
 
 from fogft.errors import RosError
-from fogft.link.port import Answer, Link, Refusal
+from fogft.link.port import Answer, Link
+from fogft.model.refusal import Refusal
 from fogft.proxy.robot.dispatcher import Dispatcher, key_of
 from fogft.requests.first_response import Pending
 from fogft.requests.votes import Ballot, Votes

@@ -13,7 +13,7 @@ import pytest
 
 from fogft.link.dial_out.replica import DialOut
 from fogft.link.dial_out.robot import DialIn
-from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import ReplicaId
 from fogft.records.signing import Signer, Verifier
 from tests.link.namespaces import inside

@@ -13,8 +13,7 @@ import pytest
 
 from fogft.link.dial_out.replica import WAITING, DialOut
 from fogft.link.dial_out.robot import PURPOSE, DialIn
-from fogft.link.zenoh.settings import CredentialPaths
-from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.records import frames
 from fogft.records.signing import Signer, Verifier
@@ -140,7 +139,7 @@ def test_nobody_but_a_replica_of_the_pool_comes_in(authority, door, tmp_path):
 
 
 def test_a_revoked_replica_does_not_come_in(authority):
-    name = names.replica_certificate_name(ID)
+    name = ID.certificate_name
     files = authority.replica()
     door = DialIn("127.0.0.1:0", POOL_UID, Verifier(files.ca), revoked=lambda: {name})
     with hostile.greet(door.endpoint, files) as link:

@@ -19,7 +19,8 @@ from pathlib import Path
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.listener import ZenohListener
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import ReplicaId
 from tests.link.wire_pool import POOL_UID, SERVICE, keys
 

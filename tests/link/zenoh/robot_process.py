@@ -13,7 +13,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from fogft.link.zenoh.robot.dialer import ZenohDialer
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.credentials import CredentialPaths
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,

@@ -13,11 +13,11 @@ import pytest
 import zenoh
 
 from fogft.link import frame
-from fogft.link.port import Refusal
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState
 from tests.link.wire_pool import (
     POOL_UID,

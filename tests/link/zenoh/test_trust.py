@@ -11,8 +11,9 @@ import zenoh
 
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState
 from fogft.pool.credentials import authority as credentials
 from fogft.pool.credentials.authority import Role
@@ -93,7 +94,7 @@ def test_a_robots_certificate_cannot_answer(
     dial: Callable[..., ZenohLink],
 ) -> None:
     """Not even one that bears a replica's name."""
-    files = authority.issue(names.replica_certificate_name(peer("").id), Role.ROBOT)
+    files = authority.issue(peer("").id.certificate_name, Role.ROBOT)
     replica = start_replica(files=files)
     _refused(dial(replica.endpoint), "certificate is refused")
     assert _heard_nothing(replica)
@@ -128,7 +129,7 @@ def test_a_replica_out_of_its_time_is_refused(
     """The words tell which of both it is: the robot's clock may be the one that is wrong."""
     day = datetime.timedelta(days=1)
     monkeypatch.setattr(credentials, "BACKDATE", -begin * day)
-    name = names.replica_certificate_name(peer("").id)
+    name = peer("").id.certificate_name
     replica = start_replica(files=authority.issue(name, Role.REPLICA, days=end))
     link = dial(replica.endpoint)
     _refused(link, words)

@@ -18,7 +18,7 @@ from fogft.pool.credentials import authority as credentials
 from fogft.pool.credentials.authority import Role
 
 UID = "0123456789abcdef"
-REPLICA = names.replica_certificate_name(ReplicaId(UID, 3, 7))
+REPLICA = ReplicaId(UID, 3, 7).certificate_name
 ROBOT = names.robot_certificate_name(UID, "ada")
 HOUR = datetime.timedelta(hours=1)
 

@@ -42,7 +42,7 @@ def id_of(slot: int, generation: int = 1) -> ReplicaId:
 def test_every_name_of_a_replica_gives_its_id_back(slot: int, generation: int) -> None:
     """Certificates, clusters, folders, memberships; none is cut short or longer than allowed."""
     id = id_of(slot, generation)
-    common_name = names.replica_certificate_name(id)
+    common_name = id.certificate_name
     assert len(common_name) <= 64
     holder = holder_of(common_name)
     assert (holder.role, int(holder.name), holder.generation) == (Role.REPLICA, slot, generation)
@@ -77,7 +77,7 @@ def test_a_groups_machines_are_not_taken_for_replicas_by_hand(tmp_path: Path) ->
     authority.create_authority(tmp_path / "ca", UID)
     ledger = Ledger(tmp_path / "ca")
     for slot in SOME:
-        ledger.issue(holder_of(names.replica_certificate_name(id_of(slot))), days=30)
+        ledger.issue(holder_of(id_of(slot).certificate_name), days=30)
     assert ledger.by_hand() == {id_of(slot) for slot in SOME if slot >= FIRST_BY_HAND}
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import RosError, Unreadable
-from fogft.link.port import Answer, Refusal
+from fogft.link.port import Answer
+from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.poolfile.state import StateService, StateSpec
 from fogft.proxy.order_mark import MarkFile

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 
-from fogft.link.port import Answer, Link, LinkStatus, Peer, Refusal
+from fogft.link.port import Answer, Link, LinkStatus, Peer
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher

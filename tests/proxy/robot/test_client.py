@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import RosError
-from fogft.link.port import ProbeAnswer, Refusal
+from fogft.link.port import ProbeAnswer
+from fogft.model.refusal import Refusal
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.spec import Part, ServiceSpec
 from fogft.model.type_definition import Definition

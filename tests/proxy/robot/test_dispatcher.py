@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import RosError
-from fogft.link.port import Refusal
+from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
 from tests.proxy.fakes import Clock, FakeLink

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.link.port import Behind, LinkStatus, ProbeAnswer, Refusal
+from fogft.link.port import Behind, LinkStatus, ProbeAnswer
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.proxy.gateway.gateway import UNREADY_S, Forwarder

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.link.port import Refusal
 from fogft.metrics.outcomes import Outcomes
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 
 REPLICA = ReplicaId("0123456789abcdef", 0, 1)

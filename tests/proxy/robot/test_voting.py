@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fogft.errors import RosError
-from fogft.link.port import Refusal
+from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.dispatcher import key_of
 from fogft.proxy.robot.voting import VotingDispatcher

@@ -15,15 +15,17 @@ from functools import partial
 
 import zenoh
 
+from fogft.errors import FrameError
 from fogft.link import frame, probe_frames
 from fogft.link.compression import ACCEPTED
 from fogft.link.counters import Counters
-from fogft.link.port import Probe, ProbeAnswer, Refusal
+from fogft.link.port import Probe, ProbeAnswer
 from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Streams
 from fogft.link.zenoh.replica.sessions import Guests, NotAdmittedError
 from fogft.link.zenoh.work_queue import Chores
+from fogft.model.refusal import Refusal
 from fogft.records import frames
 from fogft.records.record import RecordError, SignedRecord
 from fogft.records.record_set import RecordSet, Verdict
@@ -68,7 +70,7 @@ class Asides:
         """A connection that was let in asks for its answers to come."""
         try:
             greeting = _greeting(query)
-        except frame.FrameError as error:
+        except FrameError as error:
             self._malformed(error, query, turn)
             return
         if not self._guests.admits(greeting.token):
@@ -87,7 +89,7 @@ class Asides:
         try:
             probe = probe_frames.decode_probe(_content(query))
             greeting = _greeting(query)
-        except frame.FrameError as error:
+        except FrameError as error:
             self._malformed(error, query, turn)
             return
         answer = partial(self._answer_probe, on_probe, probe, greeting, query, turn)
@@ -99,7 +101,7 @@ class Asides:
         try:
             greeting = _greeting(query)
             offered = frames.unpack(_content(query))
-        except (frame.FrameError, RecordError) as error:
+        except (FrameError, RecordError) as error:
             self._malformed(error, query, turn)
             return
         self.later(partial(self._take_records, greeting, offered, query, turn), query, turn)

@@ -23,12 +23,11 @@ from typing import TypeVar
 import zenoh
 from zenoh import handlers
 
-from fogft.errors import WireError
+from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
 from fogft.link.compression import unpack
 from fogft.link.counters import Counters
-from fogft.link.port import Incoming, Probe, ProbeAnswer, Refusal
-from fogft.link.zenoh import settings as config
+from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import sockets, threads
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.join_at_exit import see_off
@@ -40,10 +39,12 @@ from fogft.link.zenoh.replica.replies import Reply
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import Guests
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
 from fogft.link.zenoh.work_queue import Chores
 from fogft.model import names
+from fogft.model.credentials import CredentialPaths
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import LazyVerifier
@@ -85,10 +86,10 @@ class ZenohListener:
         self._doorkeeper: Doorkeeper | None = None
         self._id = id
         self._settings = settings or LinkSettings()
-        self._config = config.replica_settings(self._endpoint, id, credentials, self._settings)
+        self._config = replica_settings(self._endpoint, id, credentials, self._settings)
         self._guests = Guests(
             id.pool_uid,
-            certificate_name or names.replica_certificate_name(id),
+            certificate_name or id.certificate_name,
             LazyVerifier(credentials.ca),
         )
         self._counters = Counters()
@@ -130,7 +131,7 @@ class ZenohListener:
             WireError: The port is taken, or the credentials cannot be used.
         """
         try:
-            session = self._session = zenoh.open(config.to_zenoh(self._config))
+            session = self._session = zenoh.open(to_zenoh(self._config))
         except zenoh.ZError as error:
             raise WireError(
                 f"cannot listen at `{self._endpoint}`: {str(error).split(' at /')[0]}",
@@ -216,7 +217,7 @@ class ZenohListener:
                 requests = batch_frames.decode_requests(head, sample.payload.to_bytes())
             else:
                 requests = [(frame.decode_request(head), sample.payload.to_bytes())]
-        except frame.FrameError as error:
+        except FrameError as error:
             self._malformed(error)
             return
         self._take_requests(on_request, str(sample.key_expr), requests)
@@ -283,7 +284,7 @@ class ZenohListener:
         self._counters.add("cancellations")
         try:
             ids = frame.decode_cancel(sample.payload.to_bytes())
-        except frame.FrameError as error:
+        except FrameError as error:
             self._malformed(error)
             return
         self._chores.offer(partial(on_cancel, ids))

@@ -19,10 +19,10 @@ from queue import Empty, SimpleQueue
 
 from fogft.link import batch_frames
 from fogft.link.counters import Counters
-from fogft.link.port import Refusal
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
 from fogft.link.zenoh.replica.replies import Reply, send_together
+from fogft.model.refusal import Refusal
 
 log = logging.getLogger(__name__)
 

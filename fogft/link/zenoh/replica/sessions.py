@@ -16,8 +16,8 @@ from collections.abc import Collection
 
 from fogft.link import frame
 from fogft.link.frame import Greeting
-from fogft.link.port import Refusal
 from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.refusal import Refusal
 from fogft.records.record import RecordError, Verify
 
 HOLDERS_LIMIT = 256
@@ -29,7 +29,7 @@ class NotAdmittedError(Exception):
     """Somebody is not let in.
 
     Args:
-        refusal: One of `port.Refusal`, as it travels.
+        refusal: One of `model.refusal`, as it travels.
         detail: The reason for people.
     """
 

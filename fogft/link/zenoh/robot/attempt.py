@@ -10,9 +10,11 @@ from collections.abc import Sequence
 
 import zenoh
 
+from fogft.errors import FrameError
 from fogft.link import batch_frames, frame
 from fogft.link.compression import unpack
-from fogft.link.port import Answer, Refusal
+from fogft.link.port import Answer
+from fogft.model.refusal import Refusal
 
 
 class OpenAttempt:
@@ -51,7 +53,7 @@ def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:
         return stamp, (Answer(id, None, refusal),)
     attachment = ok.attachment
     if attachment is None:
-        raise frame.FrameError("an answer without a header")
+        raise FrameError("an answer without a header")
     header, payload = attachment.to_bytes(), ok.payload.to_bytes()
     if batch_frames.is_batch(header):
         return batch_frames.decode_answers(header, payload)

@@ -21,7 +21,7 @@ from fogft.link.compression import Compression
 from fogft.link.credit import Credit
 from fogft.link.deadline_filter import InTime
 from fogft.link.large_send_gate import LARGE_BYTES, Turns
-from fogft.link.port import Answer, Refusal
+from fogft.link.port import Answer
 from fogft.link.send_options import Ways
 from fogft.link.window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.link.zenoh.flow_watch import FlowWatch
@@ -30,6 +30,7 @@ from fogft.link.zenoh.robot.attempt import OpenAttempt
 from fogft.link.zenoh.robot.batch_buffer import Held
 from fogft.link.zenoh.robot.send_queue import SendQueue
 from fogft.link.zenoh.robot.unanswered import Unanswered
+from fogft.model.refusal import Refusal
 
 # Attempts that wait for the sender, forgotten ones included: those have freed their room in the
 # window, so without a bound of its own the queue of a sender that is stuck would grow.

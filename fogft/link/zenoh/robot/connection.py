@@ -24,11 +24,11 @@ from typing import Any
 import zenoh
 from zenoh import handlers
 
-from fogft.errors import WireError
+from fogft.errors import FrameError, WireError
 from fogft.link import frame
 from fogft.link.cancellations import Recalls
 from fogft.link.large_send_gate import Turns
-from fogft.link.port import Answer, Peer, Refusal
+from fogft.link.port import Answer, Peer
 from fogft.link.send_options import PLAIN_WAYS, Ways
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
@@ -38,6 +38,7 @@ from fogft.link.zenoh.robot.attempt import read_reply
 from fogft.link.zenoh.robot.attempts import Attempts
 from fogft.link.zenoh.sockets import address
 from fogft.model import names
+from fogft.model.refusal import Refusal
 from fogft.records.record import Sign
 
 log = logging.getLogger(__name__)
@@ -218,7 +219,7 @@ class Connection:
         threads.note()
         try:
             stamp, answers = read_reply(reply)
-        except frame.FrameError as error:
+        except FrameError as error:
             self.lose(f"its answers cannot be read: {error}")
             return
         self.attempts.heard(stamp, answers)
@@ -275,7 +276,7 @@ class Connection:
     def _probe_refused(self, content: bytes) -> None:
         try:
             _, _, reason = frame.decode_refusal(content)
-        except frame.FrameError:
+        except FrameError:
             return  # Zenoh's own: it timed out, and the keeper counts the silence
         words = _REFUSED.get(reason, f"the replica refuses our probes: {reason}")
         self.lose(words)

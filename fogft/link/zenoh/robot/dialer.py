@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 from fogft.errors import CredentialError, WireError
-from fogft.link.large_send_gate import Turns
 from fogft.link.port import LinkEvents, Peer
-from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.link.send_options import Ways
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.robot.shared import Shared
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
 from fogft.records.record import SignedRecord
-from fogft.records.signing import Signer
 
 _CLOSE_WAIT_S = 3.0
 
@@ -48,23 +48,21 @@ class ZenohDialer:
         settings: LinkSettings | None = None,
         tell_losers: bool = True,
     ) -> None:
-        self.tell_losers = tell_losers
-        self.credentials = credentials
-        self.robot = robot
-        self.suspect_after_s = suspect_after_s
-        self.manager_age = manager_age
-        self.settings = settings or LinkSettings()
-        self.turns = Turns()
-        self.ways = PLAIN_WAYS
-        self._signer: Signer | None = None
-        self.records = b""
+        self._shared = Shared(
+            credentials,
+            robot,
+            suspect_after_s,
+            manager_age,
+            settings or LinkSettings(),
+            tell_losers,
+        )
         self._pool_uid = pool_uid
         self._lock = threading.Lock()
         self._links: list[ZenohLink] = []
 
     def adopt(self, ways: Ways) -> None:
         """Set what services want of their links, from the next connection on."""
-        self.ways = ways
+        self._shared.ways = ways
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
         """Start a link; return at once, in state CONNECTING.
@@ -74,23 +72,10 @@ class ZenohDialer:
         """
         if peer.id.pool_uid != self._pool_uid:
             raise WireError(f"replica `{peer.id}` belongs to another pool than this robot")
-        link = ZenohLink(self, peer, services, events)
+        link = ZenohLink(self._shared, peer, services, events, self._closed)
         with self._lock:
             self._links.append(link)
         return link
-
-    def sign(self, message: bytes) -> tuple[bytes, bytes]:
-        """Sign with the robot's key; return its certificate and the signature (DER).
-
-        Raises:
-            CredentialError: They cannot be used.
-        """
-        return self._own_signer()(message)
-
-    def _own_signer(self) -> Signer:
-        if self._signer is None:
-            self._signer = Signer(self.credentials.certificate, self.credentials.key)
-        return self._signer
 
     def renew(self) -> None:
         """Take the credentials that now stand in their files into use, link by link."""
@@ -101,19 +86,19 @@ class ZenohDialer:
 
     def tell(self, records: Sequence[SignedRecord]) -> None:
         """Tell every replica these records, with the next probe of each link."""
-        self.records = frames.pack(records) if records else b""
+        self._shared.records = frames.pack(records) if records else b""
 
     def certificate(self) -> str:
         """Return the common name of the certificate that every open link uses, or nothing."""
         with self._lock:
             used = {link.certificate for link in self._links} - {b""}
         try:
-            signer = self._own_signer()
+            signer = self._shared.signer
         except CredentialError:
             return ""
         return signer.common_name if used <= {signer.certificate} else ""
 
-    def closed(self, link: ZenohLink) -> None:
+    def _closed(self, link: ZenohLink) -> None:
         """Forget a link that was closed."""
         with self._lock:
             if link in self._links:

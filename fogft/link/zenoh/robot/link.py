@@ -13,8 +13,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
 
 import zenoh
 
@@ -27,11 +26,9 @@ from fogft.link.zenoh.join_at_exit import see_off
 from fogft.link.zenoh.robot.connection import Connection
 from fogft.link.zenoh.robot.opening import Opening
 from fogft.link.zenoh.robot.probing import Probing
+from fogft.link.zenoh.robot.shared import Shared
 from fogft.model import names
 from fogft.model.replica import LinkState
-
-if TYPE_CHECKING:
-    from fogft.link.zenoh.robot.dialer import ZenohDialer
 
 log = logging.getLogger(__name__)
 
@@ -47,15 +44,21 @@ class ZenohLink:
     """A link to one replica; see `port.Link`. Made by `ZenohDialer`."""
 
     def __init__(
-        self, dialer: ZenohDialer, peer: Peer, services: Mapping[str, str], events: LinkEvents
+        self,
+        shared: Shared,
+        peer: Peer,
+        services: Mapping[str, str],
+        events: LinkEvents,
+        on_close: Callable[[ZenohLink], None],
     ) -> None:
-        self._dialer = dialer
+        self._shared = shared
+        self._on_close = on_close
         self._peer = peer
         self._services = dict(services)
         self._events = events
-        self._suspect_after_s = dialer.suspect_after_s
-        self._probe_every_s = min(_PROBE_EVERY_S, dialer.suspect_after_s / 2)
-        self._config = settings.robot_settings(peer, dialer.credentials, dialer.settings)
+        self._suspect_after_s = shared.suspect_after_s
+        self._probe_every_s = min(_PROBE_EVERY_S, shared.suspect_after_s / 2)
+        self._config = settings.robot_settings(peer, shared.credentials, shared.settings)
         self._wake = threading.Event()
         self._woke_at = 0.0
         self._closed = False
@@ -65,7 +68,7 @@ class ZenohLink:
         self._state = LinkState.CONNECTING
         self._ready: frozenset[str] = frozenset()
         self._detail = "not reached yet"
-        self._opening = Opening(peer, dialer.settings)
+        self._opening = Opening(peer, shared.settings)
         self._opened = 0
         self._renew = threading.Event()
         self._renew_at: float | None = None
@@ -167,7 +170,7 @@ class ZenohLink:
         self._ready = frozenset()
         if live is not None:
             live.close()
-        self._dialer.closed(self)
+        self._on_close(self)
 
     def renew(self) -> None:
         """Take new credentials into use: open a connection beside this one, then close this one.
@@ -252,12 +255,12 @@ class ZenohLink:
                     {**self._config, **settings.open_within(self._opening.timeout_s)}
                 ),
                 self._peer,
-                self._dialer.robot,
+                self._shared.robot,
                 self._services,
-                sign=self._dialer.sign,
-                ways=self._dialer.ways,
-                turns=self._dialer.turns,
-                recalls=Recalls() if self._dialer.tell_losers else None,
+                sign=self._shared.sign,
+                ways=self._shared.ways,
+                turns=self._shared.turns,
+                recalls=Recalls() if self._shared.tell_losers else None,
                 answered=self._answered,
                 late=self._late,
                 lost=self._wake.set,
@@ -270,7 +273,7 @@ class ZenohLink:
         except zenoh.ZError as error:
             if not self._closed:
                 now = time.monotonic()
-                why = self._opening.failed(now - began, now, self._dialer.credentials)
+                why = self._opening.failed(now - began, now, self._shared.credentials)
                 self._say(why or self._detail or str(error))
             return None
         self._opened += 1
@@ -318,7 +321,7 @@ class ZenohLink:
         """See whether what is large moves: then nobody is silent. False where it stands still."""
         moved_s = connection.look(now)
         self._probing.excuse(moved_s, now)
-        longest_s, shortest_s = self._suspect_after_s, self._dialer.settings.stall_after_s
+        longest_s, shortest_s = self._suspect_after_s, self._shared.settings.stall_after_s
         if connection.flow.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
             connection.lost_because = "it takes nothing more of what is sent"
         return not connection.lost_because
@@ -345,7 +348,7 @@ class ZenohLink:
 
     def _tell_records(self, connection: Connection) -> None:
         """Send what the replica has not taken yet; with each probe until it has."""
-        records = self._dialer.records
+        records = self._shared.records
         if records == connection.told:
             return
         id = self._peer.id
@@ -364,7 +367,7 @@ class ZenohLink:
         known = self._probing.answer
         # Its types are asked for once a connection: it may be another process at each.
         describe = self._live is not connection or known is None or not known.types
-        probe = Probe(self._dialer.robot, self._dialer.manager_age(), describe)
+        probe = Probe(self._shared.robot, self._shared.manager_age(), describe)
         try:
             self._probing.ask(connection, probe, now)
         except zenoh.ZError as error:

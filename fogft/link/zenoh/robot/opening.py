@@ -10,7 +10,8 @@ import socket
 
 from fogft.link.port import Peer
 from fogft.link.zenoh import diagnosis
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.credentials import CredentialPaths
 
 _EXPLAIN_EVERY_S = 5.0
 _EXPLAIN_TIMEOUT_S = 0.5

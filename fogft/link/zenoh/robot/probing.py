@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
-from fogft.errors import WireError
+from fogft.errors import FrameError, WireError
 from fogft.link import probe_frames
-from fogft.link.frame import FrameError
 from fogft.link.port import Peer, Probe, ProbeAnswer
 from fogft.link.silence import Silence
 from fogft.model import names

@@ -7,13 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link.frame import Greeting, greeted_bytes
-from fogft.link.port import Refusal
 from fogft.link.zenoh.replica.sessions import HOLDERS_LIMIT, TOKENS_LIMIT, Guests, NotAdmittedError
 from fogft.model import names
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from tests.records.record_worlds import UID, signer, verify
 
-SELF = names.replica_certificate_name(ReplicaId(UID, 0, 1))
+SELF = ReplicaId(UID, 0, 1).certificate_name
 ADA = names.robot_certificate_name(UID, "ada")
 EVE = names.robot_certificate_name(UID, "eve")
 
@@ -54,14 +54,14 @@ def test_a_gateway_may_ask_too(guests: Guests) -> None:
 @pytest.mark.parametrize(
     "said",
     [
-        greeting(1, names.replica_certificate_name(ReplicaId(UID, 1, 1)), "replica"),
+        greeting(1, ReplicaId(UID, 1, 1).certificate_name, "replica"),
         greeting(1, names.manager_certificate_name(UID), "manager"),
         greeting(1, names.rendezvous_certificate_name(UID, "a"), "rendezvous"),
         greeting(1, ADA, "replica"),
-        greeting(1, names.replica_certificate_name(ReplicaId(UID, 1, 1)), "robot"),
+        greeting(1, ReplicaId(UID, 1, 1).certificate_name, "robot"),
         greeting(1, names.robot_certificate_name("f" * 16, "ada")),
         greeting(1, "ada"),
-        greeting(1, to=names.replica_certificate_name(ReplicaId(UID, 1, 1))),
+        greeting(1, to=ReplicaId(UID, 1, 1).certificate_name),
         Greeting(token(1), greeting(2).certificate, greeting(2).signature),
         Greeting(token(1), b"junk", b"junk"),
     ],

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from fogft.link import batch_frames, frame
 from fogft.link.cancellations import Recalls
 from fogft.link.large_send_gate import LARGE_BYTES, Turns
-from fogft.link.port import Answer, Refusal
+from fogft.link.port import Answer
 from fogft.link.send_options import PLAIN_WAYS
 from fogft.link.zenoh.robot.attempts import Attempts
+from fogft.model.refusal import Refusal
 from tests.link.wire_pool import request_id
 
 SERVICE = "/s"

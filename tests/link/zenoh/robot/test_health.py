@@ -161,7 +161,7 @@ def test_every_accepted_offer_is_answered_exactly_once(
 LEAVING = """
 import sys
 from pathlib import Path
-from fogft.link.zenoh.settings import CredentialPaths
+from fogft.model.credentials import CredentialPaths
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from tests.link.wire_pool import POOL_UID, SERVICE, Owner, keys, peer, request_id, wait_for
 

@@ -9,7 +9,8 @@ import pytest
 
 from fogft.link.zenoh import diagnosis
 from fogft.link.zenoh.robot.opening import Opening
-from fogft.link.zenoh.settings import CredentialPaths, LinkSettings
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.credentials import CredentialPaths
 from tests.link.wire_pool import peer
 
 SETTINGS = LinkSettings(open_timeout_s=1.0, long_open_timeout_s=4.0)

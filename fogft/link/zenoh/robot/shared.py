@@ -1,0 +1,54 @@
+"""What all links of one robot share: its credentials, Zenoh's times, what replicas are told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from fogft.link.large_send_gate import Turns
+from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.credentials import CredentialPaths
+from fogft.records.signing import Signer
+
+
+@dataclass
+class Shared:
+    """What all links of one robot share. Written by the dialer, read by its links.
+
+    Attributes:
+        robot: The robot's name.
+        suspect_after_s: Probes unanswered for so long make a link suspect.
+        manager_age: Seconds since the pool's manager gave a sign, None if never.
+        settings: Zenoh's times.
+        tell_losers: Whether replicas are told which requests are no longer wanted.
+        ways: How each service is sent.
+        turns: Lets one large message go at a time.
+        records: Signed records for every replica, packed; empty for none.
+    """
+
+    credentials: CredentialPaths
+    robot: str
+    suspect_after_s: float
+    manager_age: Callable[[], float | None]
+    settings: LinkSettings
+    tell_losers: bool
+    ways: Ways = PLAIN_WAYS
+    turns: Turns = field(default_factory=Turns)
+    records: bytes = b""
+    _signer: Signer | None = None
+
+    @property
+    def signer(self) -> Signer:
+        """The robot's key, read once. Raises CredentialError where it cannot be used."""
+        if self._signer is None:
+            self._signer = Signer(self.credentials.certificate, self.credentials.key)
+        return self._signer
+
+    def sign(self, message: bytes) -> tuple[bytes, bytes]:
+        """Sign with the robot's key; return its certificate and the signature (DER).
+
+        Raises:
+            CredentialError: They cannot be used.
+        """
+        return self.signer(message)
