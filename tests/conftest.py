@@ -17,11 +17,17 @@ from tests import own_process
 from tests.dealing import dealt
 from tests.link.namespaces import Namespaces
 from tests.needs import must_run, need, not_run
+from tests.nightly import NIGHTLY, by_day
 from tests.rmw_zenoh.rmw_router import Router, running
 
 # No test asserts wall-clock time; Hypothesis would, by default.
 # In CI the same examples each time: a new one is found by a person, who can look at it.
-hypothesis.settings.register_profile("fogft", deadline=None, derandomize=bool(os.environ.get("CI")))
+hypothesis.settings.register_profile(
+    "fogft",
+    deadline=None,
+    max_examples=by_day(40, at_night=1000),
+    derandomize=bool(os.environ.get("CI")) and not NIGHTLY,
+)
 hypothesis.settings.load_profile("fogft")
 
 # Set before any test imports rclpy; child processes inherit it.

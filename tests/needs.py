@@ -21,6 +21,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.link.namespaces import can_make_namespaces
+from tests.nightly import NIGHTLY
 
 WEIGHTS = Path(__file__).parents[1] / "templates" / "detect" / "weights"
 SKYPILOT_QUEUE_PORT = 50011  # of every API server: it cannot be chosen
@@ -65,6 +66,7 @@ NEEDS = {
     "moto": Need(_installed("moto", "boto3", "flask"), "scripts/test-sky --quick"),
     "mujoco": Need(_installed("mujoco"), "scripts/setup vision"),
     "namespaces": Need(can_make_namespaces, "root and `ip`, for network namespaces"),
+    "night": Need(lambda: NIGHTLY, "the time that .ci/nightly takes"),
     "not-root": Need(lambda: os.geteuid() != 0, "a user whom file permissions bind"),
     "numpy": Need(_installed("numpy"), "scripts/setup demo"),
     "ompl": Need(_installed("ompl"), "scripts/setup demo"),

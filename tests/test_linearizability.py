@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.linearizability import Call, counter, key_value, linearizable
+from tests.nightly import by_day
 
 ADD = ("add", 1)
 GET = ("get", 0)
@@ -102,7 +103,7 @@ def _explains(order):
     return True
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(by_day(8, at_night=200)))
 def test_a_real_lock_is_linearizable_and_one_changed_answer_is_not(seed):
     """A long history of a serial service passes; with one answer off by one it does not."""
     source = random.Random(seed)

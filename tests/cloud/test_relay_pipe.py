@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fogft.cloud.local.relay_pipe import MAX_HELD_BYTES, Pipe, Shaper
+from tests.nightly import by_day
 
 
 def test_a_chunk_takes_its_size_over_the_rate_after_those_before_it_and_then_the_delay():
@@ -45,7 +46,7 @@ steps = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=by_day(40, at_night=1000))
 @given(steps)
 def test_whatever_the_path_does_every_byte_arrives_once_and_in_order(script):
     """Delays and rates change at any time; the bytes do not."""

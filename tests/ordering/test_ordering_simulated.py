@@ -9,6 +9,7 @@ import pytest
 from fogft.ordering import lag
 from fogft.ordering.catching_up import WINDOW
 from tests.linearizability import Call, counter, key_value, linearizable
+from tests.nightly import by_day
 from tests.ordering.ordering_world import World
 from tests.ordering.service_world import ask_counter, ask_key_value
 
@@ -56,7 +57,7 @@ def fault(world: World, source: random.Random) -> None:
 
 
 @pytest.mark.usefixtures("limits")
-@pytest.mark.parametrize("seed", [*range(40), 20223])
+@pytest.mark.parametrize("seed", [*range(by_day(10, at_night=400)), 20223])
 @pytest.mark.parametrize(
     ("questions", "step", "start"),
     [(ask_counter, counter, 0), (ask_key_value, key_value, ())],
@@ -72,7 +73,7 @@ def test_histories_are_linearizable_under_faults(seed, questions, step, start):
 
 
 @pytest.mark.usefixtures("limits")
-@pytest.mark.parametrize("seed", [*range(25), 10622])
+@pytest.mark.parametrize("seed", [*range(by_day(8, at_night=250)), 10622])
 def test_without_losing_every_copy_all_recover_and_agree(seed):
     """While one replica and its service stay, all others come to its state and all is answered."""
     source = random.Random(seed)

@@ -13,6 +13,7 @@ import pytest
 from fogft.ordering.active_version import VACANCY_S, Office
 from fogft.ordering.sequencer import Sequencer
 from tests.linearizability import counter
+from tests.nightly import by_day
 from tests.ordering.ordering_world import World
 from tests.ordering.service_world import ask_counter
 from tests.ordering.test_ordering_simulated import drive
@@ -136,7 +137,7 @@ def one_service(world: Versions) -> list[str]:
 
 
 @pytest.mark.parametrize("replicas", [1, 2, 3])
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(by_day(4, at_night=100)))
 def test_an_update_is_one_point_of_the_order(seed, replicas):
     """Before it all answers are the old version's, after it the new one's, from its state."""
     source = random.Random(seed)
@@ -149,7 +150,7 @@ def test_an_update_is_one_point_of_the_order(seed, replicas):
     assert world.said[-1][1] == "new"
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(by_day(4, at_night=100)))
 def test_a_rollback_goes_on_from_the_new_versions_state(seed):
     """There and back: two points of the order, and nothing answered is forgotten."""
     source = random.Random(seed)
@@ -164,7 +165,7 @@ def test_a_rollback_goes_on_from_the_new_versions_state(seed):
     assert one_service(world) == ["old", "new", "old"]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(by_day(8, at_night=200)))
 def test_a_killed_proxy_never_lets_the_old_version_answer_after_the_new_one(seed):
     """Its successor knows who was in office, and begins from nobody else's state."""
     source = random.Random(seed)

@@ -11,6 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from fogft.ordering import orders
 from fogft.ordering.orders import Op, Position
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
+from tests.nightly import by_day
 
 NUMBERS = st.integers(1, 6)
 STATES = st.integers(0, 6)
@@ -119,7 +120,9 @@ class Replica(RuleBasedStateMachine):
 
 
 TestReplica = Replica.TestCase
-TestReplica.settings = settings(max_examples=300, stateful_step_count=40, deadline=None)
+TestReplica.settings = settings(
+    max_examples=by_day(60, at_night=3000), stateful_step_count=40, deadline=None
+)
 
 
 def test_a_second_restore_does_not_leave_requests_of_the_first_in_the_queue():

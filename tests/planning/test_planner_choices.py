@@ -25,6 +25,7 @@ from fogft.model.scoring import Weights
 from fogft.model.spec import PoolSpec
 from fogft.planning.availability import Assumption, Correlation, expected
 from fogft.planning.observed.history import Event, EventKind
+from tests.nightly import by_day
 from tests.planning.pool_worlds import (
     NOW,
     SERVICE,
@@ -37,7 +38,11 @@ from tests.planning.pool_worlds import (
     spec,
 )
 
-some = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+some = settings(
+    max_examples=by_day(20, at_night=500),
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 MIXED = OnDemandSpec(0, True)
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from fogft.model.replica import LinkState, MachinePhase, ReplicaId
 from fogft.planning.planner import Plan
+from tests.nightly import by_day
 from tests.planning.pool_worlds import (
     OFFERS,
     STRANGER,
@@ -24,7 +25,11 @@ from tests.planning.pool_worlds import (
     worlds,
 )
 
-many = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+many = settings(
+    max_examples=by_day(30, at_night=1000),
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 
 
 def needed(world: World, planned: Plan, leaving: set[ReplicaId]) -> int:

@@ -18,6 +18,7 @@ from fogft.poolfile import file, yaml_tree
 from fogft.poolfile.keys import FOGFT_KEYS, LATER_KEYS
 from fogft.poolfile.tree import plain
 from tests.needs import needs
+from tests.nightly import by_day
 
 GOOD = """\
 name: perception
@@ -650,7 +651,7 @@ pieces = st.sampled_from([": ", "\n", "\n  ", "- ", "{", "}", "[", "]", ",", "|"
 yaml_like = st.lists(words | pieces | st.text(max_size=3), max_size=40).map("".join)
 
 
-@settings(max_examples=300)
+@settings(max_examples=by_day(60, at_night=3000))
 @given(source=yaml_like | st.text(max_size=60))
 @example(source="!!bool x: 1")
 @example(source="a: !!timestamp x")

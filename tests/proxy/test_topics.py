@@ -11,6 +11,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, TopicSpec
 from fogft.proxy.replica.topics import HOLD_S, TopicsOnReplica
 from fogft.proxy.robot.topics import TopicsOnRobot
+from tests.nightly import by_day
 from tests.proxy.fakes import Clock, FakeLink
 
 
@@ -129,7 +130,7 @@ TO = TopicSpec("/to", "p/msg/T", Origin.ROBOT, depth=100)
 BACK = TopicSpec("/back", "p/msg/T", Origin.REPLICAS, depth=100)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(by_day(6, at_night=200)))
 def test_every_message_reaches_every_replica_once_and_in_order(seed):
     """Also over links that lose a third of what goes either way."""
     source = random.Random(seed)
@@ -145,7 +146,7 @@ def test_every_message_reaches_every_replica_once_and_in_order(seed):
         assert node.published["/to"] == said
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(by_day(6, at_night=200)))
 def test_every_message_of_a_replica_comes_back_once_and_in_order(seed):
     source = random.Random(seed)
     world = World(BACK)

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from fogft.requests.first_response import RETRY_FIRST_S, RETRY_LIMIT_S, FirstResponse, Verdict
+from tests.nightly import by_day
 
 A = b"a" * 16
 B = b"b" * 16
@@ -236,5 +237,7 @@ class Requests(RuleBasedStateMachine):
         assert len(self.table) == len(self.open)
 
 
-Requests.TestCase.settings = settings(max_examples=60, stateful_step_count=30)
+Requests.TestCase.settings = settings(
+    max_examples=by_day(30, at_night=1000), stateful_step_count=30
+)
 TestRequests = Requests.TestCase

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from fogft.errors import RosError
 from fogft.ros import converted, memory_tuning, rcl, serialised, transfer
 from fogft.ros.types import load_service_type
+from tests.nightly import by_day
 
 from .conftest import SET_BOOL
 
@@ -66,7 +67,7 @@ def test_the_self_test_notices_a_changed_message(monkeypatch: pytest.MonkeyPatch
 numbers = st.integers(-128, 127)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=by_day(20, at_night=400), deadline=None)
 @given(cells=st.lists(numbers, max_size=50), frame=st.text(alphabet="abcé", max_size=12))
 def test_a_map_survives_as_it_is(cells: list[int], frame: str) -> None:
     """Both ways agree on sequences, nested messages and text."""
@@ -79,7 +80,7 @@ def test_a_map_survives_as_it_is(cells: list[int], frame: str) -> None:
     assert through_c(kept) == kept
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=by_day(20, at_night=400), deadline=None)
 @given(names=st.lists(st.text(alphabet="ab_é", max_size=8), max_size=5), value=st.floats(-1e9, 1e9))
 def test_nested_sequences_survive_as_they_are(names: list[str], value: float) -> None:
     """Sequences of messages with text and sequences inside come through whole."""

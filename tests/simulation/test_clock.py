@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from fogft.planning.observed.history import MOVING, Event, EventKind
+from tests.nightly import by_day
 from tests.simulation.test_pools import FAULTS, PLACES, kill_the_manager, make_world, recover
 from tests.simulation.world import UID, World
 
@@ -47,7 +48,7 @@ def happened(world: World) -> list[tuple[object, ...]]:
     ]
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(by_day(6, at_night=100)))
 def test_a_pool_lives_the_same_life_whatever_the_clock_says(seed: int) -> None:
     """Launch for launch and end for end, through preemptions, silence, refusals and edits."""
     still, jumping = lived(seed, jumps=False), lived(seed, jumps=True)

@@ -11,6 +11,7 @@ from fogft.simulation import fitting, model
 from fogft.simulation.generator import generate
 from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.timeline import of_samples
+from tests.needs import needs
 from tests.simulation.markets import INDEPENDENT
 
 LOCATIONS = [f"c{i}/r{j}/z{k}" for i in range(2) for j in range(2) for k in range(2)]
@@ -20,10 +21,13 @@ YEARS = 3 * 365 * 86_400.0
 @pytest.mark.parametrize(
     "asked",
     [
-        INDEPENDENT,
+        pytest.param(INDEPENDENT, marks=needs("night")),
         MarketModel(),
-        MarketModel(mttf_s=54_000.0, mttr_s=7_200.0, correlation_region=0.22,
-                    correlation_cloud=0.22, correlation_world=0.1, together=0.0),
+        pytest.param(
+            MarketModel(mttf_s=54_000.0, mttr_s=7_200.0, correlation_region=0.22,
+                        correlation_cloud=0.22, correlation_world=0.1, together=0.0),
+            marks=needs("night"),
+        ),
         MarketModel(mttf_s=7_200.0, mttr_s=7_200.0, correlation_region=0.5,
                     correlation_cloud=0.1, together=0.4, regime_s=86_400.0),
     ],

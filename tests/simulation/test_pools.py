@@ -11,6 +11,7 @@ import pytest
 from fogft.errors import CloudUnreachable, NoCapacity, QuotaExceeded
 from fogft.model import intent as intents
 from fogft.model.spec import HealthSpec, PoolSpec
+from tests.nightly import by_day
 from tests.simulation.world import SERVICE, UID, CheckedCloud, World
 
 PLACES = (
@@ -214,7 +215,7 @@ def recover(world: World) -> int:
     pytest.fail(f"not whole: wanted {world.wanted()}, have {state}, notes {notes}")
 
 
-@pytest.mark.parametrize("seed", range(220))
+@pytest.mark.parametrize("seed", range(by_day(60, at_night=1000)))
 def test_laws_hold_and_the_pool_becomes_whole(seed: int) -> None:
     """Through every mix of faults no law is broken, and after the last one the pool is whole."""
     world = make_world(seed)
@@ -223,7 +224,7 @@ def test_laws_hold_and_the_pool_becomes_whole(seed: int) -> None:
     assert world.whole()
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(by_day(12, at_night=200)))
 def test_pool_is_whole_soon_after_preemptions(seed: int) -> None:
     """However many replicas were lost, the pool is whole within a minute of simulated time."""
     world = make_world(seed)

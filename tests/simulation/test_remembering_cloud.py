@@ -8,6 +8,7 @@ import pytest
 
 from fogft.errors import CloudUnreachable
 from fogft.model import intent as intents
+from tests.nightly import by_day
 from tests.simulation.test_pools import FAULTS, PLACES, live_through_faults, make_world, recover
 from tests.simulation.world import UID, RememberingCloud, World
 
@@ -25,7 +26,7 @@ def ours(world: World) -> list:
     return [m for m in world.truth() if m.id.pool_uid == UID]
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(by_day(20, at_night=500)))
 def test_laws_hold_and_the_pool_becomes_whole(seed: int) -> None:
     """As on any cloud: what the list does not know yet breaks no law."""
     world = make_world(seed, RememberingCloud)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from fogft.model.spec import HealthSpec, PoolSpec
+from tests.nightly import by_day
 from tests.simulation.test_pools import PLACES, kill_the_manager, preempt, recover
 from tests.simulation.world import SERVICE, UID, World
 
@@ -63,7 +64,7 @@ def versions(world: World) -> set[str]:
     return set(world.versions().values())
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(by_day(8, at_night=200)))
 def test_never_fewer_answer_while_new_comes_before_old(seed: int) -> None:
     """With room for both, an update takes away nothing, and ends with the new version good."""
     world = make_world(seed)
@@ -74,7 +75,7 @@ def test_never_fewer_answer_while_new_comes_before_old(seed: int) -> None:
     assert world.store.the_good == world.store.the_spec
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(by_day(8, at_night=200)))
 def test_one_fewer_answers_at_most_while_old_goes_before_new(seed: int) -> None:
     """Without room for both, all but one answer, and at least one; the update comes to its end."""
     world = make_world(seed, replicas=2 + seed % 3, tight=True)
@@ -86,7 +87,7 @@ def test_one_fewer_answers_at_most_while_old_goes_before_new(seed: int) -> None:
 
 @pytest.mark.parametrize("tight", [False, True])
 @pytest.mark.parametrize("wrong", WRONGS)
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(by_day(3, at_night=40)))
 def test_a_bad_version_is_given_up_and_the_good_one_restored(seed, wrong, tight) -> None:
     """Whatever is wrong with it, the bad version goes, once and for good, and few ever ran it."""
     replicas = 2 + seed % 3
@@ -107,7 +108,7 @@ def orders(world: World) -> list:
     return [vm.order for vm in world.cloud._vms.values() if vm.order.id.pool_uid == UID]
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(by_day(3, at_night=40)))
 def test_the_next_changed_file_is_tried_and_the_same_one_too_if_another_came_between(seed) -> None:
     world = make_world(seed, replicas=2)
     apply(world, "bad", "crashes")
@@ -119,7 +120,7 @@ def test_the_next_changed_file_is_tried_and_the_same_one_too_if_another_came_bet
     assert versions(world) == {version}
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(by_day(12, at_night=400)))
 def test_faults_meanwhile_change_nothing_about_where_it_ends(seed: int) -> None:
     """Preemptions and killed managers: the pool ends whole, with one version, never the bad one."""
     world = make_world(seed, tight=seed % 4 == 0, replicas=2 + seed % 2)

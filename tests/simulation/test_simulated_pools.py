@@ -23,6 +23,8 @@ from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.report import simulate
 from fogft.simulation.timeline import UNLIMITED, of_changes, of_samples
 from fogft.simulation.world import World
+from tests.needs import needs
+from tests.nightly import by_day
 from tests.simulation.markets import INDEPENDENT, any_scenario, scenario, spec
 
 HOUR_S = 3600.0
@@ -82,7 +84,7 @@ def test_a_loss_costs_a_boot_and_its_detection_unless_it_was_announced(notice_s,
 # -- the real planner's rules, as they come out ------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(by_day(2, at_night=20)))
 def test_asking_only_when_something_can_change_changes_nothing(seed):
     """The same events as when the manager looks every second, as it does in real life.
 
@@ -97,7 +99,7 @@ def test_asking_only_when_something_can_change_changes_nothing(seed):
     assert lazily.outcome().usd_per_hour == pytest.approx(eagerly.outcome().usd_per_hour)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(by_day(2, at_night=20)))
 def test_planning_on_adds_nothing_to_a_plan_that_is_said_to_be_closed(seed, monkeypatch):
     """The same events as when each plan that changes anything is planned on while under way."""
     wanted = any_scenario(seed, days=0.2)
@@ -149,7 +151,7 @@ def test_the_budget_holds_at_every_moment():
 # -- arithmetic --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("replicas", [1, 2, 3])
+@pytest.mark.parametrize("replicas", [1, 2, pytest.param(3, marks=needs("night"))])
 def test_without_correlation_the_product_of_unavailabilities_is_right(replicas):
     """`planning.reliability` for replicas that stay, against eight simulated months."""
     wanted = scenario(

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from fogft.cloud.sky.journal import Entry, Journal, Stage
 from fogft.errors import StateError
 from fogft.model.replica import ReplicaId
+from tests.nightly import by_day
 from tests.sky.scripted_sky import EAST, replica
 
 
@@ -25,7 +26,7 @@ def test_an_entry_is_read_back_as_it_was(tmp_path: Path):
     assert Journal(tmp_path).entries() == [changed]
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=by_day(30, at_night=500), deadline=None)
 @given(st.lists(st.sampled_from(list(Stage)), max_size=8))
 def test_a_stage_never_moves_back(tmp_path_factory: pytest.TempPathFactory, stages: list[Stage]):
     """A follower that is late cannot bring an ended launch back to life."""

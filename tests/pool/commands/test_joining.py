@@ -24,6 +24,7 @@ from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, PoolStore, write_identity
 from fogft.proxy.config import read_client, read_gateway, read_server
+from tests.nightly import by_day
 
 UID, NOW = "0123456789abcdef", 2e9
 PASSPHRASE = "correct-horse-battery"
@@ -237,7 +238,7 @@ def test_a_bundle_can_write_nowhere_else(name: str, tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@settings(max_examples=200)
+@settings(max_examples=by_day(60, at_night=2000))
 @given(st.data())
 def test_any_damage_is_told(data: st.DataObject) -> None:
     """One changed, added or missing byte, wherever: an error, never another content."""

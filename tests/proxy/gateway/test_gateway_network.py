@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.link.wire_pool import wait_for
+from tests.needs import needs
 from tests.proxy.gateway_pool import GatewayPool
 
 pytestmark = pytest.mark.timeout(120)
@@ -24,7 +25,7 @@ def pool(tmp_path, net) -> Iterator[GatewayPool]:
     made.close()
 
 
-@pytest.mark.parametrize("replicas", [1, 2, 4])
+@pytest.mark.parametrize("replicas", [pytest.param(1, marks=needs("night")), 4])
 def test_a_thin_uplink_carries_each_request_once(net, pool, replicas, record_property):
     """Packets of 1500 bytes, their headers and probes included, against the payload.
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from fogft.model.spec import HedgingMode
 from fogft.requests.adaptive import BUDGET_CAPACITY
 from tests.bench.statistics import percentile
+from tests.nightly import by_day
 from tests.proxy.robot.simulated import World, lognormal
 
 STALLING = lognormal(0.1, 0.35, stalls=0.01)
@@ -106,7 +107,7 @@ steps = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=by_day(40, at_night=1000), deadline=None)
 @given(modes, steps, st.integers(0, 1000))
 def test_laws_of_every_policy_and_of_changing_it(mode, steps, seed):
     """One answer a request, its own, never after its deadline; none is lost that can be answered.
@@ -146,7 +147,7 @@ def test_laws_of_every_policy_and_of_changing_it(mode, steps, seed):
         assert report["silent"] == 0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=by_day(15, at_night=200), deadline=None)
 @given(
     st.floats(0.01, 0.5), st.floats(1.0, 50.0), st.floats(0.005, 1.0), st.integers(2, 4),
     st.integers(0, 1000),

@@ -20,6 +20,7 @@ from fogft.link.zenoh.robot.link import ZenohLink
 from tests.link.test_frozen import STUCK
 from tests.link.wire_pool import SERVICE, Authority, Owner, ReplicaProcess, request_id, wait_for
 from tests.link.zenoh.robot_process import RobotProcess
+from tests.nightly import by_day
 
 LARGE_BYTES = 30_000_000
 
@@ -53,7 +54,7 @@ def test_by_the_robot_while_it_sends(
 ) -> None:
     replica = start_replica(settings=STUCK)
     before = set(threading.enumerate())
-    for number in range(20):
+    for number in range(by_day(6, at_night=40)):
         link = usable(dial, replica)
         if frozen:
             replica.signal(signal.SIGSTOP)
@@ -70,7 +71,7 @@ def test_by_the_robot_while_it_is_answered(
     """The replica answers another robot meanwhile: here its other link."""
     replica = start_replica(settings=STUCK)
     other = usable(dial, replica)
-    for number in range(20):
+    for number in range(by_day(6, at_night=40)):
         link = usable(dial, replica)
         asked = f"noise:{LARGE_BYTES}".encode()
         assert link.offer(SERVICE, request_id(2 * number), asked, 600.0)
@@ -85,7 +86,7 @@ def test_by_the_replica_while_it_is_sent_to(
 ) -> None:
     """The robot's link to another replica goes on."""
     other = usable(dial, start_replica(settings=STUCK))
-    for number in range(1, 11):
+    for number in range(1, 1 + by_day(4, at_night=20)):
         replica = start_replica(slot=number, settings=STUCK)
         link = usable(dial, replica, slot=number)
         sends_large(link, 2 * number)
@@ -102,7 +103,7 @@ def test_by_a_robot_that_is_killed_while_it_is_answered(
     replica = start_replica(settings=STUCK)
     link = usable(dial, replica)
     asks = {"requests": 2, "payload": f"noise:{LARGE_BYTES}", "settings": STUCK}
-    for number in range(6):
+    for number in range(by_day(3, at_night=12)):
         before = replica.count("replies")
         robot = RobotProcess(authority, replica, **asks)
         wait_for(lambda n=before: replica.count("replies") > n)
