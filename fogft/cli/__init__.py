@@ -1,1 +1,4 @@
-"""The command line: arguments in, text out."""
+"""The command line: arguments in, text out.
+
+Not here: what a command does (`fogft.app`).
+"""

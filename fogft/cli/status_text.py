@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from fogft.cli.table import GAP, Cell, columns, with_remark
+from fogft.cli.table import GAP, Cell, columns, milliseconds, with_remark
 from fogft.cli.tree_text import tree
 
 if TYPE_CHECKING:
@@ -150,16 +150,6 @@ def price(usd: float) -> str:
 def number(value: int) -> str:
     """Return a count with its thousands apart."""
     return f"{value:,}".replace(",", " ")
-
-
-def milliseconds(seconds: float | None) -> str:
-    """Return a short duration with three digits: ``0.42 ms``, ``12.3 ms``, ``1.20 s``."""
-    if seconds is None:
-        return "-"
-    if seconds >= 1:
-        return f"{seconds:.2f} s"
-    value = seconds * 1000
-    return f"{value:.{2 if value < 10 else 1 if value < 100 else 0}f} ms"
 
 
 def age(seconds: float) -> str:

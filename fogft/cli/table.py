@@ -81,3 +81,13 @@ def with_remark(line: str, remark: str, *, taken: int, width: int, indent: int) 
         return [f"{line}{GAP}{remark}"]
     room = max(20, width - indent)
     return [line.rstrip(), *(" " * indent + part for part in textwrap.wrap(remark, room))]
+
+
+def milliseconds(seconds: float | None) -> str:
+    """Return a short duration with three digits: ``0.42 ms``, ``12.3 ms``, ``1.20 s``."""
+    if seconds is None:
+        return "-"
+    if seconds >= 1:
+        return f"{seconds:.2f} s"
+    value = seconds * 1000
+    return f"{value:.{2 if value < 10 else 1 if value < 100 else 0}f} ms"

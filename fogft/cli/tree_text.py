@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fogft.cli.table import Cell
+from fogft.cli.table import Cell, milliseconds
 
 _STATES = {"up": "good", "connecting": "soon", "suspect": "bad"}
 
@@ -53,8 +53,6 @@ def _below(
 
 
 def _words(gateway: Mapping[str, Any], link: Mapping[str, Any] | None, *, colour: bool) -> str:
-    from fogft.cli.status_text import milliseconds
-
     words = [f"gateway {gateway['name']}", gateway["endpoint"]]
     if not gateway["generations"]:
         words.append(Cell("no certificate", "bad").painted(colour=colour))

@@ -3,6 +3,8 @@
 Needs ROS 2's `launch` and `launch_ros`, which are loaded when a name is first used::
 
     from fogft.launch import CloudNode, FogPool
+
+Not here: what starting and ending a pool means (`fogft.app`).
 """
 
 from __future__ import annotations

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""One link for each replica: its port, its window, and the bytes on the wire.
+
+Not here: Zenoh (`zenoh`), and which link a request takes (`fogft.proxy.robot`).
+"""

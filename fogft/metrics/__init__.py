@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""Counters of proxies, and the page that Prometheus reads.
+
+Not here: the manager's metrics (`fogft.pool.manager.metrics`).
+"""

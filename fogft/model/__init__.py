@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The values that all rooms speak of: replicas, placements, membership, what a pool file asks for.
+
+Not here: reading them from files (`fogft.poolfile`), deciding by them (`planning`, `requests`).
+"""

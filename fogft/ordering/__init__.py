@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""Stateful services: the order of requests, snapshots, and catching up. Pure.
+
+Not here: sending (`fogft.proxy`).
+"""

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""Which replicas a pool should have, where, and when one is replaced. Pure.
+
+Not here: observing and applying (`fogft.pool.manager`).
+"""

@@ -1,1 +1,4 @@
-"""Keep a pool as its file says: the manager, its state on disk and its credentials."""
+"""A pool's life: the manager, the commands, its folder and its credentials.
+
+Not here: what to launch or end (`fogft.planning`), requests (`fogft.proxy`).
+"""

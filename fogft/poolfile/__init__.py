@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The pool file: read it, judge it, compare two. Pure but for `file` and `workspace`.
+
+Not here: the values that come of it (`fogft.model`).
+"""

@@ -1,1 +1,4 @@
-"""The client proxy (robot) and the server proxy (replica)."""
+"""The processes that requests pass through, and their configuration.
+
+Not here: who decides (`fogft.requests`, `fogft.ordering`), links (`fogft.link`).
+"""

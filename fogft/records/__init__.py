@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""Signed records of who is where, and the rendezvous that passes them on.
+
+Not here: application data, which goes over links only (`fogft.link`).
+"""

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""What becomes of one request: hedging, the first success, votes, fallback, admission. Pure.
+
+Not here: sending (`fogft.proxy.robot`).
+"""

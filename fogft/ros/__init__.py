@@ -1,1 +1,4 @@
-"""The ROS 2 side of the proxies: serialised services and clients. rclpy stays in here."""
+"""ROS 2 through rclpy: serialised services, clients and topics of any type.
+
+Not here: what becomes of a request (`fogft.proxy`).
+"""

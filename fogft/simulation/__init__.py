@@ -1,4 +1,4 @@
 """Whole pools under simulated time: the real manager against recorded or generated spot markets.
 
-Decided in docs/design/simulation.md.
+Not here: the manager's decisions (`fogft.planning`). See docs/design/simulation.md.
 """

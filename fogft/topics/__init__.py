@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""Topics and actions between robot and replicas: queues, duplicates, goals. Pure.
+
+Not here: publishing and subscribing (`fogft.ros`, `fogft.proxy`).
+"""

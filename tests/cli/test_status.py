@@ -14,7 +14,8 @@ import pytest
 
 from fogft import disk
 from fogft.cli import main
-from fogft.cli.status_text import age, milliseconds, number
+from fogft.cli.status_text import age, number
+from fogft.cli.table import milliseconds
 from fogft.pool.manager.status import PoolStatus
 from tests.cli.pools import FILE, STATUS, lay_down
 

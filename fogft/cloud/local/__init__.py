@@ -1,4 +1,7 @@
-"""Replicas as real processes on this machine, in named regions. See docs/design/local-cloud.md."""
+"""The local cloud: replicas are processes on this machine, in named regions with prices.
+
+Not here: what they run (`fogft.proxy.replica`). See docs/design/local-cloud.md.
+"""
 
 from fogft.cloud.local.cloud import LocalCloud
 

@@ -1,4 +1,7 @@
-"""Real clouds through SkyPilot's public SDK: one cluster a replica. See docs/design/sky.md."""
+"""Real clouds through SkyPilot's public SDK: one cluster for each replica.
+
+Not here: which offer is bought (`fogft.planning`). See docs/design/sky.md.
+"""
 
 from __future__ import annotations
 

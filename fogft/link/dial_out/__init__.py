@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""Replicas that no robot can reach open the connection to the robot themselves.
+
+Not here: what flows through it afterwards, which is a link as any other (`fogft.link.zenoh`).
+"""

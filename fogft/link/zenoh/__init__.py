@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""Links over Zenoh: its settings and threads, and what both ends have in common.
+
+Not here: the two ends (`robot`, `replica`).
+"""

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""What observations mean: health, history, backoff, prices that expire. Pure.
+
+Not here: what to do about them (`fogft.planning`).
+"""

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""What `up`, `scale`, `join`, `sweep`, ... do to a pool.
+
+Not here: their text (`fogft.cli`).
+"""

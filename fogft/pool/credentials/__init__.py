@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The pool's certificate authority, its ledger, and bundles that let machines join.
+
+Not here: using a certificate (`fogft.link.zenoh`).
+"""

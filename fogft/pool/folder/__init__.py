@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""A pool on disk: every file has one writer.
+
+Not here: what is written (`fogft.pool.manager`).
+"""

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The manager of one pool: observe, plan, apply, once a second.
+
+Not here: what to launch or end (`fogft.planning`).
+"""

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The gateway between a robot with a thin uplink and the replicas.
+
+Not here: choosing a replica (`fogft.proxy.robot`), hearing requests (`fogft.link`).
+"""

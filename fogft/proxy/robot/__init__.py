@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The client proxy: offers the service on the robot and asks the replicas.
+
+Not here: the replica's side (`fogft.proxy.replica`).
+"""

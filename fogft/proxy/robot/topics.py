@@ -20,7 +20,6 @@ from fogft.model import names
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, Select, TopicSpec
-from fogft.proxy.replica.topics import LOOK_EVERY_S
 from fogft.ros.port import RosPublisher, RosSubscription, RosTopics
 from fogft.topics import frames
 from fogft.topics.queues import Numbered, Outbox
@@ -31,6 +30,7 @@ log = logging.getLogger(__name__)
 _MESSAGE_S = 10.0  # a message that is not confirmed in this time goes again
 _PULL_S = 10.0
 _AGAIN_S = 0.2  # after a refusal
+_LOOK_EVERY_S = 2.0  # whether publishers are heard
 
 
 class Merge(Protocol):
@@ -122,7 +122,7 @@ class RobotTopic:
         with self._lock:
             self._send()
         now = self._clock()
-        if self._subscription is not None and now - self._looked_at > LOOK_EVERY_S:
+        if self._subscription is not None and now - self._looked_at > _LOOK_EVERY_S:
             self._looked_at = now
             before, self.trouble = self.trouble, self._subscription.mismatch()
             if self.trouble not in ("", before):

@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The replica's end of a link: admit robots, take requests, send replies.
+
+Not here: running requests (`fogft.proxy.replica`).
+"""

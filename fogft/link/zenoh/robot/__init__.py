@@ -1,1 +1,4 @@
-"""To be written: what is in here, in one sentence."""
+"""The robot's end of a link: dial, probe, send attempts, take answers.
+
+Not here: which link a request takes (`fogft.proxy.robot`).
+"""

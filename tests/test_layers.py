@@ -1,0 +1,114 @@
+"""The rooms of the product: no circles, none too full, each says what is in it.
+
+Which room may import which is import-linter's to check (`pyproject.toml`, `scripts/check`).
+"""
+
+import ast
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PRODUCT = Path(__file__).parent.parent / "fogft"
+MOST_MODULES = 22
+PURE = ("model", "ordering", "planning", "poolfile", "requests", "topics")
+OPENS_FILES = {"poolfile/file.py", "poolfile/workspace.py"}
+LOADED_BY_NAME = {"sky": "cloud/sky", "boto3": "cloud/sky", "botocore": "cloud/sky"}
+
+
+def files() -> list[Path]:
+    """Return the product's modules, without what ROS 2's build runs outside of the package."""
+    return [path for path in sorted(PRODUCT.rglob("*.py")) if "ament" not in path.parts]
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(PRODUCT.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported(source: str, known: Container[str]) -> Iterator[str]:
+    """Yield what a module imports, wherever in the file; a module rather than its package."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                module = f"{node.module}.{alias.name}"
+                yield module if module in known else node.module
+
+
+def imports(sources: Mapping[str, str]) -> dict[str, set[str]]:
+    """Return module -> the other modules of `sources` that it imports."""
+    return {
+        name: set(imported(source, sources)) & sources.keys() - {name}
+        for name, source in sources.items()
+    }
+
+
+def circle(graph: Mapping[str, set[str]]) -> list[str]:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """Imports inside functions and under TYPE_CHECKING count too."""
+    assert circle(imports({name_of(path): path.read_text() for path in files()})) == []
+
+
+@pytest.mark.parametrize(
+    "late", ["def f():\n    import p.b", "if TYPE_CHECKING:\n    from p.b import x"]
+)
+def test_a_circle_is_found(late: str) -> None:
+    """Also where one of its imports is late."""
+    found = circle(imports({"p": "", "p.a": late, "p.b": "from p import a"}))
+    assert set(found) == {"p.a", "p.b"}
+
+
+def test_no_room_holds_more_modules_than_one_can_look_through() -> None:
+    modules = [path for path in files() if path.name != "__init__.py"]
+    rooms = Counter(path.parent.relative_to(PRODUCT).as_posix() for path in modules)
+    assert {room: count for room, count in rooms.items() if count > MOST_MODULES} == {}
+
+
+def test_every_room_says_what_is_in_it_and_what_is_not() -> None:
+    silent = [
+        name_of(path)
+        for path in files()
+        if path.name == "__init__.py"
+        and path.parent != PRODUCT
+        and "Not here:" not in (ast.get_docstring(ast.parse(path.read_text())) or "")
+    ]
+    assert silent == []
+
+
+def test_what_decides_opens_no_file() -> None:
+    """`open` needs no import, so import-linter does not see it."""
+    opening = {
+        path.relative_to(PRODUCT).as_posix()
+        for path in files()
+        if path.relative_to(PRODUCT).parts[0] in PURE
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and (
+            getattr(node.func, "id", None) == "open"
+            or getattr(node.func, "attr", None) in {"read_text", "read_bytes", "rglob"}
+        )
+    }
+    assert opening - OPENS_FILES == set()
+
+
+def test_skypilot_is_loaded_by_name_in_its_room_only() -> None:
+    """An import by name is hidden from import-linter."""
+    strays = [
+        f"{path.relative_to(PRODUCT)}: {name}"
+        for path in files()
+        for name, room in LOADED_BY_NAME.items()
+        if f'import_module("{name}' in path.read_text()
+        and not path.relative_to(PRODUCT).as_posix().startswith(room)
+    ]
+    assert strays == []
