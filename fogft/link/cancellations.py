@@ -1,7 +1,7 @@
 """Requests whose answer is no longer wanted, until their replica has been told. No clock, no Zenoh.
 
 Telling costs a message, and is worth it only where there is work to be saved. A request that
-was sent a moment ago is most likely answered before the message is there. So a recall is told
+was sent a moment ago is most likely answered before the message is there. So a cancellation is told
 at once if the request has been out for `WORTH_S` and the replica was told nothing for `EVERY_S`,
 else with the next flush, and not at all if the answer comes first.
 
@@ -15,8 +15,8 @@ EVERY_S = 0.01  # under load each answer has a loser: they are told together
 LIMIT = 4096  # what one message carries; further ones are not told, and their work is not saved
 
 
-class Recalls:
-    """The recalls of one connection."""
+class Cancellations:
+    """The cancellations of one connection."""
 
     def __init__(self) -> None:
         self._ids: dict[bytes, None] = {}

@@ -7,7 +7,7 @@ does not shrink is left alone, and tried again rarely.
 
 Compressed payloads go only to peers that have said that they read them (`ACCEPTED`).
 
-Owns: when and how. Not here: rates (`drain`), headers (`frame`).
+Owns: when and how. Not here: rates (`socket_progress`), headers (`frame`).
 """
 
 from __future__ import annotations

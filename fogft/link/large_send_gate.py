@@ -18,8 +18,8 @@ LARGE_BYTES = 64 << 10  # smaller requests fit into one batch of Zenoh's
 PATIENCE_S = 0.005
 
 
-class Turns:
-    """The turns of all links of one robot.
+class LargeSendGate:
+    """The order of all links of one robot.
 
     Args:
         patience_s: How long to wait for another's turn to end.

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
-from fogft.link.send_options import Ways
+from fogft.link.send_options import SendOptions
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.type_definition import Definition
 from fogft.records.record import SignedRecord
@@ -37,7 +37,7 @@ class Probe:
 
 
 @dataclass(frozen=True)
-class Behind:
+class GatewayView:
     """What a gateway sees of one replica behind it. Durations in seconds.
 
     Attributes:
@@ -58,7 +58,7 @@ class Behind:
     through: str = ""
 
     @classmethod
-    def of(cls, report: Mapping[str, Any]) -> Behind:
+    def of(cls, report: Mapping[str, Any]) -> GatewayView:
         """Return one from what a client proxy reports of a link."""
         return cls(
             slot=report["slot"],
@@ -108,7 +108,7 @@ class ProbeAnswer:
     work: Mapping[str, float] = field(default_factory=dict)
     offered: Mapping[str, str] = field(default_factory=dict)
     types: Mapping[str, Definition] = field(default_factory=dict)
-    behind: tuple[Behind, ...] = ()
+    behind: tuple[GatewayView, ...] = ()
     accepts: frozenset[str] = frozenset()
 
 
@@ -242,7 +242,7 @@ class Dialer(Protocol):
             events: Whom to tell.
         """
 
-    def adopt(self, ways: Ways) -> None:
+    def adopt(self, options: SendOptions) -> None:
         """Set what services want of their links, from the next connection on."""
 
     def renew(self) -> None:

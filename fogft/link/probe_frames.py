@@ -13,7 +13,7 @@ from typing import Any
 
 from fogft.errors import FrameError
 from fogft.link.frame import VERSION, check_version
-from fogft.link.port import Behind, Probe, ProbeAnswer
+from fogft.link.port import GatewayView, Probe, ProbeAnswer
 from fogft.model import type_definition
 from fogft.model.replica import LinkState
 from fogft.model.type_definition import Definition
@@ -120,7 +120,7 @@ def decode_probe_answer(frame: bytes) -> ProbeAnswer:
     )
 
 
-def _behind_plain(one: Behind) -> dict[str, Any]:
+def _behind_plain(one: GatewayView) -> dict[str, Any]:
     detail = one.detail[:BEHIND_DETAIL_LIMIT].encode(errors="replace").decode()
     return {
         **asdict(one),
@@ -132,20 +132,20 @@ def _behind_plain(one: Behind) -> dict[str, Any]:
     }
 
 
-def _behind(raw: Any) -> tuple[Behind, ...]:
+def _behind(raw: Any) -> tuple[GatewayView, ...]:
     if not isinstance(raw, list) or len(raw) > BEHIND_LIMIT:
         raise FrameError(f"`behind` is not a list of at most {BEHIND_LIMIT}")
     return tuple(_one_behind(one) for one in raw)
 
 
-def _one_behind(raw: Any) -> Behind:
+def _one_behind(raw: Any) -> GatewayView:
     if not isinstance(raw, dict):
         raise FrameError("`behind` holds what is no object")
     try:
         state = LinkState(raw.get("state"))
     except ValueError as error:
         raise FrameError("`state` is none") from error
-    return Behind(
+    return GatewayView(
         slot=_count(raw, "slot"),
         generation=_count(raw, "generation"),
         state=state,

@@ -10,7 +10,7 @@ from fogft.model.spec import ServiceSpec
 
 
 @dataclass(frozen=True)
-class Ways:
+class SendOptions:
     """What services want of their links.
 
     Attributes:
@@ -25,7 +25,7 @@ class Ways:
     timed: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, services: Iterable[ServiceSpec]) -> Ways:
+    def of(cls, services: Iterable[ServiceSpec]) -> SendOptions:
         """Return what these services want."""
         known = tuple(services)
         return cls(
@@ -35,4 +35,4 @@ class Ways:
         )
 
 
-PLAIN_WAYS = Ways()
+DEFAULT_OPTIONS = SendOptions()

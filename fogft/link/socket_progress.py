@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fogft.link.throughput import Carried
+from fogft.link.throughput import Throughput
 
 # A frozen peer's kernel acknowledges probes and small requests; only more than these is a queue.
 BULK_BYTES = 16 << 10
@@ -40,7 +40,7 @@ class Flow:
     unsent: int = 0
 
 
-class Drain:
+class SocketProgress:
     """Of one connection. Times are monotonic seconds.
 
     Attributes:
@@ -48,7 +48,7 @@ class Drain:
     """
 
     def __init__(self) -> None:
-        self.carried = Carried()
+        self.throughput = Throughput()
         self._last: Flow | None = None
         self._last_at = 0.0
         self._progress_at: float | None = None  # None: nothing is outstanding
@@ -85,7 +85,7 @@ class Drain:
         queued = sending or last.outstanding >= BULK_BYTES
         # On a long path much is on its way without any queue.
         full = sending or (last.unsent > 0 and flow.unsent > 0)
-        self.carried.look(moved, since_s, now, queued=full)
+        self.throughput.look(moved, since_s, now, queued=full)
         if sending or (queued and flow.outstanding >= BULK_BYTES):
             self._measured(moved / since_s)
         if (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES:

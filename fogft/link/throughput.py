@@ -1,10 +1,10 @@
 """What a connection was seen to carry while more waited than it took. Pure.
 
-What follows from it (`in_time`, `downlinks`) must not befall a link that only paused. So nothing is
-known before several spans in which a queue stood and moved, and the middle one of them counts: a
-pause makes one too slow, what buffers on the way take in makes one too fast.
+What follows from it (`deadline_filter`, `reply_streams`) must not befall a link that only paused.
+So nothing is known before several spans in which a queue stood and moved, and the middle one of
+them counts: a pause makes one too slow, what buffers on the way take in makes one too fast.
 
-Owns: these spans. Not here: what moved (`drain`).
+Owns: these spans. Not here: what moved (`socket_progress`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _MORE = 4  # times; less may be a step
 KEPT_S = 10.0  # then a link is measured anew
 
 
-class Carried:
+class Throughput:
     """Of one connection. Times are monotonic seconds.
 
     Attributes:

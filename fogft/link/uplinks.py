@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fogft.link.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer
-from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec
@@ -277,22 +277,22 @@ class UplinkDialer:
         self.inner = inner
         self.interfaces: tuple[str, ...] = ()
         self._policies: Mapping[str, UplinkPolicy] = {}
-        self._ways = PLAIN_WAYS
+        self._options = DEFAULT_OPTIONS
 
     def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
         """Set the uplinks and what services want; whether links have to be dialled anew."""
-        ways = Ways.of(services)
+        options = SendOptions.of(services)
         # Not `timed`: who becomes stateful, or comes anew, has its links dialled anyway.
-        old = (self.interfaces, self._ways.latest, self._ways.plain)
-        changed = (tuple(interfaces), ways.latest, ways.plain) != old
-        self.interfaces, self._ways = tuple(interfaces), ways
+        old = (self.interfaces, self._options.latest, self._options.plain)
+        changed = (tuple(interfaces), options.latest, options.plain) != old
+        self.interfaces, self._options = tuple(interfaces), options
         self._policies = {service.name: service.uplinks for service in services}
-        self.adopt(ways)
+        self.adopt(options)
         return changed
 
-    def adopt(self, ways: Ways) -> None:
+    def adopt(self, options: SendOptions) -> None:
         """Set what services want of their links, from the next connection on."""
-        self.inner.adopt(ways)
+        self.inner.adopt(options)
 
     def policy(self, service: str) -> UplinkPolicy:
         """Return a service's policy."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from fogft.errors import WireError
 from fogft.link.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnswer
-from fogft.link.send_options import Ways
+from fogft.link.send_options import SendOptions
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.records.record import SignedRecord
@@ -140,7 +140,7 @@ class MemoryDialer:
         self.wire.links.append(link)
         return link
 
-    def adopt(self, ways: Ways) -> None:
+    def adopt(self, options: SendOptions) -> None:
         """Do nothing: this wire has no queue."""
 
     def renew(self) -> None:

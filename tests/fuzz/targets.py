@@ -18,8 +18,8 @@ from typing import Any
 from fogft.errors import CredentialError, FrameError, StateError
 from fogft.link import batch_frames, compression, frame, probe_frames
 from fogft.link.frame import Greeting
-from fogft.link.port import Behind, Probe, ProbeAnswer
-from fogft.link.zenoh.replica.sessions import Guests, NotAdmittedError
+from fogft.link.port import GatewayView, Probe, ProbeAnswer
+from fogft.link.zenoh.replica.sessions import AuthenticatedSessions, NotAdmittedError
 from fogft.model import certificate_holder, membership
 from fogft.model.replica import LinkState, Member, Membership, ReplicaId
 from fogft.model.type_definition import Definition
@@ -114,8 +114,8 @@ def _verifier() -> Verifier:
 
 
 @lru_cache(maxsize=1)
-def _guests() -> Guests:
-    return Guests(UID, REPLICA, _verifier())
+def _sessions() -> AuthenticatedSessions:
+    return AuthenticatedSessions(UID, REPLICA, _verifier())
 
 
 def _stream(data: bytes) -> None:
@@ -163,9 +163,9 @@ def _order(data: bytes) -> None:
 
 def _judge_greeting(data: bytes) -> None:
     greeting = frame.decode_greeting(data)
-    _guests().greet(greeting)
+    _sessions().greet(greeting)
     good = {ROBOT}
-    assert set(_guests().names) <= good, "somebody was let in who holds no certificate"
+    assert set(_sessions().names) <= good, "somebody was let in who holds no certificate"
 
 
 def _greeting() -> bytes:
@@ -196,7 +196,7 @@ def targets() -> dict[str, Target]:
     types = {"a/srv/B": Definition("RIHS01_0", {"request": (("x", "a/C[2]"),), "a/C": ()})}
     offered = {"/s": "a/srv/B"}
     answer = ProbeAnswer(0, 1, "x", frozenset({"/s"}), detail="why", types=types, offered=offered)
-    behind = Behind(1, 2, LinkState.UP, frozenset({"/s"}), rtt_s=0.01, through="lab/edge")
+    behind = GatewayView(1, 2, LinkState.UP, frozenset({"/s"}), rtt_s=0.01, through="lab/edge")
     gateway = replace(answer, types={}, behind=(behind, behind), accepts=compression.ACCEPTED)
     plain = [json.dumps(records.to_plain(one)).encode() for one in _records()]
     known = Membership("p", UID, 1, 2, (Member(ReplicaId(UID, 0, 1), "h:1"),), frozenset({ROBOT}))

@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 from unittest import mock
 
-from fogft.link.deadline_filter import InTime
-from fogft.link.send_options import Ways
+from fogft.link.deadline_filter import DeadlineFilter
+from fogft.link.send_options import SendOptions
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import (
@@ -40,7 +40,7 @@ def answered_in_time() -> int:
         relay = ThinRelay(replica.endpoint, BYTES_PER_S)
         dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID)
         try:
-            dialer.adopt(Ways(timed=frozenset({SERVICE})))
+            dialer.adopt(SendOptions(timed=frozenset({SERVICE})))
             link = dialer.dial(peer(relay.endpoint), keys(0), owner)
             wait_for(lambda: link.usable)
             deadlines: list[tuple[float, int]] = []
@@ -62,7 +62,7 @@ def answered_in_time() -> int:
 def main() -> None:
     most = int((REQUESTS * EVERY_S + TIMEOUT_S) * BYTES_PER_S / SIZE)
     print(f"{REQUESTS} requests; the uplink carries {most} of them at most")
-    with mock.patch.object(InTime, "may_arrive", return_value=True):
+    with mock.patch.object(DeadlineFilter, "may_arrive", return_value=True):
         print(f"in their order: {answered_in_time()} answered in time")
     print(f"what cannot arrive is declined: {answered_in_time()} answered in time")
 

@@ -21,7 +21,7 @@ from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.replies import Reply
 from fogft.link.zenoh.replica.reply_queue import ReplyQueue
 from fogft.link.zenoh.robot.attempt import OpenAttempt
-from fogft.link.zenoh.robot.batch_buffer import Held
+from fogft.link.zenoh.robot.batch_buffer import BatchBuffer
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal
@@ -134,7 +134,7 @@ def test_there_is_a_limit_to_what_a_batch_may_claim() -> None:
 )
 def test_each_leaves_once_in_order_and_fits(steps: list[tuple[str, int] | None]) -> None:
     """None takes what is held; what is in the way of a newcomer leaves before it."""
-    held, came, left = Held(), [], []
+    held, came, left = BatchBuffer(), [], []
     for number, step in enumerate([*steps, None]):
         if step is None:
             leaving = held.take()

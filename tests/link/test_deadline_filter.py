@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link.compression import Compression
-from fogft.link.deadline_filter import InTime
-from fogft.link.send_options import Ways
-from fogft.link.socket_progress import BULK_BYTES, Drain, Flow
-from fogft.link.throughput import KEPT_S, Carried
+from fogft.link.deadline_filter import DeadlineFilter
+from fogft.link.send_options import SendOptions
+from fogft.link.socket_progress import BULK_BYTES, Flow, SocketProgress
+from fogft.link.throughput import KEPT_S, Throughput
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.spec import ServiceSpec
@@ -38,7 +38,7 @@ LOOK_S = 0.1
 LONG_S = 90.0
 
 
-def queued(carried: Carried, rate: float, lasts_s: float, now: float) -> float:
+def queued(carried: Throughput, rate: float, lasts_s: float, now: float) -> float:
     """Look at a queue that moves evenly for so long; return the time after it."""
     for _ in range(round(lasts_s / LOOK_S)):
         now += LOOK_S
@@ -48,7 +48,7 @@ def queued(carried: Carried, rate: float, lasts_s: float, now: float) -> float:
 
 @given(rates, st.floats(2.5, 20.0))
 def test_a_link_is_known_after_some_time_under_load_and_not_for_ever(rate, lasts_s):
-    carried = Carried()
+    carried = Throughput()
     now = queued(carried, rate, lasts_s, 50.0)
     found = carried.bytes_per_s(now)
     assert found is not None
@@ -60,7 +60,7 @@ def test_a_link_is_known_after_some_time_under_load_and_not_for_ever(rate, lasts
 @given(st.lists(st.tuples(rates, st.booleans()), max_size=60))
 def test_a_link_without_a_queue_that_lasts_is_never_known(looks):
     """What is quick leaves no queue, or none for as long as a span."""
-    carried, now = Carried(), 50.0
+    carried, now = Throughput(), 50.0
     for at, (rate, waits) in enumerate(looks):
         now += LOOK_S
         carried.look(int(rate * LOOK_S), LOOK_S, now, queued=waits and at % 4 != 0)
@@ -71,7 +71,7 @@ def test_a_link_without_a_queue_that_lasts_is_never_known(looks):
 @given(rates, st.floats(0.3, 1.0), st.integers(0, 9))
 def test_one_pause_makes_no_link_thinner(rate, pause_s, phase):
     """However it falls: a busy peer's second is no sign of what the link carries."""
-    carried = Carried()
+    carried = Throughput()
     now = queued(carried, rate, 3.0 + phase * LOOK_S, 50.0)
     now = queued(carried, 0.0, pause_s, now)
     now = queued(carried, rate, 0.5, now)
@@ -82,7 +82,7 @@ def test_one_pause_makes_no_link_thinner(rate, pause_s, phase):
 
 def test_what_was_thin_and_is_so_no_more_is_found_out():
     """As after a freeze: what waited leaves at once."""
-    carried = Carried()
+    carried = Throughput()
     now = queued(carried, 1e5, 2.0, 50.0)
     assert carried.steady_bytes_per_s is not None
     carried.look(100_000, LOOK_S, now + LOOK_S, queued=False)
@@ -92,12 +92,12 @@ def test_what_was_thin_and_is_so_no_more_is_found_out():
 @given(rates, st.integers(BULK_BYTES, 10**7), st.booleans())
 def test_much_on_its_way_is_no_queue(rate, on_its_way, waits):
     """A long path holds a lot; only where some of it cannot leave the link carries no more."""
-    drain, now = Drain(), 50.0
+    drain, now = SocketProgress(), 50.0
     for look in range(40):
         unsent = on_its_way // 2 if waits else 0
         drain.look(Flow(round(rate * LOOK_S * look), 0, on_its_way, unsent=unsent), now)
         now += LOOK_S
-    assert (drain.carried.bytes_per_s(now) is not None) == waits
+    assert (drain.throughput.bytes_per_s(now) is not None) == waits
 
 
 @dataclass
@@ -122,7 +122,7 @@ def carry(
         rate: What the link carries, in bytes a second.
         known: What is known of that.
     """
-    judge = InTime({SERVICE}, lambda now: known, none_left, lambda service: None)
+    judge = DeadlineFilter({SERVICE}, lambda now: known, none_left, lambda service: None)
     waiting: deque[Request] = deque()
     good: list[Request] = []
     wasted: list[Request] = []
@@ -197,7 +197,7 @@ def test_what_shrinks_is_judged_by_what_is_left_of_it(size, ratio):
     """And where that is not known yet, it is let through."""
     packs = Compression()
     packs.ratio = ratio
-    judge = InTime({SERVICE}, lambda now: 1000.0, none_left, lambda service: packs)
+    judge = DeadlineFilter({SERVICE}, lambda now: 1000.0, none_left, lambda service: packs)
     needs_s = 0.0 if ratio is None else size * ratio / 1000.0
     assert judge.may_arrive(Request(size, 0.0, 0.0), needs_s + 1e-6, 0.0)
     if needs_s > 1e-6:
@@ -209,7 +209,9 @@ def test_what_is_wanted_whenever_it_comes_is_sent():
     """The orders of a stateful service, and topics: their time only says when to send again."""
     state = StateSpec(StateService("/get", "t/srv/G", "f"), StateService("/set", "t/srv/P", "f"))
     services = [ServiceSpec("/plain", "t/srv/T"), ServiceSpec("/kept", "t/srv/T", state=state)]
-    judge = InTime(Ways.of(services).timed, lambda now: 1000.0, none_left, lambda service: None)
+    judge = DeadlineFilter(
+        SendOptions.of(services).timed, lambda now: 1000.0, none_left, lambda service: None
+    )
     assert not judge.may_arrive(Request(5000, 0.0, 1.0, "/plain"), 1.0, 0.0)
     assert judge.may_arrive(Request(5000, 0.0, 1.0, "/kept"), 1.0, 0.0)
     assert judge.may_arrive(Request(5000, 0.0, 1.0, "topic /map"), 1.0, 0.0)
@@ -218,9 +220,9 @@ def test_what_is_wanted_whenever_it_comes_is_sent():
 @given(rates, st.integers(0, 10**7), st.integers(1, 10**6), st.floats(0.0, 5.0))
 def test_what_is_still_under_way_leaves_first(rate, outstanding, size, age_s):
     """As much of it as has not left since it was looked at."""
-    drain = Drain()
+    drain = SocketProgress()
     drain.look(Flow(0, 0, outstanding), 50.0)
-    judge = InTime({SERVICE}, lambda now: rate, drain.left_bytes, lambda service: None)
+    judge = DeadlineFilter({SERVICE}, lambda now: rate, drain.left_bytes, lambda service: None)
     needs_s = max(0.0, outstanding / rate - age_s) + size / rate
     assert judge.may_arrive(Request(size, 0.0, 0.0), needs_s * 1.001 + 1e-6, 50.0 + age_s)
     assert not judge.may_arrive(Request(size, 0.0, 0.0), needs_s * 0.999 - 1e-6, 50.0 + age_s)
@@ -235,7 +237,7 @@ def test_a_request_that_cannot_arrive_is_declined_while_the_link_is_busy(
         authority.robot(), robot="robot", pool_uid=POOL_UID, suspect_after_s=LONG_S,
         settings=LinkSettings(stall_after_s=LONG_S),
     )  # fmt: skip
-    dialer.adopt(Ways(plain=frozenset({SERVICE}), timed=frozenset({SERVICE})))
+    dialer.adopt(SendOptions(plain=frozenset({SERVICE}), timed=frozenset({SERVICE})))
     payload = os.urandom(500_000)
     numbers = count(100)
 

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import threading
 
-from fogft.link.large_send_gate import Turns
+from fogft.link.large_send_gate import LargeSendGate
 from tests.link.wire_pool import wait_for
 
 
 def test_turns_do_not_overlap() -> None:
     """With patience enough, no two threads have their turn at once."""
-    turns = Turns(patience_s=60.0)
+    gate = LargeSendGate(patience_s=60.0)
     inside: list[int] = []
     most: list[int] = []
 
     def work() -> None:
         for _ in range(200):
-            turn = turns.take()
+            turn = gate.take()
             inside.append(1)
             most.append(len(inside))
             inside.pop()
-            turns.give(turn)
+            gate.give(turn)
 
     threads = [threading.Thread(target=work) for _ in range(4)]
     for thread in threads:
@@ -33,27 +33,27 @@ def test_turns_do_not_overlap() -> None:
 
 def test_who_is_stuck_loses_the_turn() -> None:
     """The first to lose patience goes without; those after it have turns of their own."""
-    turns = Turns(patience_s=0.001)
-    stuck = turns.take()
+    gate = LargeSendGate(patience_s=0.001)
+    stuck = gate.take()
     assert stuck is not None
-    assert turns.take() is None
-    following = turns.take()
+    assert gate.take() is None
+    following = gate.take()
     assert following is not None
-    turns.give(following)
-    turns.give(stuck)
-    again = turns.take()
+    gate.give(following)
+    gate.give(stuck)
+    again = gate.take()
     assert again is following
-    turns.give(again)
+    gate.give(again)
 
 
 def test_a_waiting_thread_gets_the_turn_that_ends() -> None:
     """It need not wait for its patience to end."""
-    turns = Turns(patience_s=60.0)
-    mine = turns.take()
+    gate = LargeSendGate(patience_s=60.0)
+    mine = gate.take()
     got: list[object] = []
-    waiting = threading.Thread(target=lambda: got.append(turns.take()))
+    waiting = threading.Thread(target=lambda: got.append(gate.take()))
     waiting.start()
-    turns.give(mine)
+    gate.give(mine)
     wait_for(lambda: got)
     waiting.join()
     assert got == [mine]

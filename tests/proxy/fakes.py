@@ -95,8 +95,8 @@ class FakeDialer:
         self.links.append(link)
         return link
 
-    def adopt(self, ways) -> None:
-        self.ways = ways
+    def adopt(self, options) -> None:
+        self.options = options
 
     def renew(self) -> None:
         self.renewals += 1

@@ -1,7 +1,6 @@
 """Watch what flows through one link's connection, and end it beneath Zenoh where nothing does.
 
-Owns: a connection's socket and its `Drain`. Not here: the judgement (`drain`), when to look
-(`zenoh_link`).
+Owns: a connection's socket. Not here: the judgement (`socket_progress`), when to look (`link`).
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from fogft.link.socket_progress import BULK_BYTES, Drain
+from fogft.link.socket_progress import BULK_BYTES, SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.sockets import Address, OwnSocket
 
@@ -29,27 +28,27 @@ class FlowWatch:
 
     def __init__(self, own: Address, peer: Address) -> None:
         self._socket = OwnSocket(own, peer)
-        self._drain = Drain()
+        self._progress = SocketProgress()
         self._kept_short = False
 
     @property
     def bytes_per_s(self) -> float | None:
         """How fast it drains, once that was seen."""
-        return self._drain.bytes_per_s
+        return self._progress.bytes_per_s
 
     @property
     def thin(self) -> bool:
         """Whether it was seen to drain slowly."""
-        rate = self._drain.bytes_per_s
+        rate = self._progress.bytes_per_s
         return rate is not None and rate < THIN_BYTES_PER_S
 
     def carries_bytes_per_s(self, now: float) -> float | None:
         """What it was lately seen to carry; None where that is not known."""
-        return self._drain.carried.bytes_per_s(now)
+        return self._progress.throughput.bytes_per_s(now)
 
     def left_bytes(self, now: float, bytes_per_s: float) -> float:
-        """What is still on its way in the kernel; see `Drain.left_bytes`."""
-        return self._drain.left_bytes(now, bytes_per_s)
+        """What is still on its way in the kernel; see `SocketProgress.left_bytes`."""
+        return self._progress.left_bytes(now, bytes_per_s)
 
     def look(self, now: float, sending_for_s: float = 0.0) -> float:
         """Look once; return for how many of the last seconds large things moved."""
@@ -60,15 +59,15 @@ class FlowWatch:
             flow = sockets.flow(connection)
             if flow is None:
                 return 0.0
-            moved_s = self._drain.look(flow, now, sending_for_s)
+            moved_s = self._progress.look(flow, now, sending_for_s)
             if self.thin and not self._kept_short:
                 sockets.keep_short(connection)
                 self._kept_short = True
         return moved_s
 
     def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
-        """Whether a queue stands still, as of the last look; see `Drain.stalled`."""
-        return self._drain.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
+        """Whether a queue stands still, as of the last look; see `SocketProgress.stalled`."""
+        return self._progress.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
 
     def end_when_safe(
         self, sending: Callable[[], bool], asked: Callable[[], bool], within_s: float

@@ -18,7 +18,7 @@ WAIT_S = 2.0
 _leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
 
 
-def see_off(thread: threading.Thread) -> None:
+def join_at_exit(thread: threading.Thread) -> None:
     """Have the process wait for this thread when it ends. The thread must be about to end."""
     _leaving.add(thread)
 

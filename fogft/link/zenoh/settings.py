@@ -29,7 +29,7 @@ class LinkSettings:
     """Times of a link, in seconds.
 
     Zenoh's own two are long, because it cannot tell a thin uplink from a dead one; both ends see
-    to the connection themselves (`flow_watch`, `doorkeeper`).
+    to the connection themselves (`flow_watch`, `connection_reaper`).
 
     Attributes:
         lease_s: Zenoh ends a session whose peer sent nothing for so long. Must be longer

@@ -3,7 +3,8 @@
 Zenoh opens the sockets and tells nothing of them. The kernel does: it lists the descriptors of
 this process and counts each connection's bytes. Where it does not (no Linux), nothing is found.
 
-Owns: finding and reading sockets. Not here: what follows from it (`doorkeeper`, `drain`).
+Owns: finding and reading sockets.
+Not here: what follows from it (`connection_reaper`, `socket_progress`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One more thread for what Zenoh's threads must not do, ahead of all replies.
 
-Owns: what waits for it, and how much may. Not here: what there is to do (`asides`).
+Owns: what waits for it, and how much may. Not here: what there is to do (`control_queries`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from fogft.link.counters import Counters
 
 log = logging.getLogger(__name__)
 
-LIMIT = 1024  # probes, records and recalls that wait; a robot has a few on the way
+LIMIT = 1024  # probes, records and cancellations that wait; a robot has a few on the way
 
 
-class Chores:
+class WorkQueue:
     """A thread that does what it is given, in order. Nothing here blocks.
 
     Args:
@@ -35,26 +35,26 @@ class Chores:
         """Begin. What was given before waits until then."""
         threading.Thread(target=self._work, name="fogft-probes", daemon=True).start()
 
-    def offer(self, chore: Callable[[], None]) -> bool:
-        """Take a chore, unless too many wait: then count it; return whether it was taken."""
+    def offer(self, job: Callable[[], None]) -> bool:
+        """Take a job, unless too many wait: then count it; return whether it was taken."""
         if len(self) >= LIMIT:
             self._counters.add("chores_dropped")
             return False
-        self._queue.put(chore)
+        self._queue.put(job)
         return True
 
-    def add(self, chore: Callable[[], None]) -> None:
-        """Take a chore in any case. The collector of garbage may call this, too."""
-        self._queue.put(chore)
+    def add(self, job: Callable[[], None]) -> None:
+        """Take a job in any case. The collector of garbage may call this, too."""
+        self._queue.put(job)
 
     def close(self) -> None:
         """Do what waits, then end."""
         self._queue.put(None)
 
     def _work(self) -> None:
-        while (chore := self._queue.get()) is not None:
+        while (job := self._queue.get()) is not None:
             try:
-                chore()
+                job()
             except Exception:
                 self._counters.add("failed")
                 log.exception("chore_failed")

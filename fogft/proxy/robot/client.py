@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from fogft.errors import RosError
-from fogft.link.port import Answer, Behind, Dialer, Link, Peer
+from fogft.link.port import Answer, Dialer, GatewayView, Link, Peer
 from fogft.link.uplinks import UplinksLink
 from fogft.model import names
 from fogft.model.replica import LinkState, Member, Membership, ReplicaId
@@ -379,11 +379,11 @@ class ClientProxy:
             behind += seen_through(link.status(), member.gateway)
         return [*replicas, *best_of(behind)], gateways
 
-    def behind(self) -> tuple[Behind, ...]:
+    def behind(self) -> tuple[GatewayView, ...]:
         """Return what is seen of each replica, as a gateway tells its robots."""
         with self._lock:
             links, _ = self._link_reports()
-        return tuple(Behind.of(report) for report in links)
+        return tuple(GatewayView.of(report) for report in links)
 
     def types_behind(self) -> dict[str, Definition]:
         """Return the definitions of types as replicas told them, as a gateway passes them on."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from fogft.link.port import Behind, LinkStatus
+from fogft.link.port import GatewayView, LinkStatus
 from fogft.model.replica import LinkState
 
 _ORDER = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
@@ -28,7 +28,7 @@ def seen_through(status: LinkStatus, gateway: str) -> list[dict[str, Any]]:
     return [_report(status, gateway, one) for one in (answer.behind if answer else ())]
 
 
-def _report(status: LinkStatus, gateway: str, one: Behind) -> dict[str, Any]:
+def _report(status: LinkStatus, gateway: str, one: GatewayView) -> dict[str, Any]:
     up = status.state is LinkState.UP
     state = one.state if up or one.state is not LinkState.UP else LinkState.SUSPECT
     rtt_s = None if one.rtt_s is None or status.rtt_s is None else one.rtt_s + status.rtt_s

@@ -17,7 +17,7 @@ def leave(seconds):
 thread = threading.Thread(target=leave, args=(float(sys.argv[1]),), daemon=True)
 thread.start()
 leaving.WAIT_S = float(sys.argv[2])
-leaving.see_off(thread)
+leaving.join_at_exit(thread)
 """
 
 

@@ -1,4 +1,4 @@
-"""The thread for chores: it does what it takes, in order, whatever one of them does."""
+"""The worker thread: it does what it takes, in order, whatever one of them does."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import logging
 import threading
 
 from fogft.link.counters import Counters
-from fogft.link.zenoh.work_queue import LIMIT, Chores
+from fogft.link.zenoh.work_queue import LIMIT, WorkQueue
 from tests.link.wire_pool import LIMIT_S
 
 
 def test_chores_are_done_in_order_and_one_that_fails_stops_none(caplog):
     counters, done, last = Counters(), [], threading.Event()
-    chores = Chores(counters)
-    chores.add(lambda: done.append(1))
-    chores.start()
-    chores.add(lambda: done.append(1 // 0))
-    assert chores.offer(lambda: done.append(2))
-    chores.add(last.set)
+    work = WorkQueue(counters)
+    work.add(lambda: done.append(1))
+    work.start()
+    work.add(lambda: done.append(1 // 0))
+    assert work.offer(lambda: done.append(2))
+    work.add(last.set)
     assert last.wait(LIMIT_S)
-    chores.close()
+    work.close()
     assert done == [1, 2]
     assert counters.snapshot() == {"failed": 1}
     assert "ZeroDivisionError" in caplog.text
@@ -27,11 +27,11 @@ def test_chores_are_done_in_order_and_one_that_fails_stops_none(caplog):
 
 def test_only_so_many_wait_but_what_must_be_taken_is():
     counters = Counters()
-    chores = Chores(counters)
-    assert all(chores.offer(print) for _ in range(LIMIT))
-    assert not chores.offer(print)
-    chores.add(print)
-    assert len(chores) == LIMIT + 1
+    work = WorkQueue(counters)
+    assert all(work.offer(print) for _ in range(LIMIT))
+    assert not work.offer(print)
+    work.add(print)
+    assert len(work) == LIMIT + 1
     assert counters.snapshot() == {"chores_dropped": 1}
 
 

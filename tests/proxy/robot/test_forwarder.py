@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.link.port import Behind, LinkStatus, ProbeAnswer
+from fogft.link.port import GatewayView, LinkStatus, ProbeAnswer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import ServiceSpec
@@ -140,13 +140,13 @@ def test_closing_refuses_what_is_under_way(scene):
     assert incoming.outcome == [refused(Refusal.LOST)]
 
 
-def status(state: LinkState, *behind: Behind, detail: str = "") -> LinkStatus:
+def status(state: LinkState, *behind: GatewayView, detail: str = "") -> LinkStatus:
     answer = ProbeAnswer(1, 1, "x", behind=behind)
     return LinkStatus(state, answer, 0.5, 3.0, 0.01, 0, 0, 0, detail)
 
 
 def test_replicas_are_seen_through_a_gateway_as_if_linked():
-    up = Behind(0, 1, LinkState.UP, READY, rtt_s=0.02)
+    up = GatewayView(0, 1, LinkState.UP, READY, rtt_s=0.02)
     (seen,) = seen_through(status(LinkState.UP, up), "edge")
     assert (seen["state"], seen["ready"], seen["through"]) == ("up", ["/s"], "edge")
     assert seen["rtt_s"] == pytest.approx(0.03)
@@ -157,9 +157,9 @@ def test_replicas_are_seen_through_a_gateway_as_if_linked():
 
 
 def test_the_best_sight_of_a_replica_counts():
-    up = Behind(0, 1, LinkState.UP, READY)
-    lost = Behind(0, 1, LinkState.SUSPECT)
-    other = Behind(1, 2, LinkState.CONNECTING)
+    up = GatewayView(0, 1, LinkState.UP, READY)
+    lost = GatewayView(0, 1, LinkState.SUSPECT)
+    other = GatewayView(1, 2, LinkState.CONNECTING)
     reports = [
         *seen_through(status(LinkState.UP, lost, other), "one"),
         *seen_through(status(LinkState.UP, up), "two"),

@@ -7,7 +7,7 @@ authenticated link is ended when it is too old or when there are too many, a lin
 holder at once, and one that delivers nothing of what it holds after a while. All are counted.
 Who looks sees, too, which links are thin.
 
-Owns: ending connections, and how they drain. Not here: whose requests are refused (`guests`).
+Owns: ending connections, and how they drain. Not here: whose requests are refused (`sessions`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 
 from fogft.link.counters import Counters
-from fogft.link.socket_progress import Drain
+from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
 from fogft.link.zenoh.sockets import Address
@@ -37,7 +37,7 @@ LEAST_AGE_S = 0.5
 STUCK_AFTER_S = 15.0
 
 
-class Doorkeeper:
+class ConnectionReaper:
     """Looks after one port until closed.
 
     Args:
@@ -70,9 +70,9 @@ class Doorkeeper:
         self._stuck_after_s = stuck_after_s
         self.thin: frozenset[str] = frozenset()
         self._first_seen: dict[Address, float] = {}
-        self._drains: dict[Address, Drain] = {}
+        self._progress: dict[Address, SocketProgress] = {}
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="fogft-doorkeeper", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="fogft-reaper", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -115,19 +115,21 @@ class Doorkeeper:
         A peer that has acknowledged nothing for long is frozen, or out of reach.
         """
         thin = set()
-        drains = {peer: self._drains.get(peer) or Drain() for peer in links if peer in found}
-        for peer, drain in drains.items():
+        progress = {
+            peer: self._progress.get(peer) or SocketProgress() for peer in links if peer in found
+        }
+        for peer, one in progress.items():
             flow = sockets.flow(found[peer])
             if flow is None:
                 continue
-            drain.look(flow, now)
-            rate = drain.carried.steady_bytes_per_s
+            one.look(flow, now)
+            rate = one.throughput.steady_bytes_per_s
             if rate is not None and rate < THIN_BYTES_PER_S:
                 thin.add(links[peer])
                 sockets.keep_short(found[peer])
-            if drain.stuck_s(now) > self._stuck_after_s:
+            if one.stuck_s(now) > self._stuck_after_s:
                 self._end(found[peer], peer, "stuck_links", links[peer])
-        self._drains = drains
+        self._progress = progress
         self.thin = frozenset(thin)
 
     def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:

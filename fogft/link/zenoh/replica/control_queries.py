@@ -1,6 +1,6 @@
 """What a robot asks a replica beside its requests: to be let in, probed, believed and answered.
 
-These are queries. Zenoh's threads only decode them and hand them over; the thread for chores
+These are queries. Zenoh's threads only decode them and hand them over; the worker thread
 answers them, and their ends queue behind the replies of their robot.
 
 Owns: who is let in. Not here: requests and their replies (`zenoh_listener`, `reply_queue`).
@@ -23,8 +23,8 @@ from fogft.link.port import Probe, ProbeAnswer
 from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Streams
-from fogft.link.zenoh.replica.sessions import Guests, NotAdmittedError
-from fogft.link.zenoh.work_queue import Chores
+from fogft.link.zenoh.replica.sessions import AuthenticatedSessions, NotAdmittedError
+from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model.refusal import Refusal
 from fogft.records import frames
 from fogft.records.record import RecordError, SignedRecord
@@ -35,33 +35,33 @@ log = logging.getLogger(__name__)
 _STRANGERS = b""  # in place of a token: replies to whose connection is not known
 
 
-class Asides:
+class ControlQueries:
     """Answers the queries of robots.
 
     Args:
-        guests: Who was let in.
+        sessions: Who was let in.
         records: What the pool has signed, as far as it is known here.
         streams: Where each connection's answers go.
         queues: End queries.
-        chores: The thread that answers.
+        work: The thread that answers.
         counters: Count what came.
     """
 
     def __init__(
         self,
         *,
-        guests: Guests,
+        sessions: AuthenticatedSessions,
         records: RecordSet,
         streams: Streams,
         queues: ReplyQueues,
-        chores: Chores,
+        work: WorkQueue,
         counters: Counters,
     ) -> None:
-        self._guests = guests
+        self._sessions = sessions
         self._records = records
         self._streams = streams
         self._queues = queues
-        self._chores = chores
+        self._work_queue = work
         self._counters = counters
 
     # -- Zenoh's threads ------------------------------------------------------------------
@@ -73,11 +73,11 @@ class Asides:
         except FrameError as error:
             self._malformed(error, query, turn)
             return
-        if not self._guests.admits(greeting.token):
+        if not self._sessions.admits(greeting.token):
             self._turn_away(QueryEnd(query, turn, Refusal.NOT_ADMITTED), "it did not greet")
             return
         for token, ended in self._streams.opened(
-            greeting.token, query, self._guests.holder(greeting.token)
+            greeting.token, query, self._sessions.holder(greeting.token)
         ):
             self._queues.end(token, "gone", QueryEnd(ended, turn))
 
@@ -106,9 +106,9 @@ class Asides:
             return
         self.later(partial(self._take_records, greeting, offered, query, turn), query, turn)
 
-    def later(self, chore: Callable[[], None], query: zenoh.Query, turn: int) -> None:
+    def later(self, job: Callable[[], None], query: zenoh.Query, turn: int) -> None:
         """Have the other thread do something; where too much waits for it, the query just ends."""
-        if not self._chores.offer(chore):
+        if not self._work_queue.offer(job):
             self._queues.end(_STRANGERS, "strangers", QueryEnd(query, turn))
 
     def _turn_away(self, refused: QueryEnd, why: str) -> None:
@@ -119,7 +119,7 @@ class Asides:
         self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
         self._queues.end(_STRANGERS, "strangers", QueryEnd(query, turn, Refusal.MALFORMED))
 
-    # -- the thread for chores ------------------------------------------------------------
+    # -- the worker thread -----------------------------------------------------------
 
     def _answer_probe(
         self,
@@ -155,12 +155,12 @@ class Asides:
             query.reply(query.key_expr, b"")
         finally:
             self._end(greeting, query, turn)
-        self._guests.revoke(self._records.revoked)
+        self._sessions.revoke(self._records.revoked)
 
     def _greeted(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> bool:
         """Whether this is somebody who is let in; else it is told why not."""
         try:
-            self._guests.greet(greeting)
+            self._sessions.greet(greeting)
         except NotAdmittedError as error:
             self._turn_away(QueryEnd(query, turn, error.refusal), str(error))
             return False

@@ -12,14 +12,14 @@ from fogft.link import frame
 from fogft.link.zenoh.replica.replies import Reply
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Stream
-from fogft.link.zenoh.work_queue import Chores
+from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model.refusal import Refusal
 
 
 class ZenohIncoming:
     """A request that came over Zenoh; see `port.Incoming`."""
 
-    __slots__ = ("_chores", "_header", "_payload", "_queues", "_service", "_streams", "_thin")
+    __slots__ = ("_header", "_payload", "_queues", "_service", "_streams", "_thin", "_work_queue")
 
     def __init__(
         self,
@@ -29,7 +29,7 @@ class ZenohIncoming:
         *,
         stream: Stream,
         queues: ReplyQueues,
-        chores: Chores,
+        work: WorkQueue,
         thin: Callable[[bytes], bool],
     ) -> None:
         self._thin = thin
@@ -38,7 +38,7 @@ class ZenohIncoming:
         self._payload = payload
         self._streams = [stream]  # taken by the first answer; list.pop is atomic
         self._queues = queues
-        self._chores = chores
+        self._work_queue = work
 
     @property
     def service(self) -> str:
@@ -94,4 +94,4 @@ class ZenohIncoming:
             forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)
             header = self._header
             refuse = partial(self._queues.put, header.token, header.robot, forgotten, more=True)
-            self._chores.add(refuse)
+            self._work_queue.add(refuse)

@@ -30,18 +30,18 @@ from fogft.link.counters import Counters
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import sockets, threads
 from fogft.link.zenoh.handshakes import HandshakeLog
-from fogft.link.zenoh.join_at_exit import see_off
-from fogft.link.zenoh.replica.connection_reaper import Doorkeeper
-from fogft.link.zenoh.replica.control_queries import Asides
+from fogft.link.zenoh.join_at_exit import join_at_exit
+from fogft.link.zenoh.replica.connection_reaper import ConnectionReaper
+from fogft.link.zenoh.replica.control_queries import ControlQueries
 from fogft.link.zenoh.replica.incoming import ZenohIncoming
 from fogft.link.zenoh.replica.query_ends import QueryTurns
 from fogft.link.zenoh.replica.replies import Reply
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Stream, Streams
-from fogft.link.zenoh.replica.sessions import Guests
+from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
-from fogft.link.zenoh.work_queue import Chores
+from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
@@ -83,11 +83,11 @@ class ZenohListener:
     ) -> None:
         self._endpoint = _with_port(listen)
         self._handshakes = handshakes
-        self._doorkeeper: Doorkeeper | None = None
+        self._reaper: ConnectionReaper | None = None
         self._id = id
         self._settings = settings or LinkSettings()
         self._config = replica_settings(self._endpoint, id, credentials, self._settings)
-        self._guests = Guests(
+        self._sessions = AuthenticatedSessions(
             id.pool_uid,
             certificate_name or id.certificate_name,
             LazyVerifier(credentials.ca),
@@ -95,16 +95,16 @@ class ZenohListener:
         self._counters = Counters()
         self._turns = QueryTurns()
         self._queues = ReplyQueues(self._counters, self._turns)
-        self._chores = Chores(self._counters)
+        self._work_queue = WorkQueue(self._counters)
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
         self._streams = Streams(slow=self._slow)
-        self._asides = Asides(
-            guests=self._guests,
+        self._control = ControlQueries(
+            sessions=self._sessions,
             records=RecordSet(id.pool_uid, LazyVerifier(credentials.ca)),
             streams=self._streams,
             queues=self._queues,
-            chores=self._chores,
+            work=self._work_queue,
             counters=self._counters,
         )
         self._services: dict[str, str] = {}  # key -> service
@@ -137,11 +137,11 @@ class ZenohListener:
                 f"cannot listen at `{self._endpoint}`: {str(error).split(' at /')[0]}",
                 "see that the port is free and that the certificate, its key and the CA exist",
             ) from error
-        self._chores.start()
-        self._doorkeeper = Doorkeeper(
+        self._work_queue.start()
+        self._reaper = ConnectionReaper(
             self._port,
             self._peers,
-            lambda: self._guests.revoked,
+            lambda: self._sessions.revoked,
             self._counters,
             also=self._count_handshakes,
             stuck_after_s=self._settings.stuck_after_s,
@@ -150,10 +150,10 @@ class ZenohListener:
         place = self._id.pool_uid, self._id.slot
         self._hear(session, names.services_key(*place), partial(self._request, on_request))
         self._hear(session, names.cancel_key(*place), partial(self._cancel, on_cancel))
-        self._declare(session, names.answers_key(*place), self._asides.open_answers)
-        self._declare(session, names.records_key(*place), self._asides.records)
+        self._declare(session, names.answers_key(*place), self._control.open_answers)
+        self._declare(session, names.records_key(*place), self._control.records)
         # Last: who is told that this replica is ready finds every service.
-        self._declare(session, names.probe_key(*place), partial(self._asides.probe, on_probe))
+        self._declare(session, names.probe_key(*place), partial(self._control.probe, on_probe))
 
     def add(self, services: Mapping[str, str]) -> None:
         """Hear requests for further services too (name -> key)."""
@@ -166,11 +166,11 @@ class ZenohListener:
 
     def _slow(self, holder: str) -> bool:
         """Whether what a robot is sent was seen to leave slowly."""
-        doorkeeper = self._doorkeeper
-        return doorkeeper is not None and holder in doorkeeper.thin
+        connection_reaper = self._reaper
+        return connection_reaper is not None and holder in connection_reaper.thin
 
     def _thin(self, token: bytes) -> bool:
-        return self._slow(self._guests.holder(token))
+        return self._slow(self._sessions.holder(token))
 
     def _count_handshakes(self) -> None:
         for reason in self._handshakes.refusals() if self._handshakes else ():
@@ -231,7 +231,7 @@ class ZenohListener:
     ) -> None:
         token = requests[0][0].token
         stream = self._streams.of(token)
-        if stream is None or not self._guests.admits(token):
+        if stream is None or not self._sessions.admits(token):
             self._counters.warn(
                 log, "not_admitted", "robot_not_admitted reason=%r", "it did not greet"
             )
@@ -255,7 +255,7 @@ class ZenohListener:
                 request,
                 stream=stream,
                 queues=self._queues,
-                chores=self._chores,
+                work=self._work_queue,
                 thin=self._thin,
             )
             try:
@@ -287,13 +287,13 @@ class ZenohListener:
         except FrameError as error:
             self._malformed(error)
             return
-        self._chores.offer(partial(on_cancel, ids))
+        self._work_queue.offer(partial(on_cancel, ids))
 
     # -- the owner ------------------------------------------------------------------------
 
     def revoke(self, names: Collection[str]) -> None:
         """Let these holders in no more; what they ask from now on is refused."""
-        self._guests.revoke(names)
+        self._sessions.revoke(names)
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
@@ -310,16 +310,16 @@ class ZenohListener:
             return
         self._declared.clear()
         self._streams.clear()
-        if self._doorkeeper is not None:
-            self._doorkeeper.close()
+        if self._reaper is not None:
+            self._reaper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)
         sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
-        self._chores.close()
+        self._work_queue.close()
         closer = threading.Thread(
             target=_close, args=(session,), name="fogft-close-listener", daemon=True
         )
         closer.start()
-        see_off(closer)
+        join_at_exit(closer)
         closer.join(_CLOSE_WAIT_S / 2)
 
 

@@ -7,7 +7,7 @@ Only who has read a reply knows its stamp: no robot can make others wait by sayi
 
 All connections of a robot count together: they may share one socket. What was sent over another one
 counts for a minute after it was sent, since that one may be gone; whoever reads more slowly than
-that is known by the doorkeeper, and is sent nothing at once.
+that is known by the `connection_reaper`, and is sent nothing at once.
 
 Owns: stamps, and who sends. Not here: the connections (`streams`).
 """
@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from fogft.link.frame import STAMP_BYTES
 
-UNSEEN_LIMIT = 4  # replies of 16 KiB: the 64 KiB of `credit`, for the same reason
+CREDIT_LIMIT = 4  # replies of 16 KiB: 64 KiB, for the same reason
 _OTHERS_COUNT_FOR_S = 60.0
 
 Send = Callable[[bytes], None]  # takes the stamp
@@ -35,7 +35,7 @@ class _Sent(NamedTuple):
     may_block: bool  # it was sent by somebody who may
 
 
-class Unseen:
+class ReplyCredit:
     """What one robot has not said that it has seen. Any thread.
 
     Args:
@@ -53,22 +53,22 @@ class Unseen:
         self._gate = threading.Lock()  # held by who sends at once, which does not take long
         self._lock = threading.Lock()
         self._blockable = 0  # senders under way who may block
-        self._unseen: dict[bytes, _Sent] = {}  # by stamp, oldest first
+        self._outstanding: dict[bytes, _Sent] = {}  # by stamp, oldest first
 
     def seen(self, connection: object, stamp: bytes) -> None:
         """Note the last stamp that was seen on a connection; one that is not known is fine."""
-        if stamp not in self._unseen:  # nothing new, as mostly
+        if stamp not in self._outstanding:  # nothing new, as mostly
             return
         with self._lock:
-            sent = self._unseen.get(stamp)
+            sent = self._outstanding.get(stamp)
             if sent is not None and sent.connection is connection:
                 self._forget(connection, stamp)
 
     def _forget(self, connection: object, last: bytes = b"") -> None:
         """Forget what was sent on a connection, up to a stamp. Under the lock."""
-        for stamp, sent in list(self._unseen.items()):
+        for stamp, sent in list(self._outstanding.items()):
             if sent.connection is connection:
-                del self._unseen[stamp]
+                del self._outstanding[stamp]
             if stamp == last:
                 return
 
@@ -81,7 +81,7 @@ class Unseen:
             with self._lock:
                 if self._blockable or self._full(connection):
                     return False
-                self._unseen[stamp] = _Sent(connection, self._clock(), may_block=False)
+                self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=False)
             send(stamp)
             return True
         finally:
@@ -89,18 +89,18 @@ class Unseen:
 
     def _full(self, connection: object) -> bool:
         """Whether all that buffers surely hold may be on the way. Under the lock."""
-        if not self._unseen:
+        if not self._outstanding:
             return False
         self._forget_old(connection)
-        full = len(self._unseen) >= UNSEEN_LIMIT
-        return full or any(sent.may_block for sent in self._unseen.values())
+        full = len(self._outstanding) >= CREDIT_LIMIT
+        return full or any(sent.may_block for sent in self._outstanding.values())
 
     def _forget_old(self, connection: object) -> None:
         """Forget what was sent on other connections long ago. Under the lock."""
         since = self._clock() - _OTHERS_COUNT_FOR_S
-        for stamp, sent in list(self._unseen.items()):
+        for stamp, sent in list(self._outstanding.items()):
             if sent.connection is not connection and sent.at < since:
-                del self._unseen[stamp]
+                del self._outstanding[stamp]
 
     def send(self, connection: object, send: Send) -> None:
         """Call `send`, which may block, for anything. At once nothing leaves until it was seen."""
@@ -109,11 +109,11 @@ class Unseen:
             self._blockable += 1
             self._forget(connection)  # who has seen this has seen those before it
             self._forget_old(connection)
-            self._unseen[stamp] = _Sent(connection, math.inf, may_block=True)  # it goes on
+            self._outstanding[stamp] = _Sent(connection, math.inf, may_block=True)  # it goes on
         try:
             send(stamp)
         finally:
             with self._lock:
                 self._blockable -= 1
-                if stamp in self._unseen:
-                    self._unseen[stamp] = _Sent(connection, self._clock(), may_block=True)
+                if stamp in self._outstanding:
+                    self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=True)

@@ -4,7 +4,7 @@ A connection asks it once, after it has greeted; every answer, and every refusal
 Whoever asks again under one token, or whose connection is the oldest of too many, has its former
 query ended, and opens another connection.
 
-Owns: which query is whose. Not here: who is let in (`guests`), what may leave at once (`unseen`),
+Owns: which query is whose. Not here: who is let in (`sessions`), what may leave at once (`credit`),
 the threads that may block (`reply_queue`).
 """
 
@@ -17,7 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
-from fogft.link.zenoh.replica.reply_credit import Send, Unseen
+from fogft.link.zenoh.replica.reply_credit import ReplyCredit, Send
 
 if TYPE_CHECKING:
     import zenoh
@@ -30,27 +30,27 @@ class Stream:
 
     Args:
         query: The query.
-        unseen: What is on the way to its robot.
+        credit: What is on the way to its robot.
     """
 
-    __slots__ = ("_name", "_unseen", "query")
+    __slots__ = ("_credit", "_name", "query")
 
-    def __init__(self, query: zenoh.Query, unseen: Unseen | None = None) -> None:
+    def __init__(self, query: zenoh.Query, credit: ReplyCredit | None = None) -> None:
         self.query = query
-        self._unseen = unseen or Unseen()
+        self._credit = credit or ReplyCredit()
         self._name = object()  # which must not keep the query: that ends with us
 
     def seen(self, stamp: bytes) -> None:
         """Note the last stamp that the robot says it has seen; one that is not known is fine."""
-        self._unseen.seen(self._name, stamp)
+        self._credit.seen(self._name, stamp)
 
     def send_at_once(self, send: Send) -> bool:
         """Call `send` for something of at most 16 KiB where it cannot block; return whether."""
-        return self._unseen.send_at_once(self._name, send)
+        return self._credit.send_at_once(self._name, send)
 
     def send(self, send: Send) -> None:
         """Call `send`, which may block, for anything. At once nothing leaves until it was seen."""
-        self._unseen.send(self._name, send)
+        self._credit.send(self._name, send)
 
 
 class Streams:
@@ -66,7 +66,7 @@ class Streams:
         self._slow = slow
         self._lock = threading.Lock()
         self._streams: OrderedDict[bytes, Stream] = OrderedDict()
-        self._unseen: WeakValueDictionary[str, Unseen] = WeakValueDictionary()
+        self._credit: WeakValueDictionary[str, ReplyCredit] = WeakValueDictionary()
 
     def opened(
         self, token: bytes, query: zenoh.Query, holder: str
@@ -76,10 +76,10 @@ class Streams:
         with self._lock:
             if token in self._streams:
                 ended.append((token, self._streams.pop(token).query))
-            unseen = self._unseen.get(holder)
-            if unseen is None:
-                unseen = self._unseen[holder] = Unseen(partial(self._slow, holder))
-            self._streams[token] = Stream(query, unseen)
+            credit = self._credit.get(holder)
+            if credit is None:
+                credit = self._credit[holder] = ReplyCredit(partial(self._slow, holder))
+            self._streams[token] = Stream(query, credit)
             if len(self._streams) > self._limit:
                 oldest, stream = self._streams.popitem(last=False)
                 ended.append((oldest, stream.query))

@@ -38,7 +38,7 @@ class NotAdmittedError(Exception):
         self.refusal = refusal
 
 
-class Guests:
+class AuthenticatedSessions:
     """The connections that may ask here. Safe to use from several threads.
 
     Args:

@@ -16,18 +16,18 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from fogft.link import batch_frames, frame
-from fogft.link.cancellations import Recalls
+from fogft.link.cancellations import Cancellations
 from fogft.link.compression import Compression
 from fogft.link.credit import Credit
-from fogft.link.deadline_filter import InTime
-from fogft.link.large_send_gate import LARGE_BYTES, Turns
+from fogft.link.deadline_filter import DeadlineFilter
+from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
 from fogft.link.port import Answer
-from fogft.link.send_options import Ways
+from fogft.link.send_options import SendOptions
 from fogft.link.window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.link.zenoh.flow_watch import FlowWatch
-from fogft.link.zenoh.join_at_exit import see_off
+from fogft.link.zenoh.join_at_exit import join_at_exit
 from fogft.link.zenoh.robot.attempt import OpenAttempt
-from fogft.link.zenoh.robot.batch_buffer import Held
+from fogft.link.zenoh.robot.batch_buffer import BatchBuffer
 from fogft.link.zenoh.robot.send_queue import SendQueue
 from fogft.link.zenoh.robot.unanswered import Unanswered
 from fogft.model.refusal import Refusal
@@ -56,7 +56,7 @@ class Outlet(Protocol):
     def publish(self, service: str, content: bytes, header: bytes) -> None:
         """Send a message to a service. May block for as long as the peer takes nothing."""
 
-    def recall(self, ids: Sequence[bytes]) -> None:
+    def cancel(self, ids: Sequence[bytes]) -> None:
         """Tell the replica that these are no longer wanted. May block likewise."""
 
     def alive(self) -> bool:
@@ -73,9 +73,9 @@ class Attempts:
         outlet: The connection.
         services: What may be asked for.
         origin: What the headers of all its requests say (`frame.origin`).
-        ways: How the services' payloads are sent.
-        turns: Shared with the robot's other connections.
-        recalls: Of whom the replica is told that it may stop; None to tell of nobody.
+        options: How the services' payloads are sent.
+        gate: Shared with the robot's other connections.
+        cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
         answered: Called with each attempt's end, once. Must not block.
         late: Called with service and id when a forgotten request was answered. Must not block.
         room: Called when a window that was full has room again.
@@ -96,9 +96,9 @@ class Attempts:
         services: Iterable[str],
         origin: bytes,
         *,
-        ways: Ways,
-        turns: Turns,
-        recalls: Recalls | None,
+        options: SendOptions,
+        gate: LargeSendGate,
+        cancellations: Cancellations | None,
         answered: Callable[[Answer], None],
         late: Callable[[str, bytes], None],
         room: Callable[[], None],
@@ -109,8 +109,8 @@ class Attempts:
         self._outlet = outlet
         self._services = frozenset(services)
         self._origin = origin
-        self._turns = turns
-        self._recalls = recalls
+        self._gate = gate
+        self._cancellations = cancellations
         self._answered = answered
         self._late = late
         self._room = room
@@ -126,13 +126,13 @@ class Attempts:
         self._seen = frame.NO_STAMP  # the stamp of the last answer
         self._telling = False
         self._unanswered = Unanswered()
-        self._held = Held()
+        self._batch = BatchBuffer()
         self._credit = Credit()
-        self._queue = SendQueue(ways.latest)
-        self._compressions = {name: Compression() for name in self._services - ways.plain}
+        self._queue = SendQueue(options.latest)
+        self._compressions = {name: Compression() for name in self._services - options.plain}
         self._flow = outlet.flow
-        self._in_time = InTime(
-            ways.timed, self._flow.carries_bytes_per_s, self._left_bytes, self._compression
+        self._deadline = DeadlineFilter(
+            options.timed, self._flow.carries_bytes_per_s, self._left_bytes, self._compression
         )
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -153,7 +153,7 @@ class Attempts:
             return False
         now = time.monotonic()
         attempt = OpenAttempt(service, request_id, payload, offered=now, remaining_s=remaining_s)
-        if not self._in_time.may_arrive(attempt, remaining_s, now, self._before):
+        if not self._deadline.may_arrive(attempt, remaining_s, now, self._before):
             return False
         if not self.window.admit(attempt) and not self._displace(attempt):
             return False
@@ -165,8 +165,8 @@ class Attempts:
             return True
         # It cannot block: the hop to another thread is saved.
         attempt.mark = mark
-        if (more or self._held) and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
-            self._send_together(self._held.add(attempt))
+        if (more or self._batch) and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
+            self._send_together(self._batch.add(attempt))
         else:
             self._send_at_once(attempt, payload, remaining_s)
         if not more:
@@ -184,7 +184,7 @@ class Attempts:
 
     def send(self) -> None:
         """Send what was offered with `more`. Never blocks: it was small, and reserved."""
-        self._send_together(self._held.take())
+        self._send_together(self._batch.take())
 
     def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
         if len(attempts) < 2 or self._flow.thin:  # there, each is compressed
@@ -237,8 +237,12 @@ class Attempts:
         attempt = self.window.forget(request_id)
         if attempt is None:
             return
-        sent, recalls, now = attempt.payload is None, self._recalls, time.monotonic()
-        if sent and recalls is not None and recalls.add(request_id, attempt.offered, now):
+        sent, cancellations, now = attempt.payload is None, self._cancellations, time.monotonic()
+        if (
+            sent
+            and cancellations is not None
+            and cancellations.add(request_id, attempt.offered, now)
+        ):
             self.flush()
         attempt.payload = None
         if self.window.regained_room():
@@ -246,7 +250,7 @@ class Attempts:
 
     def flush(self) -> None:
         """Have the replica told of what was forgotten and not answered."""
-        if self._recalls and not self._telling:  # there are some
+        if self._cancellations and not self._telling:  # there are some
             self._telling = True
             self._queue.put(_TELL)
 
@@ -273,11 +277,11 @@ class Attempts:
 
     def _tell(self) -> None:
         self._telling = False
-        ids = self._recalls.take() if self._recalls is not None else []
+        ids = self._cancellations.take() if self._cancellations is not None else []
         if not ids:
             return
         try:
-            self._outlet.recall(ids)
+            self._outlet.cancel(ids)
         except Exception as error:
             self._outlet.lose(f"sending failed: {error}")
 
@@ -296,12 +300,12 @@ class Attempts:
         if remaining_s <= 0:
             self._end(attempt, None, Refusal.LOST)
             return
-        if not self._in_time.may_arrive(attempt, remaining_s, time.monotonic()):
+        if not self._deadline.may_arrive(attempt, remaining_s, time.monotonic()):
             self._end(attempt, None, Refusal.TOO_SLOW)
             return
         attempt.payload = None
         large = attempt.size >= LARGE_BYTES
-        turn = self._turns.take() if large else None
+        turn = self._gate.take() if large else None
         began = time.monotonic()
         if large:
             self._large_since = self._sending_since = began
@@ -311,7 +315,7 @@ class Attempts:
                 self._publish(attempt, payload, remaining_s)
         finally:
             self._sending_since = None
-            self._turns.give(turn)
+            self._gate.give(turn)
         if large:
             self._held_by_zenoh = time.monotonic(), min(attempt.size, _ZENOH_HOLDS_BYTES)
         if time.monotonic() - began > _STUCK_S and not self._outlet.alive():
@@ -358,8 +362,8 @@ class Attempts:
         if self.window.holds(attempt):
             self._end(attempt, answer.payload, answer.refusal)
             return
-        if self._recalls is not None:  # it was forgotten, or has ended
-            self._recalls.answered(answer.request_id)
+        if self._cancellations is not None:  # it was forgotten, or has ended
+            self._cancellations.answered(answer.request_id)
         if answer.payload is not None or answer.refusal == Refusal.LATE:
             self._late(attempt.service, answer.request_id)
 
@@ -392,7 +396,7 @@ class Attempts:
     def close(self) -> None:
         """Take nothing more: what is open is lost. Returns at once; `end` must follow."""
         ended = self.window.close()
-        see_off(self._thread)
+        join_at_exit(self._thread)
         for attempt in ended:
             attempt.payload = None
             self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))

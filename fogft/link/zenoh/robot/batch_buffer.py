@@ -13,7 +13,7 @@ from fogft.link.batch_frames import BYTES_LIMIT, LIMIT
 from fogft.link.zenoh.robot.attempt import OpenAttempt
 
 
-class Held:
+class BatchBuffer:
     """The attempts of one service at a time. Any thread."""
 
     def __init__(self) -> None:

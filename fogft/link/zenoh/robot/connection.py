@@ -26,14 +26,14 @@ from zenoh import handlers
 
 from fogft.errors import FrameError, WireError
 from fogft.link import frame
-from fogft.link.cancellations import Recalls
-from fogft.link.large_send_gate import Turns
+from fogft.link.cancellations import Cancellations
+from fogft.link.large_send_gate import LargeSendGate
 from fogft.link.port import Answer, Peer
-from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.flow_watch import FlowWatch
-from fogft.link.zenoh.join_at_exit import see_off
+from fogft.link.zenoh.join_at_exit import join_at_exit
 from fogft.link.zenoh.robot.attempt import read_reply
 from fogft.link.zenoh.robot.attempts import Attempts
 from fogft.link.zenoh.sockets import address
@@ -72,9 +72,9 @@ class Connection:
         robot: Who we are.
         keys: Service name -> key.
         sign: Signs our greeting.
-        ways: How the services' payloads are sent.
-        turns: Shared with the robot's other connections.
-        recalls: Of whom the replica is told that it may stop; None to tell of nobody.
+        options: How the services' payloads are sent.
+        gate: Shared with the robot's other connections.
+        cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
         answered: Called with each attempt's end, once. Must not block.
         late: Called with service and id when a forgotten request was answered. Must not block.
         lost: Called, from any thread and perhaps more than once, when it is no longer of use.
@@ -102,9 +102,9 @@ class Connection:
         keys: Mapping[str, str],
         *,
         sign: Sign,
-        ways: Ways = PLAIN_WAYS,
-        turns: Turns,
-        recalls: Recalls | None = None,
+        options: SendOptions = DEFAULT_OPTIONS,
+        gate: LargeSendGate,
+        cancellations: Cancellations | None = None,
         answered: Callable[[Answer], None],
         late: Callable[[str, bytes], None],
         lost: Callable[[], None],
@@ -140,9 +140,9 @@ class Connection:
             self,
             keys,
             frame.origin(robot, self._token),
-            ways=ways,
-            turns=turns,
-            recalls=recalls,
+            options=options,
+            gate=gate,
+            cancellations=cancellations,
             answered=answered,
             late=late,
             room=room,
@@ -196,7 +196,7 @@ class Connection:
         """
         self._publishers[service].put(content, attachment=header)
 
-    def recall(self, ids: Sequence[bytes]) -> None:
+    def cancel(self, ids: Sequence[bytes]) -> None:
         """Tell the replica that these are no longer wanted. May block likewise.
 
         Raises:
@@ -337,4 +337,4 @@ def _close_aside(session: Any, peer: Peer) -> None:
         target=_close, args=(session,), name=f"fogft-close-{peer.id.short}", daemon=True
     )
     closer.start()
-    see_off(closer)
+    join_at_exit(closer)

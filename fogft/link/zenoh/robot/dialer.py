@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from fogft.errors import CredentialError, WireError
 from fogft.link.port import LinkEvents, Peer
-from fogft.link.send_options import Ways
+from fogft.link.send_options import SendOptions
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.settings import LinkSettings
@@ -60,9 +60,9 @@ class ZenohDialer:
         self._lock = threading.Lock()
         self._links: list[ZenohLink] = []
 
-    def adopt(self, ways: Ways) -> None:
+    def adopt(self, options: SendOptions) -> None:
         """Set what services want of their links, from the next connection on."""
-        self._shared.ways = ways
+        self._shared.options = options
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
         """Start a link; return at once, in state CONNECTING.

@@ -18,11 +18,11 @@ from collections.abc import Callable, Mapping
 import zenoh
 
 from fogft.errors import CredentialError, WireError
-from fogft.link.cancellations import Recalls
+from fogft.link.cancellations import Cancellations
 from fogft.link.compression import ZLIB, ZLIB_ANSWERS
 from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.link.zenoh import settings
-from fogft.link.zenoh.join_at_exit import see_off
+from fogft.link.zenoh.join_at_exit import join_at_exit
 from fogft.link.zenoh.robot.connection import Connection
 from fogft.link.zenoh.robot.opening import Opening
 from fogft.link.zenoh.robot.probing import Probing
@@ -164,7 +164,7 @@ class ZenohLink:
     def close(self) -> None:
         """End the link; its keeper lets go of the rest within moments."""
         self._closed = True
-        see_off(self._thread)
+        join_at_exit(self._thread)
         self._wake.set()
         live, self._live = self._live, None
         self._ready = frozenset()
@@ -258,9 +258,9 @@ class ZenohLink:
                 self._shared.robot,
                 self._services,
                 sign=self._shared.sign,
-                ways=self._shared.ways,
-                turns=self._shared.turns,
-                recalls=Recalls() if self._shared.tell_losers else None,
+                options=self._shared.options,
+                gate=self._shared.gate,
+                cancellations=Cancellations() if self._shared.tell_losers else None,
                 answered=self._answered,
                 late=self._late,
                 lost=self._wake.set,

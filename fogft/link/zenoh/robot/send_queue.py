@@ -28,14 +28,14 @@ class SendQueue:
     """
 
     def __init__(self, latest: Collection[str] = ()) -> None:
-        self._turns: SimpleQueue[OpenAttempt | str | None] = SimpleQueue()
+        self._queued: SimpleQueue[OpenAttempt | str | None] = SimpleQueue()
         self._lock = threading.Lock()
         self._order = count()
         self._waiting: dict[str, Waiting] = {service: [] for service in latest}
 
     def qsize(self) -> int:
         """How many wait."""
-        return self._turns.qsize()
+        return self._queued.qsize()
 
     def overtakes(self, service: str) -> bool:
         """Whether what comes last of a service goes first."""
@@ -45,15 +45,15 @@ class SendQueue:
         """Let an attempt wait; None ends the sender when all before it was taken."""
         waiting = self._waiting.get(attempt.service) if attempt is not None else None
         if attempt is None or waiting is None:
-            self._turns.put(attempt)
+            self._queued.put(attempt)
             return
         with self._lock:
             heapq.heappush(waiting, (-attempt.deadline, next(self._order), attempt))
-        self._turns.put(attempt.service)
+        self._queued.put(attempt.service)
 
     def get(self) -> OpenAttempt | None:
         """Wait for the next one."""
-        turn = self._turns.get()
+        turn = self._queued.get()
         if not isinstance(turn, str):
             return turn
         with self._lock:

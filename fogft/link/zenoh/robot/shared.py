@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from fogft.link.large_send_gate import Turns
-from fogft.link.send_options import PLAIN_WAYS, Ways
+from fogft.link.large_send_gate import LargeSendGate
+from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.records.signing import Signer
@@ -22,8 +22,8 @@ class Shared:
         manager_age: Seconds since the pool's manager gave a sign, None if never.
         settings: Zenoh's times.
         tell_losers: Whether replicas are told which requests are no longer wanted.
-        ways: How each service is sent.
-        turns: Lets one large message go at a time.
+        options: How each service is sent.
+        gate: Lets one large message go at a time.
         records: Signed records for every replica, packed; empty for none.
     """
 
@@ -33,8 +33,8 @@ class Shared:
     manager_age: Callable[[], float | None]
     settings: LinkSettings
     tell_losers: bool
-    ways: Ways = PLAIN_WAYS
-    turns: Turns = field(default_factory=Turns)
+    options: SendOptions = DEFAULT_OPTIONS
+    gate: LargeSendGate = field(default_factory=LargeSendGate)
     records: bytes = b""
     _signer: Signer | None = None
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link import frame
-from fogft.link.zenoh.replica.reply_credit import UNSEEN_LIMIT, Unseen
+from fogft.link.zenoh.replica.reply_credit import CREDIT_LIMIT, ReplyCredit
 from fogft.link.zenoh.replica.reply_streams import Streams
 from tests.proxy.fakes import Clock
 
@@ -25,115 +25,115 @@ ONE, OTHER = object(), object()  # two connections of a robot
 )
 def test_only_what_cannot_block_leaves_at_once(steps: list[str | int]) -> None:
     """At most so much on the way, by what the robot proves; nothing behind what may be stuck."""
-    unseen, sent, seen, patient = Unseen(), [], 0, 0
+    credit, sent, seen, patient = ReplyCredit(), [], 0, 0
     for step in steps:
         if step == "at once":
-            left = unseen.send_at_once(ONE, sent.append)
-            assert left == (len(sent) - left - seen < UNSEEN_LIMIT and patient <= seen)
+            left = credit.send_at_once(ONE, sent.append)
+            assert left == (len(sent) - left - seen < CREDIT_LIMIT and patient <= seen)
         elif step == "with patience":
-            unseen.send(ONE, sent.append)
+            credit.send(ONE, sent.append)
             patient = len(sent)
         elif step == "forged":
-            unseen.seen(ONE, frame.NO_STAMP)
+            credit.seen(ONE, frame.NO_STAMP)
         elif isinstance(step, int) and step < len(sent):
-            unseen.seen(ONE, sent[step])
+            credit.seen(ONE, sent[step])
             if step + 1 >= patient:  # older ones say nothing of what was sent with patience
                 seen = max(seen, step + 1)
     assert len(set(sent)) == len(sent)
 
 
 def test_nothing_leaves_at_once_while_somebody_sends_who_may_block() -> None:
-    unseen, tried = Unseen(), []
-    unseen.send(ONE, lambda _: tried.append(unseen.send_at_once(ONE, tried.append)))
+    credit, tried = ReplyCredit(), []
+    credit.send(ONE, lambda _: tried.append(credit.send_at_once(ONE, tried.append)))
     assert tried == [False]
-    assert not unseen.send_at_once(ONE, tried.append)  # nor before the robot has seen that one
+    assert not credit.send_at_once(ONE, tried.append)  # nor before the robot has seen that one
 
 
 def test_whoever_sends_with_patience_goes_on_after_an_error() -> None:
-    unseen = Unseen()
+    credit = ReplyCredit()
 
     def fail(_: bytes) -> None:
         raise zenoh.ZError("closed")
 
-    for send in (unseen.send_at_once, unseen.send):
+    for send in (credit.send_at_once, credit.send):
         with pytest.raises(zenoh.ZError):
             send(ONE, fail)
     sent: list[bytes] = []
-    unseen.send(ONE, sent.append)
+    credit.send(ONE, sent.append)
     assert len(sent) == 1
 
 
 def test_what_is_sent_with_patience_while_a_stamp_is_looked_up_is_not_taken_for_seen() -> None:
-    unseen, sent = Unseen(), []
-    unseen.send_at_once(ONE, sent.append)
+    credit, sent = ReplyCredit(), []
+    credit.send_at_once(ONE, sent.append)
 
     class Raced(dict):
         """Somebody else is faster, once."""
 
         def __contains__(self, stamp: object) -> bool:
             if len(sent) == 1:
-                unseen.send(ONE, sent.append)
+                credit.send(ONE, sent.append)
             return super().__contains__(stamp)
 
-    unseen._unseen = Raced(unseen._unseen)
-    unseen.seen(ONE, sent[0])
+    credit._outstanding = Raced(credit._outstanding)
+    credit.seen(ONE, sent[0])
     assert len(sent) == 2
-    assert not unseen.send_at_once(ONE, sent.append)
-    unseen.seen(ONE, sent[1])
-    assert unseen.send_at_once(ONE, sent.append)
+    assert not credit.send_at_once(ONE, sent.append)
+    credit.seen(ONE, sent[1])
+    assert credit.send_at_once(ONE, sent.append)
 
 
 def test_all_connections_of_a_robot_count_together() -> None:
     """They may share one socket: together they would fill what it holds."""
-    unseen, sent = Unseen(), []
+    credit, sent = ReplyCredit(), []
     for connection in (ONE, OTHER, ONE, OTHER):
-        assert unseen.send_at_once(connection, sent.append)
-    assert not unseen.send_at_once(ONE, sent.append)
-    unseen.seen(OTHER, sent[2])  # it was sent on the other one: that says nothing of this
-    assert not unseen.send_at_once(ONE, sent.append)
-    unseen.seen(ONE, sent[2])
-    assert unseen.send_at_once(OTHER, sent.append)
-    unseen.send(OTHER, sent.append)
-    assert not unseen.send_at_once(ONE, sent.append)
+        assert credit.send_at_once(connection, sent.append)
+    assert not credit.send_at_once(ONE, sent.append)
+    credit.seen(OTHER, sent[2])  # it was sent on the other one: that says nothing of this
+    assert not credit.send_at_once(ONE, sent.append)
+    credit.seen(ONE, sent[2])
+    assert credit.send_at_once(OTHER, sent.append)
+    credit.send(OTHER, sent.append)
+    assert not credit.send_at_once(ONE, sent.append)
 
 
 def test_nothing_leaves_at_once_beside_one_who_may_block_on_another_connection() -> None:
     """However long he is at it; and whoever sends so does not wait for the next one."""
     clock, tried = Clock(), []
-    unseen = Unseen(clock=clock)
+    credit = ReplyCredit(clock=clock)
 
     def long(_: bytes) -> None:
         clock.now += 3600.0
-        tried.append(unseen.send_at_once(ONE, tried.append))
-        unseen.send(ONE, lambda stamp: unseen.seen(ONE, stamp))
+        tried.append(credit.send_at_once(ONE, tried.append))
+        credit.send(ONE, lambda stamp: credit.seen(ONE, stamp))
 
-    unseen.send(OTHER, long)
-    tried.append(unseen.send_at_once(ONE, tried.append))
+    credit.send(OTHER, long)
+    tried.append(credit.send_at_once(ONE, tried.append))
     assert tried == [False, False]
 
 
 def test_what_was_sent_on_another_connection_counts_for_a_minute() -> None:
     """That may be gone: a robot opens a new one where the old one is lost."""
     clock, sent = Clock(), []
-    unseen = Unseen(clock=clock)
-    unseen.send(OTHER, sent.append)
+    credit = ReplyCredit(clock=clock)
+    credit.send(OTHER, sent.append)
     clock.now += 59.0
-    assert not unseen.send_at_once(ONE, sent.append)
+    assert not credit.send_at_once(ONE, sent.append)
     clock.now += 2.0
-    assert unseen.send_at_once(ONE, sent.append)
+    assert credit.send_at_once(ONE, sent.append)
     clock.now += 3600.0
-    unseen.send(ONE, sent.append)
+    credit.send(ONE, sent.append)
     clock.now += 3600.0
-    assert not unseen.send_at_once(ONE, sent.append), "its own must be seen"
+    assert not credit.send_at_once(ONE, sent.append), "its own must be seen"
 
 
 def test_connections_that_are_gone_leave_nothing_behind() -> None:
     clock = Clock()
-    unseen = Unseen(clock=clock)
+    credit = ReplyCredit(clock=clock)
     for _ in range(1000):
-        unseen.send(object(), lambda _: None)
+        credit.send(object(), lambda _: None)
         clock.now += 1.0
-    assert len(unseen._unseen) < 70
+    assert len(credit._outstanding) < 70
 
 
 def test_who_reads_slowly_is_sent_nothing_at_once() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fogft.link import frame
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh.replica.listener import ZenohListener
-from fogft.link.zenoh.replica.reply_credit import UNSEEN_LIMIT
+from fogft.link.zenoh.replica.reply_credit import CREDIT_LIMIT
 from fogft.link.zenoh.replica.reply_streams import Streams
 from fogft.link.zenoh.robot.attempt import OpenAttempt
 from fogft.link.zenoh.robot.link import ZenohLink
@@ -172,7 +172,7 @@ def test_a_robot_that_does_not_say_what_it_saw_is_answered_by_the_thread_that_ma
     assert [owner.of(n)[0].payload for n in range(20)] == [bytes(5000) + b"%d" % n
                                                            for n in range(20)]  # fmt: skip
     own = threading.current_thread().name
-    assert answering.senders.count(own) == UNSEEN_LIMIT
+    assert answering.senders.count(own) == CREDIT_LIMIT
     assert all(name == own or name.startswith("fogft-reply-") for name in answering.senders)
 
 

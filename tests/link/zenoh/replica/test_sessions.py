@@ -7,7 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link.frame import Greeting, greeted_bytes
-from fogft.link.zenoh.replica.sessions import HOLDERS_LIMIT, TOKENS_LIMIT, Guests, NotAdmittedError
+from fogft.link.zenoh.replica.sessions import (
+    HOLDERS_LIMIT,
+    TOKENS_LIMIT,
+    AuthenticatedSessions,
+    NotAdmittedError,
+)
 from fogft.model import names
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
@@ -28,27 +33,27 @@ def greeting(number: int, name: str = ADA, role: str = "robot", to: str = SELF) 
 
 
 @pytest.fixture
-def guests() -> Guests:
-    return Guests(UID, SELF, verify)
+def sessions() -> AuthenticatedSessions:
+    return AuthenticatedSessions(UID, SELF, verify)
 
 
-def refusal(guests: Guests, said: Greeting) -> str:
+def refusal(sessions: AuthenticatedSessions, said: Greeting) -> str:
     with pytest.raises(NotAdmittedError) as caught:
-        guests.greet(said)
+        sessions.greet(said)
     return caught.value.refusal
 
 
-def test_who_greeted_is_let_in_and_nobody_else(guests: Guests) -> None:
-    assert refusal(guests, Greeting(token(1))) == Refusal.NOT_ADMITTED
-    guests.greet(greeting(1))
-    guests.greet(Greeting(token(1)))  # further probes bring the token only
-    assert guests.admits(token(1))
-    assert not guests.admits(token(2))
+def test_who_greeted_is_let_in_and_nobody_else(sessions: AuthenticatedSessions) -> None:
+    assert refusal(sessions, Greeting(token(1))) == Refusal.NOT_ADMITTED
+    sessions.greet(greeting(1))
+    sessions.greet(Greeting(token(1)))  # further probes bring the token only
+    assert sessions.admits(token(1))
+    assert not sessions.admits(token(2))
 
 
-def test_a_gateway_may_ask_too(guests: Guests) -> None:
-    guests.greet(greeting(1, names.gateway_certificate_name(UID, "edge"), "gateway"))
-    assert guests.admits(token(1))
+def test_a_gateway_may_ask_too(sessions: AuthenticatedSessions) -> None:
+    sessions.greet(greeting(1, names.gateway_certificate_name(UID, "edge"), "gateway"))
+    assert sessions.admits(token(1))
 
 
 @pytest.mark.parametrize(
@@ -78,43 +83,43 @@ def test_a_gateway_may_ask_too(guests: Guests) -> None:
         "garbage",
     ],
 )
-def test_who_may_not_ask_is_not_let_in(guests: Guests, said: Greeting) -> None:
-    assert refusal(guests, said) == Refusal.NOT_ADMITTED
-    assert not guests.admits(token(1))
+def test_who_may_not_ask_is_not_let_in(sessions: AuthenticatedSessions, said: Greeting) -> None:
+    assert refusal(sessions, said) == Refusal.NOT_ADMITTED
+    assert not sessions.admits(token(1))
 
 
-def test_the_revoked_are_let_in_no_more(guests: Guests) -> None:
+def test_the_revoked_are_let_in_no_more(sessions: AuthenticatedSessions) -> None:
     """Their open connections end with the others' untouched, and they cannot come back."""
     for number, name in ((1, EVE), (2, EVE), (3, ADA)):
-        guests.greet(greeting(number, name))
-    guests.revoke([EVE])
-    guests.revoke([])  # nothing is ever taken back
-    assert [guests.admits(token(n)) for n in (1, 2, 3)] == [False, False, True]
-    assert refusal(guests, greeting(4, EVE)) == Refusal.REVOKED
-    guests.greet(greeting(5, names.robot_certificate_name(UID, "eve", 2)))
+        sessions.greet(greeting(number, name))
+    sessions.revoke([EVE])
+    sessions.revoke([])  # nothing is ever taken back
+    assert [sessions.admits(token(n)) for n in (1, 2, 3)] == [False, False, True]
+    assert refusal(sessions, greeting(4, EVE)) == Refusal.REVOKED
+    sessions.greet(greeting(5, names.robot_certificate_name(UID, "eve", 2)))
 
 
-def test_a_token_cannot_be_taken_over(guests: Guests) -> None:
-    guests.greet(greeting(1, ADA))
-    assert refusal(guests, greeting(1, EVE)) == Refusal.NOT_ADMITTED
-    guests.revoke([EVE])
-    assert guests.admits(token(1))
+def test_a_token_cannot_be_taken_over(sessions: AuthenticatedSessions) -> None:
+    sessions.greet(greeting(1, ADA))
+    assert refusal(sessions, greeting(1, EVE)) == Refusal.NOT_ADMITTED
+    sessions.revoke([EVE])
+    assert sessions.admits(token(1))
 
 
 @given(st.integers(1, 3 * TOKENS_LIMIT))
 def test_one_holder_cannot_push_out_another(count: int) -> None:
     """However often somebody greets, only its own oldest connections are forgotten."""
-    guests = Guests(UID, SELF, verify)
-    guests.greet(greeting(10_000, ADA))
+    sessions = AuthenticatedSessions(UID, SELF, verify)
+    sessions.greet(greeting(10_000, ADA))
     for number in range(count):
-        guests.greet(greeting(number, EVE))
-    assert guests.admits(token(10_000))
-    assert sum(guests.admits(token(n)) for n in range(count)) == min(count, TOKENS_LIMIT)
-    assert guests.admits(token(count - 1))
+        sessions.greet(greeting(number, EVE))
+    assert sessions.admits(token(10_000))
+    assert sum(sessions.admits(token(n)) for n in range(count)) == min(count, TOKENS_LIMIT)
+    assert sessions.admits(token(count - 1))
 
 
-def test_what_is_remembered_is_bounded(guests: Guests) -> None:
+def test_what_is_remembered_is_bounded(sessions: AuthenticatedSessions) -> None:
     for number in range(HOLDERS_LIMIT + 5):
-        guests.greet(greeting(number, names.robot_certificate_name(UID, f"r{number}")))
-    assert len(guests.names) == HOLDERS_LIMIT
-    assert not guests.admits(token(0))
+        sessions.greet(greeting(number, names.robot_certificate_name(UID, f"r{number}")))
+    assert len(sessions.names) == HOLDERS_LIMIT
+    assert not sessions.admits(token(0))

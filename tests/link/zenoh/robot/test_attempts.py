@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link import batch_frames, frame
-from fogft.link.cancellations import Recalls
-from fogft.link.large_send_gate import LARGE_BYTES, Turns
+from fogft.link.cancellations import Cancellations
+from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
 from fogft.link.port import Answer
-from fogft.link.send_options import PLAIN_WAYS
+from fogft.link.send_options import DEFAULT_OPTIONS
 from fogft.link.zenoh.robot.attempts import Attempts
 from fogft.model.refusal import Refusal
 from tests.link.wire_pool import request_id
@@ -49,7 +49,7 @@ class Outlet:
         else:
             self.sent.append(frame.decode_request(header).request_id)
 
-    def recall(self, ids: Sequence[bytes]) -> None:
+    def cancel(self, ids: Sequence[bytes]) -> None:
         pass
 
     def alive(self) -> bool:
@@ -69,9 +69,9 @@ class Scene:
             self.outlet,
             [SERVICE],
             frame.origin("ada", bytes(frame.TOKEN_BYTES)),
-            ways=PLAIN_WAYS,
-            turns=Turns(),
-            recalls=Recalls(),
+            options=DEFAULT_OPTIONS,
+            gate=LargeSendGate(),
+            cancellations=Cancellations(),
             answered=self.answers.append,
             late=lambda service, id: self.late.append(id),
             room=lambda: None,

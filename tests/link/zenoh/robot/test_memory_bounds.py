@@ -84,7 +84,7 @@ def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authorit
     listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
     for turn in range(3000):
         listener._turns.came()
-        listener._asides.later(lambda: None, Query(), turn)
+        listener._control.later(lambda: None, Query(), turn)
     dropped = listener.counters()["chores_dropped"]
-    assert 0 < len(listener._chores) == 3000 - dropped <= 1024
+    assert 0 < len(listener._work_queue) == 3000 - dropped <= 1024
     wait_for(lambda: Query.ended == dropped)

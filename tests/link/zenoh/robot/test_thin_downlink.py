@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fogft.link.send_options import Ways
+from fogft.link.send_options import SendOptions
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
@@ -110,7 +110,7 @@ def test_a_service_that_wants_none_gets_none(
 ) -> None:
     relay = ThinRelay(start_replica().endpoint, 4 * MBIT * 125_000)
     dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
-    dialer.adopt(Ways(plain=frozenset({SERVICE})))
+    dialer.adopt(SendOptions(plain=frozenset({SERVICE})))
     try:
         asking = Asking(dialer, relay.endpoint, owner, lambda: relay.passed_bytes)
         assert [asking.ask(b"text:500000") > 0.95 for _ in range(2)] == [True, True]

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from fogft.link.send_options import Ways
+from fogft.link.send_options import SendOptions
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
@@ -158,7 +158,7 @@ def test_the_newest_request_overtakes_stale_ones_where_the_service_says_so(
     """While one large request leaves, others wait; the last to come is the next to leave."""
     relay = ThinRelay(start_replica(reply_bytes=16).endpoint, 500_000)
     dialer = ZenohDialer(authority.robot(), robot="robot", pool_uid=POOL_UID, **PATIENT)
-    dialer.adopt(Ways(latest=frozenset({SERVICE})))
+    dialer.adopt(SendOptions(latest=frozenset({SERVICE})))
     try:
         link = dialer.dial(peer(relay.endpoint), keys(0), owner)
         wait_for(lambda: link.usable)
