@@ -3,11 +3,39 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
+import threading
+from collections.abc import Iterator
 
 import rclpy
+from rclpy.client import Client
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 from std_srvs.srv import SetBool
+
+
+@contextlib.contextmanager
+def spinning(node: Node) -> Iterator[None]:
+    """Take what arrives in a thread of its own while the block runs."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        yield
+    finally:
+        executor.shutdown()
+        thread.join()
+
+
+def call(client: Client, request: object, timeout_s: float) -> object | None:
+    """Return the answer to a request; None if none came in time."""
+    try:
+        return client.call(request, timeout_sec=timeout_s)
+    except TimeoutError:  # since Kilted; Jazzy returns None
+        return None
 
 
 def main() -> int:
@@ -22,15 +50,15 @@ def main() -> int:
         if not client.wait_for_service(timeout_sec=options.timeout_s):
             print("no service /echo", file=sys.stderr)
             return 1
-        for number in range(options.count):
-            asked = number % 2 == 0
-            future = client.call_async(SetBool.Request(data=asked))
-            rclpy.spin_until_future_complete(node, future, timeout_sec=options.timeout_s)
-            if not future.done() or future.result().message != f"heard {asked}":
-                print(f"request {number}: no answer, or a wrong one", file=sys.stderr)
-                return 1
-            print(future.result().message, flush=True)
-        return 0
+        with spinning(node):
+            for number in range(options.count):
+                asked = number % 2 == 0
+                answer = call(client, SetBool.Request(data=asked), options.timeout_s)
+                if answer is None or answer.message != f"heard {asked}":
+                    print(f"request {number}: no answer, or a wrong one", file=sys.stderr)
+                    return 1
+                print(answer.message, flush=True)
+            return 0
     finally:
         rclpy.try_shutdown()
 

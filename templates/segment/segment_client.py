@@ -7,15 +7,20 @@ question. Prints one JSON object; exits with 1 if a request failed or an answer 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import json
 import sys
+import threading
 import time
+from collections.abc import Iterator
 
 import numpy as np
 import rclpy
 from PIL import Image
-from rclpy.executors import ExternalShutdownException
+from rclpy.client import Client
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 from segment_interfaces.srv import Segment
 
@@ -65,42 +70,63 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args(remove_ros_args(sys.argv)[1:])
 
 
+@contextlib.contextmanager
+def spinning(node: Node) -> Iterator[None]:
+    """Take what arrives in a thread of its own while the block runs."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        yield
+    finally:
+        executor.shutdown()
+        thread.join()
+
+
+def call(client: Client, request: object, timeout_s: float) -> object | None:
+    """Return the answer to a request; None if none came in time."""
+    try:
+        return client.call(request, timeout_sec=timeout_s)
+    except TimeoutError:  # since Kilted; Jazzy returns None
+        return None
+
+
 def run(options: argparse.Namespace) -> int:
     node = rclpy.create_node("segment_client")
     client = node.create_client(Segment, options.service)
     if not client.wait_for_service(timeout_sec=options.wait_s):
         print(f"no service {options.service} within {options.wait_s} s", file=sys.stderr)
         return 1
-    questions = [question(number) for number in range(QUESTIONS)]
-    first: dict[int, Segment.Response] = {}
-    latencies_s, faults, failed = [], [], 0
-    for number in range(options.count):
-        which = number % QUESTIONS
-        began = time.monotonic()
-        future = client.call_async(questions[which])
-        rclpy.spin_until_future_complete(node, future, timeout_sec=options.timeout_s)
-        took_s = time.monotonic() - began
-        if future.done():
-            latencies_s.append(took_s)
-            wrong = fault(future.result(), first.get(which))
-            first.setdefault(which, future.result())
-            faults += [wrong] if wrong else []
-        else:
-            client.remove_pending_request(future)
-            failed += 1
-        time.sleep(max(0.0, options.period_s - took_s))
-    ordered = sorted(latencies_s)
-    summary = {
-        "requests": options.count,
-        "failed": failed,
-        "wrong": len(faults),
-        "p50_s": round(ordered[len(ordered) // 2], 4) if ordered else None,
-        "max_s": round(ordered[-1], 4) if ordered else None,
-        "model": first[0].model if 0 in first else None,
-        "faults": faults[:5],
-    }
-    print(json.dumps(summary, indent=2), flush=True)
-    return 1 if failed or faults else 0
+    with spinning(node):
+        questions = [question(number) for number in range(QUESTIONS)]
+        first: dict[int, Segment.Response] = {}
+        latencies_s, faults, failed = [], [], 0
+        for number in range(options.count):
+            which = number % QUESTIONS
+            began = time.monotonic()
+            answer = call(client, questions[which], options.timeout_s)
+            took_s = time.monotonic() - began
+            if answer is None:
+                failed += 1
+            else:
+                latencies_s.append(took_s)
+                wrong = fault(answer, first.get(which))
+                first.setdefault(which, answer)
+                faults += [wrong] if wrong else []
+            time.sleep(max(0.0, options.period_s - took_s))
+        ordered = sorted(latencies_s)
+        summary = {
+            "requests": options.count,
+            "failed": failed,
+            "wrong": len(faults),
+            "p50_s": round(ordered[len(ordered) // 2], 4) if ordered else None,
+            "max_s": round(ordered[-1], 4) if ordered else None,
+            "model": first[0].model if 0 in first else None,
+            "faults": faults[:5],
+        }
+        print(json.dumps(summary, indent=2), flush=True)
+        return 1 if failed or faults else 0
 
 
 def main() -> int:
