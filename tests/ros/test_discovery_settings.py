@@ -29,6 +29,7 @@ def start(ros_domain: int, tmp_path: Path) -> Iterator[Start]:
     def begin(*words: object, where: str = "", **variables: str) -> subprocess.Popen[str]:
         environ = {k: v for k, v in os.environ.items() if k not in SETTINGS}
         environ |= {"ROS_DOMAIN_ID": str(ros_domain), "ROS_LOG_DIR": str(tmp_path), **variables}
+        environ = {name: value for name, value in environ.items() if value}
         inside = ["ip", "netns", "exec", where] if where else []
         process = subprocess.Popen(
             [*inside, sys.executable, str(SCRIPT), *map(str, words)],

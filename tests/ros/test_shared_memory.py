@@ -263,4 +263,5 @@ def _judge_only(names: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
 def _names_of(pid: int) -> set[str]:
     """Return the Fast DDS files that a process maps."""
     lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
-    return {line.rsplit("/", 1)[1] for line in lines if "/dev/shm/fastdds_" in line}
+    segments = ("/dev/shm/fastdds_", "/dev/shm/fastrtps_")  # since Fast DDS 3, and before
+    return {line.rsplit("/", 1)[1] for line in lines if any(name in line for name in segments)}
