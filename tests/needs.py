@@ -60,6 +60,7 @@ NEEDS = {
     "egl": Need(
         lambda: bool(ctypes.util.find_library("EGL")), "apt install libegl1 libgl1-mesa-dri"
     ),
+    "etcd": Need(lambda: bool(shutil.which("etcd")), "apt install etcd-server"),
     "launch": Need(_installed("launch", "launch_ros"), "a ROS 2 installation with launch_ros"),
     "litert": Need(_installed("ai_edge_litert"), "scripts/setup vision"),
     "matplotlib": Need(_installed("matplotlib"), "scripts/setup plot"),

@@ -18,7 +18,7 @@ from fogft.errors import FogftError
 from fogft.pool.commands import init
 from fogft.poolfile import file
 
-EXAMPLES = ["detect", "echo", "motion", "pick", "planner", "segment", "words"]
+EXAMPLES = ["detect", "echo", "inspection", "motion", "pick", "planner", "segment", "words"]
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
 values = st.recursive(
@@ -169,7 +169,8 @@ class TestRefusals:
             "did you mean `planner`?",
         )
         assert self.refuse(tmp_path, "xyz", tmp_path / "a")[1] == (
-            "known here: `detect`, `echo`, `motion`, `pick`, `planner`, `segment`, `words`"
+            "known here: `detect`, `echo`, `inspection`, `motion`, `pick`, `planner`, `segment`, "
+            "`words`"
         )
 
     def test_a_file_is_in_the_way(self, tmp_path):
