@@ -1,0 +1,228 @@
+"""Whether bytes are a well-formed message of a type, checked before a middleware reads them. Pure.
+
+A middleware that is given bytes it cannot read may fail, end its process, or read another
+message than was meant; each does so in its own way. So bytes that come over the network are
+walked along the type first: nothing is decoded, and whole runs of numbers are stepped over.
+
+Serialised messages are plain CDR, as ROS 2 writes them: four bytes of header that tell the byte
+order, then each field at a multiple of its own size, counted from behind the header.
+
+Owns: that walk. Not here: a type's definition (`fogft.model.type_definition`) and how it is read
+(`fogft.ros.definition`); what is done with bytes that are refused (`fogft.proxy`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from struct import Struct
+
+from fogft.model.type_definition import Fields
+
+HEADER_BYTES = 4
+_BYTE_ORDERS = {b"\x00\x00": Struct(">I"), b"\x00\x01": Struct("<I")}
+# A middleware may fill a message's end up to a multiple of its widest field. Fast DDS also leaves
+# what it reserved for gaps between fields and did not need: less than the message is long.
+_MOST_PADDING = 7
+
+_NUMBERS = {
+    **dict.fromkeys(("boolean", "octet", "byte", "char", "uint8", "int8"), 1),
+    **dict.fromkeys(("uint16", "int16"), 2),
+    **dict.fromkeys(("uint32", "int32", "float"), 4),
+    **dict.fromkeys(("uint64", "int64", "double"), 8),
+}
+_SEQUENCE = re.compile(r"sequence<(?P<of>.+?)(?:, (?P<bound>\d+))?>")
+_ARRAY = re.compile(r"(?P<of>.+)\[(?P<count>\d+)\]")
+_STRING = re.compile(r"string(?:<(?P<bound>\d+)>)?")
+
+
+class _Malformed(Exception):
+    """What is wrong, in words."""
+
+
+class _Uncheckable(Exception):
+    """A field whose form is not the same in every middleware."""
+
+
+@dataclass(frozen=True)
+class _Bytes:
+    """A message's bytes.
+
+    Attributes:
+        length_at: Reads a length in the message's byte order.
+        booleans: Where the booleans that were stepped over stand.
+    """
+
+    payload: bytes
+    length_at: Struct
+    booleans: list[int] = field(default_factory=list)
+
+    def length(self, at: int) -> tuple[int, int]:
+        """Return a length that stands at an offset, aligned, and the offset behind it."""
+        at += -(at - HEADER_BYTES) % 4
+        if at + 4 > len(self.payload):
+            raise _Malformed("it ends within a length")
+        return self.length_at.unpack_from(self.payload, at)[0], at + 4
+
+    def skip(self, at: int, size: int) -> int:
+        """Return the offset behind so many bytes."""
+        if at + size > len(self.payload):
+            raise _Malformed(f"it ends {at + size - len(self.payload)} bytes early")
+        return at + size
+
+    def check_booleans(self, first: int, end: int, step: int) -> None:
+        """Make sure that each `step`-th byte between two offsets is 0 or 1."""
+        highest = max(self.payload[first:end:step], default=0)
+        if highest > 1:
+            raise _Malformed(f"a boolean is {highest}")
+
+
+_Walk = Callable[[_Bytes, int], int]  # from an offset in the payload to the one behind the value
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """How to step over a value of one type.
+
+    Attributes:
+        walk: From an offset to the one behind the value.
+        align: Of its widest number; where it starts only matters modulo this.
+        has_fixed_size: Whether its size follows from where it starts.
+    """
+
+    walk: _Walk
+    align: int
+    has_fixed_size: bool
+
+
+class Shape:
+    """The shape of one message type.
+
+    Args:
+        root: Name of the message in `fields`.
+        fields: Message -> its fields, as in `type_definition.Definition`.
+    """
+
+    def __init__(self, root: str, fields: Mapping[str, Fields]) -> None:
+        self._fields = fields
+        self._kinds: dict[str, _Kind] = {}
+        try:
+            self._root: _Kind | None = self._message(root, ())
+        except _Uncheckable:
+            self._root = None
+
+    def fault(self, payload: bytes) -> str:
+        """Return what is wrong with the bytes of a message, in words; empty if nothing is."""
+        length_at = _BYTE_ORDERS.get(payload[:2])
+        if len(payload) < HEADER_BYTES or length_at is None:
+            return f"{len(payload)} bytes without the header of a ROS 2 message"
+        if self._root is None:
+            return ""
+        try:
+            end = self._root.walk(_Bytes(payload, length_at), HEADER_BYTES)
+        except _Malformed as error:
+            return str(error)
+        left = len(payload) - end
+        is_padding = left <= _MOST_PADDING + end - HEADER_BYTES
+        return "" if is_padding else f"{left} bytes are left over"
+
+    def _message(self, name: str, within: tuple[str, ...]) -> _Kind:
+        known = self._kinds.get(name)
+        if known is not None:
+            return known
+        if name not in self._fields or name in within:
+            raise _Uncheckable(name)
+        kinds = [self._kind(kind, (*within, name)) for _, kind in self._fields[name]]
+        # ROS 2 gives a message without fields one byte.
+        self._kinds[name] = _one_after_another(kinds or [_number("uint8")])
+        return self._kinds[name]
+
+    def _kind(self, kind: str, within: tuple[str, ...]) -> _Kind:
+        if kind in _NUMBERS:
+            return _number(kind)
+        if found := _STRING.fullmatch(kind):
+            return _string(int(found["bound"] or 0))
+        if found := _ARRAY.fullmatch(kind):
+            return _array(self._kind(found["of"], within), int(found["count"]))
+        if found := _SEQUENCE.fullmatch(kind):
+            return _sequence(self._kind(found["of"], within), int(found["bound"] or 0))
+        return self._message(kind, within)
+
+
+def _number(kind: str) -> _Kind:
+    size = _NUMBERS[kind]
+    is_boolean = kind == "boolean"
+
+    def walk(data: _Bytes, at: int) -> int:
+        at += -(at - HEADER_BYTES) % size
+        end = data.skip(at, size)
+        if is_boolean:
+            data.booleans.append(at)
+            data.check_booleans(at, end, 1)
+        return end
+
+    return _Kind(walk, size, True)
+
+
+def _string(bound: int) -> _Kind:
+    def walk(data: _Bytes, at: int) -> int:
+        length, at = data.length(at)
+        if bound and length > bound + 1:  # with the zero at its end
+            raise _Malformed(f"a text of at most {bound} bytes has {length - 1}")
+        return data.skip(at, length)
+
+    return _Kind(walk, 4, False)
+
+
+def _array(of: _Kind, count: int) -> _Kind:
+    def walk(data: _Bytes, at: int) -> int:
+        return _several(of, count, data, at)
+
+    return _Kind(walk, of.align, of.has_fixed_size)
+
+
+def _sequence(of: _Kind, bound: int) -> _Kind:
+    def walk(data: _Bytes, at: int) -> int:
+        count, at = data.length(at)
+        if bound and count > bound:
+            raise _Malformed(f"a sequence of at most {bound} elements has {count}")
+        if count > len(data.payload) - at:  # each has a byte at the least
+            raise _Malformed(f"it ends within a sequence of {count} elements")
+        known = len(data.booleans)
+        end = _several(of, count, data, at)
+        del data.booleans[known:]  # only what has a fixed size is stepped over unseen
+        return end
+
+    return _Kind(walk, max(4, of.align), False)
+
+
+def _one_after_another(kinds: list[_Kind]) -> _Kind:
+    walks = [kind.walk for kind in kinds]
+
+    def walk(data: _Bytes, at: int) -> int:
+        for step in walks:
+            at = step(data, at)
+        return at
+
+    return _Kind(
+        walk,
+        max(kind.align for kind in kinds),
+        all(kind.has_fixed_size for kind in kinds),
+    )
+
+
+def _several(of: _Kind, count: int, data: _Bytes, at: int) -> int:
+    """Step over some values of one type, all at once where each takes as much as the one before."""
+    while count:
+        began, at = at, of.walk(data, at)
+        count -= 1
+        if count and of.has_fixed_size and (at - began) % of.align == 0:
+            known = len(data.booleans)
+            size = of.walk(data, at) - at
+            end = data.skip(at, size * count)
+            for boolean in data.booleans[known:]:
+                data.check_booleans(boolean, end, size)
+                data.booleans.extend(range(boolean + size, end, size))
+            return end
+    return at
