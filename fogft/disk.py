@@ -32,7 +32,6 @@ def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> No
     """Replace a file at once, mode 0600; its folder must exist.
 
     Args:
-        path: The file.
         content: Bytes, or text for UTF-8.
         durable: Whether it must survive a power cut (one fsync).
 

@@ -44,11 +44,7 @@ class Source(Protocol):
         """Whether this source exists on this machine."""
 
     def ask(self) -> Iterator[Notice]:
-        """Yield the notices in force now, again each time.
-
-        Raises:
-            OSError: It does not answer.
-        """
+        """Yield the notices in force now, again each time. Raises OSError: it does not answer."""
 
 
 class Watch:

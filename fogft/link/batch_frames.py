@@ -83,11 +83,7 @@ def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
 
 
 def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
-    """Return the stamp and the answers of a batch.
-
-    Raises:
-        FrameError: It is not one.
-    """
+    """Return the stamp and the answers of a batch. Raises FrameError: it is not one."""
     if not is_batch(header) or len(header) != _STAMPED:
         raise FrameError("no batch of answers")
     return header[1:], [

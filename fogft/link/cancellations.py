@@ -29,9 +29,7 @@ class Cancellations:
         """Note that a request that was sent is no longer wanted; whether to tell at once.
 
         Args:
-            request_id: The request.
             sent_at: When it was sent, on the caller's clock, in seconds.
-            now: The clock.
         """
         if len(self._ids) < LIMIT:
             self._ids[request_id] = None

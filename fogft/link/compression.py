@@ -53,7 +53,6 @@ class Compression:
         """Return the payload compressed, or None where it is to be sent as it is.
 
         Args:
-            payload: What shall be sent.
             bytes_per_s: What the link was seen to drain; None for not known, which is fast.
         """
         if bytes_per_s is None or bytes_per_s > FASTEST_BYTES_PER_S:

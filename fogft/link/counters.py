@@ -30,7 +30,6 @@ class Counters:
         """Count an event and log it, the more often it happens the more seldom.
 
         Args:
-            log: Whose log.
             event: Under which name it is counted.
             message: The line, with a place for each of `values`; the count is added to it.
             values: What happened.

@@ -71,9 +71,7 @@ class DeadlineFilter:
         """Whether an attempt may arrive while there is time, for all that is known.
 
         Args:
-            attempt: The attempt.
             remaining_s: The time that it has.
-            now: The clock.
             before: Returns what leaves before a request to a service.
         """
         rate = self._carries(now)

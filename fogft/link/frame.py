@@ -141,11 +141,7 @@ def encode_request(
 
 
 def decode_request(frame: bytes) -> RequestHeader:
-    """Read a request's header.
-
-    Raises:
-        FrameError: It is not one.
-    """
+    """Read a request's header. Raises FrameError: it is not one."""
     if len(frame) < _ORIGIN_AT:
         raise FrameError(f"a request's header of {len(frame)} bytes")
     first, request_id, remaining_s, seen = _REQUEST.unpack_from(frame)
@@ -201,11 +197,7 @@ def decode_refusal(frame: bytes) -> tuple[bytes, bytes, str]:
 
 
 def read_reason(said: bytes) -> str:
-    """Return the reason of a refusal.
-
-    Raises:
-        FrameError: It is none.
-    """
+    """Return the reason of a refusal. Raises FrameError: it is none."""
     if not 0 < len(said) <= REASON_LIMIT:
         raise FrameError(f"a reason of {len(said)} bytes")
     try:
@@ -221,7 +213,6 @@ def greeted_bytes(token: bytes, replica: str) -> bytes:
     """Return what a greeting's signature covers: good for one connection to one replica.
 
     Args:
-        token: The connection's.
         replica: The replica's common name.
     """
     return b"fogft greeting 1\n" + token + replica.encode()
@@ -246,11 +237,7 @@ def encode_greeting(greeting: Greeting) -> bytes:
 
 
 def decode_greeting(frame: bytes) -> Greeting:
-    """Read a greeting; nothing in it is verified.
-
-    Raises:
-        FrameError: It is not one.
-    """
+    """Read a greeting; nothing in it is verified. Raises FrameError: it is not one."""
     if len(frame) == _TOKEN.size:
         version, token = _TOKEN.unpack(frame)
         check_version(version)
@@ -288,10 +275,6 @@ def _check_first(first: int, flags: int) -> None:
 
 
 def check_version(version: Any) -> None:
-    """Refuse what another version wrote.
-
-    Raises:
-        FrameError: It is not of this version.
-    """
+    """Refuse what another version wrote. Raises FrameError: it is not of this version."""
     if version is True or version != VERSION:
         raise FrameError(f"version {version!r}, where {VERSION} is spoken here")

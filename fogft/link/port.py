@@ -237,9 +237,7 @@ class Dialer(Protocol):
         """Start a link; return at once, in state CONNECTING.
 
         Args:
-            peer: Whom to reach.
             services: Service name -> key (from `names.service_key`).
-            events: Whom to tell.
         """
 
     def adopt(self, options: SendOptions) -> None:
@@ -288,7 +286,6 @@ class Incoming(Protocol):
         """Send the serialised response. Never blocks.
 
         Args:
-            payload: The response.
             more: Others will soon follow, to leave in one message with it.
         """
 

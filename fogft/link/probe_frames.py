@@ -38,11 +38,7 @@ def encode_probe(probe: Probe) -> bytes:
 
 
 def decode_probe(frame: bytes) -> Probe:
-    """Read a probe.
-
-    Raises:
-        FrameError: It is not one.
-    """
+    """Read a probe. Raises FrameError: it is not one."""
     raw = _from_json(frame, PROBE_LIMIT)
     age = raw.get("manager_age_s")
     return Probe(
@@ -96,11 +92,7 @@ def _plain_answer(answer: ProbeAnswer) -> dict[str, Any]:
 
 
 def decode_probe_answer(frame: bytes) -> ProbeAnswer:
-    """Read a probe's answer.
-
-    Raises:
-        FrameError: It is not one.
-    """
+    """Read a probe's answer. Raises FrameError: it is not one."""
     raw = _from_json(frame, PROBE_ANSWER_LIMIT)
     return ProbeAnswer(
         slot=_count(raw, "slot"),

@@ -66,8 +66,6 @@ class SocketProgress:
         These are not to be held against the peer: whatever it says queues behind that.
 
         Args:
-            flow: The count.
-            now: The clock.
             sending_for_s: For how long something large has been on its way into the kernel.
         """
         last, since_s = self._last, now - self._last_at
@@ -103,7 +101,6 @@ class SocketProgress:
         """Return what of the outstanding bytes will not have arrived yet.
 
         Args:
-            now: The clock.
             bytes_per_s: At which they leave.
         """
         outstanding = self._last.outstanding if self._last is not None else 0
@@ -117,7 +114,6 @@ class SocketProgress:
         """Whether a queue has stood still for longer than this path's own pauses explain.
 
         Args:
-            now: The clock.
             shortest_s: However quick the path: its peer's processor may be busy.
             longest_s: However slow the path, no longer than that.
         """

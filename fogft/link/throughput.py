@@ -40,7 +40,6 @@ class Throughput:
         Args:
             moved: So many bytes.
             lasted_s: In so many seconds.
-            now: The clock.
             queued: Whether more than that waited the whole time.
         """
         self._still_s += lasted_s

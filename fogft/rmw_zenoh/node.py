@@ -127,11 +127,7 @@ class RmwZenohNode:
         return server
 
     def client(self, name: str, type_name: str) -> Client:
-        """Make a client of a service.
-
-        Raises:
-            RosError: The node is closed.
-        """
+        """Make a client of a service. Raises RosError: the node is closed."""
         servers = functools.partial(self.graph.hashes, SERVER, name, type_name)
         made: Client = self._add(
             lambda: Client(self._session, self._tokens(CLIENT, name, type_name), servers)

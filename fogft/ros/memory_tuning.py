@@ -56,7 +56,6 @@ class Trimmer:
     Args:
         above_bytes: What the process may keep.
         every_s: Look no more often.
-        clock: Monotonic seconds.
         own: Returns the process's own memory, in bytes.
         give: Gives free memory back.
     """

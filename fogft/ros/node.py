@@ -208,7 +208,6 @@ class SerialisedNode:
         """Make a node for people's tools beside this one. It ends with this one.
 
         Args:
-            name: Its name.
             judge: Takes parameters that somebody sets, and returns why not.
 
         Raises:

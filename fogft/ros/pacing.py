@@ -116,7 +116,6 @@ class Pacer:
 
     Args:
         send: Sends a response; may raise RosError.
-        clock: Monotonic seconds.
     """
 
     def __init__(

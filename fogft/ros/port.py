@@ -107,8 +107,6 @@ class RosNode(Protocol):
         """Offer a service.
 
         Args:
-            name: Its name.
-            type_name: Its type.
             on_request: Gets the serialised request and a handle.
             on_burst: Told, by the same thread, before and after requests that came together.
 
@@ -117,11 +115,7 @@ class RosNode(Protocol):
         """
 
     def client(self, name: str, type_name: str) -> RosClient:
-        """Make a client of a service.
-
-        Raises:
-            RosError: The type cannot be loaded.
-        """
+        """Make a client of a service. Raises RosError: the type cannot be loaded."""
 
     def offered(self) -> Mapping[str, str]:
         """Return name -> type of the services that applications offer in this domain.
@@ -137,11 +131,7 @@ class RosTopics(Protocol):
     """A node that publishes and subscribes, too."""
 
     def publisher(self, name: str, type_name: str, quality: Quality) -> RosPublisher:
-        """Make a publisher of a topic.
-
-        Raises:
-            RosError: The type cannot be loaded.
-        """
+        """Make a publisher of a topic. Raises RosError: the type cannot be loaded."""
 
     def subscribe(
         self, name: str, type_name: str, quality: Quality, on_message: Callable[[bytes], None]

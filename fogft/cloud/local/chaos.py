@@ -44,7 +44,6 @@ class Chaos:
         """Give a machine notice; it ends when that is over. Returns the seconds until then.
 
         Args:
-            id: The machine.
             notice_s: None for its zone's own. A second notice never puts the end off.
         """
         folder = self._living(id)
@@ -84,7 +83,6 @@ class Chaos:
         """Delay all that passes to and from a machine, each way, and limit its rate.
 
         Args:
-            id: The machine.
             delay_s: 0 for none.
             rate_bytes_per_s: None for no limit.
             for_s: None until `clear`.

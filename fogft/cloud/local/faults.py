@@ -98,9 +98,5 @@ def read_cloud(root: Path) -> CloudFaults:
 
 
 def write(path: Path, faults: LinkFaults | CloudFaults) -> None:
-    """Replace what stands in a file.
-
-    Raises:
-        StateError: It cannot be written.
-    """
+    """Replace what stands in a file. Raises StateError: it cannot be written."""
     disk.write_json(path, asdict(faults), durable=False)

@@ -45,7 +45,6 @@ class Relay:
 
     Args:
         upstream: Where the server listens, or will.
-        clock: Monotonic seconds.
     """
 
     def __init__(

@@ -115,11 +115,7 @@ class Journal:
             self._path(id).unlink(missing_ok=True)
 
     def get(self, id: ReplicaId) -> Entry | None:
-        """Return an entry, or None.
-
-        Raises:
-            StateError: It cannot be read.
-        """
+        """Return an entry, or None. Raises StateError: it cannot be read."""
         value = read_json(self._path(id))
         return None if value is None else _entry(value, self._path(id))
 

@@ -66,7 +66,6 @@ class Presence:
         """Return a pool's machines, ordered by id.
 
         Args:
-            pool_uid: The pool.
             entries: What the journal holds of it.
             regions: Cloud -> where machines of the pool can be.
 

@@ -29,11 +29,7 @@ def read() -> dict[str, Any]:
 
 
 def read_text(name: str) -> str:
-    """Return the text of a template.
-
-    Raises:
-        CloudError: The installation is incomplete.
-    """
+    """Return the text of a template. Raises CloudError: the installation is incomplete."""
     for folder in (_PACKAGE / "templates", _PACKAGE.parent / "templates"):
         path = folder / name
         if path.is_file():

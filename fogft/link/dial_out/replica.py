@@ -35,7 +35,6 @@ class DialOut:
 
     Args:
         local: ``host:port`` of this replica's own listener.
-        pool_uid: The pool.
         sign: Proves who we are.
     """
 

@@ -82,11 +82,7 @@ class Tunnel:
 
 
 def _splice(source: int, target: int) -> None:
-    """Carry bytes until the source ends.
-
-    Raises:
-        OSError: One of both is broken.
-    """
+    """Carry bytes until the source ends. Raises OSError: one of both is broken."""
     take, put = os.pipe()
     try:
         while count := os.splice(source, put, _CHUNK):

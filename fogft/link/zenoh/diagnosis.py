@@ -33,7 +33,6 @@ def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
     """Return in words why `peer` cannot be reached, as far as TCP and TLS can tell.
 
     Args:
-        peer: Whom to reach.
         credentials: Our side.
         timeout_s: The most that each of its steps may take.
     """

@@ -197,7 +197,6 @@ def abort_all(port: int, within_s: float) -> None:
     """Abort the connections whose own end is at a port, as soon as nothing flows there.
 
     Args:
-        port: The port.
         within_s: Wait no longer for that.
     """
     deadline = time.monotonic() + within_s

@@ -172,11 +172,7 @@ class ControlQueries:
 
 
 def _greeting(query: zenoh.Query) -> frame.Greeting:
-    """Read who asks.
-
-    Raises:
-        FrameError: It does not say so.
-    """
+    """Read who asks. Raises FrameError: it does not say so."""
     attachment = query.attachment
     return frame.decode_greeting(attachment.to_bytes() if attachment else b"")
 

@@ -63,7 +63,6 @@ class ZenohListener:
         listen: ``host:port``; port 0 for any that is free.
         credentials: The replica's certificate and key, and the pool's CA.
         id: Which replica this is: it hears the keys of its slot only.
-        settings: Zenoh's times.
         handshakes: Tells which handshakes were refused; None where they need not be counted.
         certificate_name: The common name of its certificate, where that is not the replica's.
 

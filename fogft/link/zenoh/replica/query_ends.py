@@ -42,7 +42,6 @@ class QueryEnd:
     """A query that is to be ended, after a refusal if there is one.
 
     Args:
-        query: The query.
         turn: When it came, by `QueryTurns`.
         refusal: What is said before; empty for nothing.
     """

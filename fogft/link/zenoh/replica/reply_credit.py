@@ -40,7 +40,6 @@ class ReplyCredit:
 
     Args:
         slow: Whether it is known to read slowly.
-        clock: Monotonic seconds.
     """
 
     def __init__(

@@ -29,7 +29,6 @@ class Stream:
     """One connection's open query. Any thread.
 
     Args:
-        query: The query.
         credit: What is on the way to its robot.
     """
 

@@ -70,7 +70,6 @@ class Attempts:
     """The attempts of one connection.
 
     Args:
-        outlet: The connection.
         services: What may be asked for.
         origin: What the headers of all its requests say (`frame.origin`).
         options: How the services' payloads are sent.

@@ -28,12 +28,10 @@ class ZenohDialer:
 
     Args:
         credentials: The robot's certificate and key, and the pool's CA.
-        robot: The robot's name.
         pool_uid: The pool; peers of another are refused.
         suspect_after_s: Probes unanswered for so long make a link suspect.
         manager_age: Seconds since the pool's manager gave a sign, None if never; told to
             replicas with each probe.
-        settings: Zenoh's times.
         tell_losers: Whether replicas are told which requests are no longer wanted.
     """
 

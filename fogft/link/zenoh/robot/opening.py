@@ -22,7 +22,6 @@ class Opening:
     """Of one link; used by one thread.
 
     Args:
-        peer: Whom to reach.
         settings: How long a try may take.
     """
 
@@ -50,7 +49,6 @@ class Opening:
 
         Args:
             took_s: How long it took.
-            now: The clock.
             credentials: Our side.
         """
         self._timed_out = self._timed_out + 1 if took_s >= self.timeout_s * _NEARLY else 0

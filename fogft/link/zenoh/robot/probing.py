@@ -64,11 +64,7 @@ class Probing:
     # -- asking and hearing ---------------------------------------------------------------
 
     def ask(self, connection: Connection, probe: Probe, now: float) -> None:
-        """Send a probe.
-
-        Raises:
-            zenoh.ZError: It could not be sent.
-        """
+        """Send a probe. Raises zenoh.ZError: it could not be sent."""
         self._of_connection.began(now)
         self._of_replica.began(now)
 
