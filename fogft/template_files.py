@@ -29,7 +29,7 @@ def folder() -> Path:
     Raises:
         FogftError: It is nowhere.
     """
-    package = Path(__file__).resolve().parent.parent
+    package = Path(__file__).resolve().parent
     for candidate in (package / "templates", package.parent / "templates"):
         if (candidate / "echo" / "pool.yaml").is_file():
             return candidate
@@ -51,12 +51,21 @@ def render(name: str, values: Mapping[str, object]) -> str:
         FogftError: There is no such template.
         ValueError: The keys are not exactly the template's, or a value cannot be written.
     """
+    return fill(read_text(name), values, name)
+
+
+def read_text(name: str) -> str:
+    """Return a template of the templates' folder as it stands there.
+
+    Raises:
+        FogftError: There is no such template, or it cannot be read.
+    """
     path = folder() / name
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise FogftError(f"the template `{path}` cannot be read: {error.strerror}") from error
-    return fill(text, values, name)
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise FogftError(f"the template `{path}` cannot be read: {reason}") from error
 
 
 def fill(text: str, values: Mapping[str, object], name: str = "template") -> str:

@@ -89,11 +89,11 @@ class TestFolder:
     def test_of_an_installed_package(self, tmp_path, monkeypatch):
         """A wheel carries the templates inside the package."""
         shutil.copytree(template_files.folder(), tmp_path / "fogft" / "templates")
-        monkeypatch.setattr(template_files, "__file__", str(tmp_path / "fogft" / "pool" / "x.py"))
+        monkeypatch.setattr(template_files, "__file__", str(tmp_path / "fogft" / "x.py"))
         assert template_files.folder() == tmp_path / "fogft" / "templates"
 
     def test_missing(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(template_files, "__file__", str(tmp_path / "fogft" / "pool" / "x.py"))
+        monkeypatch.setattr(template_files, "__file__", str(tmp_path / "fogft" / "x.py"))
         with pytest.raises(FogftError, match=r"^the templates are missing") as caught:
             template_files.folder()
         assert caught.value.hint == "install fogft again"

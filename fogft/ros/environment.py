@@ -19,7 +19,7 @@ from collections.abc import Mapping, MutableMapping
 from importlib import metadata
 from pathlib import Path
 
-from fogft.errors import RosError
+from fogft import template_files
 
 # Fast DDS 3 (Kilted and later) reads the first, Fast DDS 2 (Jazzy, Humble) the second only. Setting
 # both makes newer rmw_fastrtps warn. Libraries are named like their variable.
@@ -44,17 +44,8 @@ _DISTRIBUTIONS = {"3.3": "humble", "7.1": "jazzy", "9.1": "kilted"}  # by rclpy'
 
 
 def profile_path() -> Path:
-    """Return the shipped Fast DDS profile, in a checkout or in an installed package.
-
-    Raises:
-        RosError: The installation is incomplete.
-    """
-    package = Path(__file__).resolve().parents[1]
-    for folder in (package / "templates", package.parent / "templates"):
-        path = folder / "fastdds_shm.xml"
-        if path.is_file():
-            return path
-    raise RosError("fogft's own `templates/fastdds_shm.xml` is missing", "install fogft again")
+    """Return the shipped Fast DDS profile. Raises FogftError: the installation is incomplete."""
+    return template_files.folder() / "fastdds_shm.xml"
 
 
 def profile_variable(environ: Mapping[str, str] = os.environ) -> str:

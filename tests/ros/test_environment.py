@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 
 import pytest
 
-from fogft.errors import RosError
 from fogft.ros import environment
 
 
@@ -98,25 +97,6 @@ def test_small_shared_memory_keeps_the_profile_out(monkeypatch: pytest.MonkeyPat
     """In a container with 64 MB of /dev/shm, segments of 35 MB would only fail."""
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=64_000_000))
     assert not environment.prepare({})
-
-
-def test_an_incomplete_installation_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(environment, "__file__", str(tmp_path / "fogft" / "ros" / "x.py"))
-    with pytest.raises(RosError, match="missing"):
-        environment.profile_path()
-
-
-def test_an_installed_package_finds_its_own_profile(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In a wheel, templates lie in the package; in a checkout, beside it."""
-    packaged = tmp_path / "fogft" / "templates" / "fastdds_shm.xml"
-    packaged.parent.mkdir(parents=True)
-    packaged.touch()
-    monkeypatch.setattr(environment, "__file__", str(tmp_path / "fogft" / "ros" / "x.py"))
-    assert environment.profile_path() == packaged
 
 
 def test_the_profile_has_both_transports() -> None:

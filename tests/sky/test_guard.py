@@ -8,7 +8,8 @@ import sys
 import time
 from pathlib import Path
 
-from fogft.cloud.sky import guard, template
+from fogft import template_files
+from fogft.cloud.sky import guard
 from fogft.cloud.sky.following import DEFAULT_LIMITS
 
 LIMIT_S = 60.0
@@ -31,7 +32,7 @@ def machine(folder: Path) -> dict[str, str]:
 
 
 def start(folder: Path, minutes: int) -> subprocess.Popen[bytes]:
-    text = template.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(minutes))
+    text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(minutes))
     script = folder / "guard"
     # What other tests on this machine run is no replica of this one.
     script.write_text(text.replace("fogft[ ]serve", f"fogft[ ]serve-{folder.name}"))

@@ -20,14 +20,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from fogft.cloud.local.catalogue import BUILT_IN, Catalogue, Instance, Zone
 from fogft.errors import SpecError
-from fogft.poolfile.tree import Node, Section, plain, shown
-
-if TYPE_CHECKING:
-    import yaml
+from fogft.poolfile.tree import Section, plain, shown
 
 FILE = "regions.yaml"
 ZONE_KEYS = ("boot_s", "notice_s", "capacity", "price_factor", "relay")
@@ -47,7 +43,11 @@ def read(path: Path) -> Catalogue:
         return BUILT_IN
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError(f"{path}: cannot be read: {error}") from error
-    top = Section(str(path), "", _tree(text, str(path)), "write `regions:` with regions below it")
+    if not re.sub(r"#.*", "", text).strip():
+        return BUILT_IN
+    from fogft.poolfile.yaml_tree import tree  # late: it loads PyYAML
+
+    top = Section(str(path), "", tree(text, str(path)), "write `regions:` with regions below it")
     top.only((*ZONE_KEYS, "instances", "regions"))
     zones, instances = BUILT_IN.zones, BUILT_IN.instances
     if top.has("instances"):
@@ -125,37 +125,3 @@ def _check_name(section: Section, name: str, what: str) -> None:
     if not _NAME.fullmatch(name):
         hint = "use lower-case letters, digits and dashes"
         raise section.error(name, f"is not the name of a {what}", hint, at_key=True)
-
-
-def _tree(text: str, file: str) -> Node:
-    import yaml
-
-    try:
-        loader = yaml.SafeLoader(text)
-        root = loader.get_single_node()
-        if root is None:
-            return Node({}, 1, 1)
-        return _node(loader, root, root.start_mark.line + 1)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise SpecError(f"{file}:{line}: not YAML: {error.problem}", "check its syntax") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        what = shown(error, 120)[1:-1]
-        raise SpecError(f"{file}:1: not YAML: {what}", "check its syntax") from None
-
-
-def _node(loader: yaml.SafeLoader, node: yaml.Node, key_line: int) -> Node:
-    import yaml
-
-    line = node.start_mark.line + 1
-    value: Any
-    if isinstance(node, yaml.MappingNode):
-        value = {
-            str(key.value): _node(loader, child, key.start_mark.line + 1)
-            for key, child in node.value
-        }
-    elif isinstance(node, yaml.SequenceNode):
-        value = tuple(_node(loader, n, n.start_mark.line + 1) for n in node.value)
-    else:
-        value = loader.construct_object(node)
-    return Node(value, line, key_line)

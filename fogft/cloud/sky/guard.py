@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import base64
 
-from fogft.cloud.sky import template
+from fogft import template_files
 from fogft.cloud.sky.task import SETUP_LIMIT_S
 
 SETTING = ("aws", "post_provision_runcmd")
@@ -24,9 +24,9 @@ def command() -> str:
     """Return the command: one line, for a shell, which returns at once.
 
     Raises:
-        CloudError: The installation is incomplete.
+        FogftError: The installation is incomplete.
     """
-    text = template.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(ALONE_MINUTES))
+    text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(ALONE_MINUTES))
     packed = base64.b64encode(text.encode()).decode()
     path = "/run/fogft-guard"
     return f"echo {packed} | base64 -d > {path} && setsid sh {path} > /dev/null 2>&1 &"

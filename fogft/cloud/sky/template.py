@@ -1,40 +1,23 @@
-"""Find and read what goes to a VM, in a checkout's `templates` or in an installed package's."""
+"""Read `sky_task.yaml`, the template of a replica's SkyPilot task."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-from fogft.errors import CloudError
+from fogft import template_files
+from fogft.errors import CloudError, FogftError
 
-_PACKAGE = Path(__file__).resolve().parents[2]
+_NAME = "sky_task.yaml"
 
 
 def read() -> dict[str, Any]:
-    """Return the template of a replica's SkyPilot task, `sky_task.yaml`.
-
-    Raises:
-        CloudError: The installation is incomplete, or the template was damaged.
-    """
+    """Return the template. Raises CloudError: the installation is incomplete or damaged."""
     import yaml
 
-    name = "sky_task.yaml"
     try:
-        value = yaml.safe_load(read_text(name))
-    except yaml.YAMLError as error:
-        raise CloudError(f"fogft's own `templates/{name}` cannot be read: {error}") from error
+        value = yaml.safe_load(template_files.read_text(_NAME))
+    except (FogftError, yaml.YAMLError) as error:
+        raise CloudError(f"fogft's own `{_NAME}` cannot be read: {error}") from error
     if not isinstance(value, dict):
-        raise CloudError(f"fogft's own `templates/{name}` is not a task", "install fogft again")
+        raise CloudError(f"fogft's own `{_NAME}` is not a task", "install fogft again")
     return value
-
-
-def read_text(name: str) -> str:
-    """Return the text of a template. Raises CloudError: the installation is incomplete."""
-    for folder in (_PACKAGE / "templates", _PACKAGE.parent / "templates"):
-        path = folder / name
-        if path.is_file():
-            try:
-                return path.read_text()
-            except (OSError, UnicodeDecodeError) as error:
-                raise CloudError(f"`{path}` cannot be read: {error}") from error
-    raise CloudError(f"fogft's own `templates/{name}` is missing", "install fogft again")
