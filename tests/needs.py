@@ -72,6 +72,7 @@ NEEDS = {
     "numpy": Need(_installed("numpy"), "scripts/setup demo"),
     "ompl": Need(_installed("ompl"), "scripts/setup demo"),
     "pillow": Need(_installed("PIL"), "scripts/setup demo"),
+    "promtool": Need(lambda: bool(shutil.which("promtool")), "apt install prometheus"),
     "pyzeros": Need(_installed("pyzeros"), "Python 3.11 and scripts/setup ros-test"),
     "rclpy": Need(_installed("rclpy"), "scripts/setup ros, or a sourced ROS 2 installation"),
     "ros2service": Need(_installed("ros2service"), "a ROS 2 installation with ros2service"),

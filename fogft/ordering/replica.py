@@ -106,7 +106,7 @@ class OrderedReplica(Generic[T]):
         self._claims: list[T] = []
         self._snapshots: list[T] = []
         self._restore: tuple[int, bytes, T] | None = None
-        self._kept: OrderedDict[int, bytes | None] = OrderedDict()
+        self.kept: OrderedDict[int, bytes | None] = OrderedDict()
         self._kept_size = 0
 
     @property
@@ -209,9 +209,9 @@ class OrderedReplica(Generic[T]):
         if not self.joined:
             return [Refuse(to, NOT_JOINED)]
         if index <= self.position.index:
-            if index not in self._kept:
+            if index not in self.kept:
                 return [Refuse(to, FORGOTTEN)]
-            answer = self._kept[index]
+            answer = self.kept[index]
             return [Refuse(to, MALFORMED) if answer is None else Reply(to, answer)]
         work = self._work
         if work is not None and work.op is Op.APPLY and work.index == index:
@@ -319,14 +319,14 @@ class OrderedReplica(Generic[T]):
 
     def _keep(self, index: int, answer: bytes | None) -> None:
         _, _, kept, kept_bytes = self._limits
-        self._kept[index] = answer
+        self.kept[index] = answer
         self._kept_size += len(answer or b"")
-        while len(self._kept) > kept or (self._kept_size > kept_bytes and len(self._kept) > 1):
-            _, oldest = self._kept.popitem(last=False)
+        while len(self.kept) > kept or (self._kept_size > kept_bytes and len(self.kept) > 1):
+            _, oldest = self.kept.popitem(last=False)
             self._kept_size -= len(oldest or b"")
 
     def _forget_answers(self) -> None:
-        self._kept.clear()
+        self.kept.clear()
         self._kept_size = 0
 
     # -- what goes wrong ------------------------------------------------------------------

@@ -93,7 +93,7 @@ def plan(
         health: What `judge` makes of these very arguments, where that is known already.
     """
     health = health or judge(pool_uid, spec, observed, history)
-    decided = latest = _plan_once(
+    decided = latest = plan_once(
         spec, intent, observed, history, health=health, drain_limit_s=drain_limit_s
     )
     if observed.machines is None:
@@ -111,7 +111,7 @@ def plan(
             draining=decided.draining,
         )
         health = judge(pool_uid, spec, world, memory)
-        latest = _plan_once(spec, intent, world, memory, health=health, drain_limit_s=drain_limit_s)
+        latest = plan_once(spec, intent, world, memory, health=health, drain_limit_s=drain_limit_s)
         is_done = not latest.launches and not latest.terminations
         is_done = is_done and set(latest.draining) == set(decided.draining)
         decided = decided._replace(
@@ -137,7 +137,7 @@ def _changes(decided: Plan, history: History) -> bool:
     return not marked.issuperset((id.slot, id.generation) for id in decided.draining)
 
 
-def _plan_once(
+def plan_once(
     spec: PoolSpec,
     intent: Intent,
     observed: Observed,

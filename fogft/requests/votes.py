@@ -54,6 +54,11 @@ class Votes(Generic[T]):
         """Whether a request has its answer (and it is not long ago)."""
         return request in self._final
 
+    @property
+    def undecided(self) -> int:
+        """How many requests are being voted on."""
+        return len(self._open)
+
     def vote(self, request: bytes, ballot: Ballot[T]) -> bytes | None:
         """Take an answer. Return the final one, once: when this ballot decided it.
 

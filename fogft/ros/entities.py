@@ -53,7 +53,7 @@ class Server:
         self.handle = service.handle
         self._service = service
         self._end: ServiceEnd | None = end
-        self._take = end.take
+        self.take = end.take
         self._on_request = on_request
         self._on_burst = on_burst
         self._withdraw = withdraw
@@ -112,7 +112,7 @@ class Server:
 
     def _next(self) -> tuple[bytes, Any] | None:
         try:
-            return self._take()
+            return self.take()
         except RosError as error:
             self._unreadable(error)
             return None
@@ -156,7 +156,7 @@ class Client:
         self._count = count
         self._client = client
         self._end: ClientEnd | None = end
-        self._take = end.take
+        self.take = end.take
         self._withdraw = withdraw
         self._pending: dict[int, Callable[[bytes], None]] = {}
         self._unreadable = _Unreadable(client.srv_name)
@@ -206,7 +206,7 @@ class Client:
         """Deliver what has arrived. Take loop only."""
         for _ in range(BURST):
             try:
-                taken = self._take()
+                taken = self.take()
             except RosError as error:
                 self._unreadable(error)
                 return

@@ -130,6 +130,11 @@ class Pacer:
         self._thread: threading.Thread | None = None  # made when the first response waits
         self._closed = False
 
+    @property
+    def clients(self) -> int:
+        """How many clients are remembered."""
+        return len(self._paces)
+
     def requested(self, handle: Any) -> None:
         """Note a request as it is taken."""
         now = self._clock()
@@ -154,9 +159,14 @@ class Pacer:
                 self._held[client] = pace
                 self._begin()
                 return
-        self._try(handle, payload, now + _FIND_LIMIT_S)
+        self.try_now(handle, payload, now + _FIND_LIMIT_S)
 
-    def _try(self, handle: Any, payload: bytes, give_up_at: float) -> None:
+    def try_now(self, handle: Any, payload: bytes, give_up_at: float) -> None:
+        """Send now; once more later if the client is not found yet, until a time.
+
+        Raises:
+            NotFoundYet: It was not found in time.
+        """
         try:
             self._send(handle, payload)
         except NotFoundYet:
@@ -194,7 +204,7 @@ class Pacer:
                     return
             for handle, payload, give_up_at in due:
                 try:
-                    self._try(handle, payload, give_up_at)
+                    self.try_now(handle, payload, give_up_at)
                 except RosError as error:
                     log.warning("response_refused reason=%r", error.message)
 

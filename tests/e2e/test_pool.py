@@ -9,6 +9,8 @@ import time
 
 import pytest
 
+from tests.nightly import by_day
+
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
 
 
@@ -18,11 +20,12 @@ def flawless(result: dict) -> bool:
 
 @pytest.mark.parametrize("seed", [20261])
 def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
-    """Requests for 30 s and more under kills and freezes, one replica always spared at a time."""
+    """Requests under kills and freezes of both kinds, one replica always spared at a time."""
+    under_fire_s = by_day(10, at_night=120)
     pool.up()
-    client = pool.client(120, 25)
+    client = pool.client(300, 25)
     chance = random.Random(seed)
-    end = time.monotonic() + 30
+    end = time.monotonic() + under_fire_s
     faults = []
     while time.monotonic() < end or len({kind for kind, _ in faults}) < 2:
         ready = [r["slot"] for r in pool.status()["replicas"] if r["phase"] == "ready"]
@@ -37,7 +40,7 @@ def test_no_answer_is_lost_or_wrong_while_replicas_die(pool, seed):
                 pool.fogft("chaos", "thaw", str(slot), ok=False)
         time.sleep(chance.uniform(0.5, 2.0))
     result = client.finish()
-    assert result["requests"] > 500
+    assert result["requests"] > 15 * under_fire_s
     assert flawless(result), (result, faults)
     pool.wait(lambda: pool.ready() == 3)
     pool.fogft("down")
@@ -78,33 +81,23 @@ def test_a_slow_service_is_never_taken_for_a_dead_one(pool):
     assert all(r["phase"] == "ready" for r in after["replicas"])
 
 
-def test_traffic_outlives_the_manager_and_the_next_one_adopts_the_pool(pool):
-    pool.write(replicas=2)
-    pool.up()
-    before = {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
-    client = pool.client(60, 20)
-    os.kill(pool.status()["manager_pid"], signal.SIGKILL)
-    time.sleep(1)
-    pool.fogft("up", str(pool.file), "--yes")
-    assert flawless(client.finish())
-    status = pool.wait(lambda: pool.status() if pool.ready() == 2 else None)
-    assert {(r["slot"], r["generation"]) for r in status["replicas"]} == before
-
-
-def test_scale_up_and_down_under_load(pool):
+def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
+    """Scaled up; its manager dies and the next one adopts it; scaled down; ended with neither."""
     pool.write(replicas=1)
     pool.up()
-    client = pool.client(60, 20)
+    client = pool.client(120, 20)
     pool.fogft("scale", "up", "2")
     pool.wait(lambda: pool.ready() == 3)
+    before = {(r["slot"], r["generation"]) for r in pool.status()["replicas"]}
+    os.kill(pool.status()["manager_pid"], signal.SIGKILL)
+    time.sleep(1)  # a second of requests that no manager sees
+    pool.fogft("up", str(pool.file), "--yes")
+    pool.wait(lambda: pool.ready() == 3)
+    assert {(r["slot"], r["generation"]) for r in pool.status()["replicas"]} == before
     pool.fogft("scale", "down", "2")
     pool.wait(lambda: len(pool.status()["replicas"]) == 1 and pool.ready() == 1)
     assert flawless(client.finish())
 
-
-def test_down_works_when_everything_but_the_replicas_is_dead(pool):
-    pool.write(replicas=2)
-    pool.up()
     status = pool.status()
     for pid in (status["manager_pid"], status["proxy_pid"]):
         os.kill(pid, signal.SIGKILL)

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.pool import NODES
+from tests.needs import needs
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
 
@@ -61,6 +62,7 @@ def rolled_back(pool) -> dict[str, Any] | None:
     return status if update and update["state"] == "rolled back" else None
 
 
+@needs("night")  # by day in simulated time: tests/simulation/test_rolling_updates.py
 def test_old_goes_before_new_where_the_budget_has_no_room_for_both(pool):
     """The cap has room for two and no third: one always answers, and none is lost."""
     pool.write(replicas=2)

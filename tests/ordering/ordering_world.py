@@ -181,6 +181,6 @@ class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
 
     def awaited(self) -> bool:
         """Whether an answer is still to come: one that a replica keeps, or will have."""
-        kept = [host.machine._kept for host in self.hosts.values()]
+        kept = [host.machine.kept for host in self.hosts.values()]
         last = max(host.machine.position.index for host in self.hosts.values())
         return any(index > last or any(index in k for k in kept) for index in self.pending)

@@ -41,7 +41,7 @@ class GatewayPool:
         self._service = f"{{name: {SERVICE}, type: {TYPE}, timeout_s: {timeout_s}{services}}}"
         self._version = 1
         self._files: list[Path] = []
-        self._members: dict[int, Member] = {}
+        self.members: dict[int, Member] = {}
         self.topology = Topology()
         self.processes: list[Process] = []
         self.replicas: dict[int, ReplicaProcess] = {}
@@ -54,7 +54,7 @@ class GatewayPool:
                 self.authority.replica(slot), endpoint=endpoint, slot=slot, **given
             )
         self.replicas[slot] = made
-        self._members[slot] = Member(ReplicaId(POOL_UID, slot, 1), endpoint)
+        self.members[slot] = Member(ReplicaId(POOL_UID, slot, 1), endpoint)
 
     def server_proxy(
         self, slot: int, *, where: str = "", host: str = "127.0.0.1", delay_s: float = 0.0
@@ -62,21 +62,21 @@ class GatewayPool:
         """Start a whole server proxy, which runs a request once, and let it in; to be killed."""
         id = ReplicaId(POOL_UID, slot, 1)
         endpoint = f"{host}:{free_port() if not where else 7447 + slot}"
-        self._members[slot] = Member(id, endpoint)
+        self.members[slot] = Member(id, endpoint)
         with _inside(where):
             return start_server(self.folder, self.authority, id, endpoint, delay_s)
 
     def endpoint(self, slot: int) -> str:
-        return self._members[slot].endpoint
+        return self.members[slot].endpoint
 
     def reach(self, slot: int, endpoint: str) -> None:
         """Have everybody reach a replica at another address, from the next membership on."""
-        self._members[slot] = replace(self._members[slot], endpoint=endpoint)
+        self.members[slot] = replace(self.members[slot], endpoint=endpoint)
 
     def forget(self, slot: int) -> None:
         """Let a replica in no more; it was killed."""
         self.replicas.pop(slot).kill()
-        del self._members[slot]
+        del self.members[slot]
 
     def gateway(
         self, name: str, *, listen: str = "", where: str = "", generation: int = 1, extra: str = ""
@@ -110,12 +110,12 @@ class GatewayPool:
     def publish(self) -> None:
         """Write the membership for everybody."""
         self._version += 1
-        members = tuple(self._members.values())
+        members = tuple(self.members.values())
         for path in self._files:
             self.write_membership(path, members)
 
     def write_membership(self, path: Path, members: tuple[Member, ...] | None = None) -> None:
-        members = tuple(self._members.values()) if members is None else members
+        members = tuple(self.members.values()) if members is None else members
         wanted = Membership("p", POOL_UID, 1, self._version, members, topology=self.topology)
         new = path.with_suffix(".new")
         new.write_text(json.dumps(membership.to_dict(wanted)))

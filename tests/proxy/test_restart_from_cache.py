@@ -98,6 +98,6 @@ def test_every_proxy_starts_again_while_no_rendezvous_is_there(scene):
         proxy.start()
     assert scene.serve()
     eve = scene.pool.robot("eve")
-    scene.pool._members[0] = Member(ID, scene.replica.endpoint)
+    scene.pool.members[0] = Member(ID, scene.replica.endpoint)
     scene.pool.publish()
     wait_for(lambda: "our certificate is revoked" in str(eve.tell()["report"]["links"]), LIMIT_S)

@@ -102,7 +102,7 @@ class World:
                     request.refuse(Refusal.LOST)
                     continue
                 self.replicas[slot].request(request)
-                self._published(slot)
+                self.publish_all(slot)
                 if lose():  # it arrived, but nobody hears of it
                     self._drop(request)
         while self.answers:
@@ -114,7 +114,7 @@ class World:
         request.ended = False
         request.refuse(Refusal.LOST)
 
-    def _published(self, slot: int) -> None:
+    def publish_all(self, slot: int) -> None:
         """Do what the replica's thread does, here."""
         replica = self.replicas[slot]
         while not replica._queue.empty():
@@ -223,7 +223,7 @@ def test_noise_from_a_peer_harms_nobody():
     request = Carried(world, 0, world.links[0], ("topic /to", b"i" * 16, b"noise", 5.0))
     world.replicas[0].request(request)
     with pytest.raises(ValueError):
-        world._published(0)
+        world.publish_all(0)
     back = World(BACK)
     request = Carried(back, 0, back.links[0], ("topic /back", b"i" * 16, b"noise", 5.0))
     back.replicas[0].request(request)

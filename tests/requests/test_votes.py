@@ -87,7 +87,7 @@ def test_without_agreement_nobody_is_blamed():
         votes.close(bytes([number]))
     assert not votes.flagged
     assert not votes.disagreed
-    assert not votes._open
+    assert not votes.undecided
 
 
 def test_a_copy_is_no_second_vote():

@@ -61,8 +61,8 @@ def test_a_request_does_not_wait_until_ros_was_asked_for_another():
     heard, waiting = [], numbered(1)
     server = serving(waiting, heard)
     asked: list[int] = []
-    take = server._take
-    server._take = lambda: (asked.append(len(heard)), take())[1]
+    take = server.take
+    server.take = lambda: (asked.append(len(heard)), take())[1]
     server.drain()
     assert asked == [0, 1]
     waiting += numbered(4)

@@ -174,7 +174,7 @@ def test_clients_that_are_gone_are_forgotten():
     for client in range(200):
         pacer.requested(handle(client, 0))
         pacer.respond(handle(client, 0), b"")
-    assert len(pacer._paces) <= 64
+    assert pacer.clients <= 64
     pacer.close()
 
 
@@ -211,4 +211,4 @@ def test_a_client_that_is_never_found_is_given_up():
 
     pacer = Pacer(send, clock=lambda: now)
     with pytest.raises(NotFoundYet):
-        pacer._try(bytes(24), b"early", 0.5)
+        pacer.try_now(bytes(24), b"early", 0.5)

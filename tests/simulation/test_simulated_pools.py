@@ -104,9 +104,9 @@ def test_planning_on_adds_nothing_to_a_plan_that_is_said_to_be_closed(seed, monk
     """The same events as when each plan that changes anything is planned on while under way."""
     wanted = any_scenario(seed, days=0.2)
     trusting = run(wanted, seed=seed)[0].store.events
-    once = planner._plan_once
+    once = planner.plan_once
     doubted = lambda *args, **options: once(*args, **options)._replace(closed=False)  # noqa: E731
-    monkeypatch.setattr(planner, "_plan_once", doubted)
+    monkeypatch.setattr(planner, "plan_once", doubted)
     assert run(wanted, seed=seed)[0].store.events == trusting
 
 

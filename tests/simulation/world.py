@@ -273,7 +273,7 @@ class World:
     def _check_plan(self, tick: Tick) -> None:
         """Check the laws against what the manager was told when it decided."""
         listed = {m.id for m in self.truth()}
-        busy = self.manager._operations.busy()
+        busy = self.manager.operations.busy()
         queued = [id for id, order in busy.items() if order is not None and id not in listed]
         live = [m for m in self.truth() if m.id.pool_uid == UID and not self._exempt(m)]
         if tick.plan.launches:

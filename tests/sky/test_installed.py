@@ -90,7 +90,7 @@ def real(home: Path) -> tuple[InstalledSky, Any, Any]:
 
     silent = mock.create_autospec(sdk)
     installed = InstalledSky()
-    installed._modules = (sky, silent)
+    installed.modules = (sky, silent)
     return installed, silent, sky
 
 

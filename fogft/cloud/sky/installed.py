@@ -41,7 +41,7 @@ class InstalledSky:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._modules: tuple[Any, Any] | None = None
+        self.modules: tuple[Any, Any] | None = None
         self._calls = Calls()
 
     def launch(self, task: Mapping[str, Any], name: str) -> str:
@@ -226,9 +226,9 @@ class InstalledSky:
 
     def _sky(self) -> tuple[Any, Any]:
         with self._lock:
-            if self._modules is None:
+            if self.modules is None:
                 try:
-                    self._modules = (
+                    self.modules = (
                         importlib.import_module("sky"),
                         importlib.import_module("sky.client.sdk"),
                     )
@@ -237,7 +237,7 @@ class InstalledSky:
                         f"SkyPilot is not usable here: {error}",
                         "`pip install 'fogft[cloud]'`, or run with `--cloud local`",
                     ) from error
-            return self._modules
+            return self.modules
 
 
 def _asked(sdk: Any, **filters: Any) -> list[Any]:

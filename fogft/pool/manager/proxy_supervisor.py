@@ -46,26 +46,26 @@ class ProxySupervisor:
             *(sys.executable, "-m", "fogft"),
             *("proxy", "--config", str(paths.proxy_config)),
         )
-        self._child: subprocess.Popen[bytes] | None = None
+        self.child: subprocess.Popen[bytes] | None = None
         self._started_at = 0.0
         self._next_at = 0.0
         self._failures = 0
 
     def look(self) -> bool:
         """Start the proxy where it is missing; return whether one runs."""
-        if self._child is not None:
-            if self._child.poll() is None:
+        if self.child is not None:
+            if self.child.poll() is None:
                 return True
-            self._ended(self._child.returncode)
-            self._child = None
+            self._ended(self.child.returncode)
+            self.child = None
         # Only asked when none of ours runs: asking takes the lock for a moment.
         if disk.is_locked(self._paths.proxy_lock):
             return True
         if self._clock() < self._next_at:
             return False
         self._started_at = self._clock()
-        self._child = detached(self._command, self._paths.proxy_log)
-        log.info("proxy_started pid=%d", self._child.pid)
+        self.child = detached(self._command, self._paths.proxy_log)
+        log.info("proxy_started pid=%d", self.child.pid)
         return True
 
     def _ended(self, status: int) -> None:
@@ -78,7 +78,7 @@ class ProxySupervisor:
     @property
     def trouble(self) -> str:
         """Return what is wrong with it, in a sentence; empty when nothing is."""
-        if self._failures < 2 or self._child is not None:
+        if self._failures < 2 or self.child is not None:
             return ""
         return (
             f"the client proxy has ended {self._failures} times in a row; "

@@ -139,7 +139,7 @@ class Reconciler:
         self._by_hand = by_hand
         self._gateways = gateways
         # A planned launch is what a launch is about; None stands for a termination.
-        self._operations: Operations[Machine | None] = Operations(submit, on_done)
+        self.operations: Operations[Machine | None] = Operations(submit, on_done)
         self._refreshes: Operations[None] = Operations(submit, on_done)
         self._silent = Silent()
         self._offers: tuple[Offer, ...] = ()
@@ -199,7 +199,7 @@ class Reconciler:
     # -- observe ----------------------------------------------------------------------------
 
     def _settle_outcomes(self) -> None:
-        for outcome in self._operations.collect():
+        for outcome in self.operations.collect():
             id, error = outcome.id, outcome.error
             if error is None:
                 continue
@@ -218,7 +218,7 @@ class Reconciler:
 
     def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[str]]:
         trouble: list[str] = []
-        busy = self._operations.busy()  # before the cloud is asked: see `operations`
+        busy = self.operations.busy()  # before the cloud is asked: see `operations`
         now = self._time.now
         machines: tuple[Machine, ...] | None = None
         try:
@@ -343,16 +343,16 @@ class Reconciler:
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
         )
-        self._operations.start(order.id, expected, lambda: self._cloud.launch(order))
+        self.operations.start(order.id, expected, lambda: self._cloud.launch(order))
 
     def _terminate(self, id: ReplicaId, reason: str, history: History) -> None:
-        if id in self._operations.busy():
+        if id in self.operations.busy():
             return  # its launch is under way: a later tick ends it
         record = history.record(id.slot, id.generation)
         if record is None or not record.ending:
             self._remember.add(EventKind.ENDING, id, detail=reason)
             log.info("terminate_ordered replica=%s reason=%r", id.short, reason)
-        self._operations.start(id, None, lambda: self._cloud.terminate(id))
+        self.operations.start(id, None, lambda: self._cloud.terminate(id))
 
 
 def _refusal(error: Exception) -> str:

@@ -97,8 +97,8 @@ class Proxy:
 
     def look_until_ended(self) -> None:
         assert self.supervisor.look()
-        assert self.supervisor._child is not None
-        self.supervisor._child.wait(20)
+        assert self.supervisor.child is not None
+        self.supervisor.child.wait(20)
 
 
 def test_a_proxy_that_keeps_dying_is_started_less_and_less_often(tmp_path: Path) -> None:
@@ -111,8 +111,8 @@ def test_a_proxy_that_keeps_dying_is_started_less_and_less_often(tmp_path: Path)
         while not proxy.supervisor.look():
             proxy.now += 0.5
         waits.append(proxy.now - died_at)
-        assert proxy.supervisor._child is not None
-        proxy.supervisor._child.wait(20)
+        assert proxy.supervisor.child is not None
+        proxy.supervisor.child.wait(20)
     assert waits == sorted(waits)
     assert waits[-1] <= BACKOFF_LIMIT_S
     assert waits[0] < 2
@@ -128,8 +128,8 @@ def test_a_proxy_that_ran_well_is_started_again_at_once(tmp_path: Path) -> None:
     proxy.now += 31
     assert proxy.supervisor.look()
     assert proxy.supervisor.trouble == ""
-    assert proxy.supervisor._child is not None
-    proxy.supervisor._child.wait(20)
+    assert proxy.supervisor.child is not None
+    proxy.supervisor.child.wait(20)
 
 
 def test_a_running_proxy_is_adopted(tmp_path: Path) -> None:
@@ -138,5 +138,5 @@ def test_a_running_proxy_is_adopted(tmp_path: Path) -> None:
     held = disk.Lock(proxy.paths.proxy_lock)
     assert held.acquire(wait=False)
     assert proxy.supervisor.look()
-    assert proxy.supervisor._child is None
+    assert proxy.supervisor.child is None
     held.release()

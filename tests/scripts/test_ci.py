@@ -1,13 +1,16 @@
-"""What cannot run here is skipped out loud: `scripts/test-sky`, and `.ci/run` after it."""
+"""What cannot run here is said: by `scripts/test-sky`, and by `.ci/run` and `.ci/nightly`."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+
+from tests.needs import NEEDS
 
 ROOT = Path(__file__).parents[2]
 SETUP = '#!/usr/bin/env bash\nwhile [ "$1" != -- ]; do shift; done\nshift\necho "ran: $*"\n'
@@ -19,7 +22,8 @@ def tree(tmp_path: Path) -> Path:
     (tmp_path / "scripts").mkdir()
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / "scripts/test-sky", tmp_path / "scripts")
-    shutil.copy(ROOT / ".ci/run", tmp_path / ".ci")
+    for name in ("run", "nightly"):
+        shutil.copy(ROOT / ".ci" / name, tmp_path / ".ci")
     program(tmp_path / "scripts/setup", SETUP)
     return tmp_path
 
@@ -29,13 +33,16 @@ def program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def run(tree: Path, *words: str, **stubs: str) -> subprocess.CompletedProcess[str]:
+def run(
+    tree: Path, *words: str, more: Mapping[str, str] = {}, **stubs: str
+) -> subprocess.CompletedProcess[str]:
     """Run a script of the tree, with programs that stand in for those of the machine."""
     folder = tree / "stubs"
     folder.mkdir(exist_ok=True)
     for name, text in stubs.items():
         program(folder / name, f"#!/bin/sh\n{text}\n")
-    environ = {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"}
+    environ = {k: v for k, v in os.environ.items() if not k.startswith("FOGFT_")}
+    environ |= {"PATH": f"{folder}:{os.environ['PATH']}", **more}
     return subprocess.run(
         [tree / words[0], *words[1:]], env=environ, capture_output=True, text=True, check=False,
         timeout=60,
@@ -67,10 +74,10 @@ def test_an_unknown_option_is_wrong_usage(tree):
 
 @pytest.fixture
 def ci(tree):
-    """A tree in which all that `.ci/run` calls passes, and nothing is installed."""
-    for name in ("check", "test", "quickstart", "soak", "test-sky"):
-        program(tree / "scripts" / name, "#!/bin/sh\nexit 0\n")
-    program(tree / "scripts/reproduce", '#!/bin/sh\necho "reproduce $*"\n')
+    """A tree in which all that `.ci/run` calls passes and says so, and nothing is installed."""
+    for name in ("check", "quickstart", "soak", "test-sky", "reproduce", "fuzz"):
+        program(tree / "scripts" / name, f'#!/bin/sh\necho "{name} $*"\n')
+    program(tree / "scripts/test", '#!/bin/sh\necho "test with $FOGFT_MUST_RUN"\n')
     (tree / "stubs").mkdir()
     tools = dict.fromkeys(("apt-get", "g++", "cmake", "ninja", "npm"), "exit 0")
     for name, text in {**tools, "ldconfig": "echo libEGL.so.1"}.items():
@@ -78,12 +85,32 @@ def ci(tree):
     return tree
 
 
-@pytest.mark.parametrize(("status", "whole"), [(0, 0), (77, 0), (1, 1), (124, 1)])
-def test_ci_goes_on_after_a_skip_and_fails_after_a_failure(ci, status, whole):
-    program(ci / "scripts/test-sky", f"#!/bin/sh\nexit {status}\n")
-    done = run(ci, ".ci/run")
-    assert done.returncode == whole
-    assert ("SKIPPED: scripts/test-sky" in done.stderr) is (status == 77)
+@pytest.mark.parametrize(
+    ("step", "status", "must", "whole"),
+    [
+        ("test-sky", 0, "pools-on-aws", 0),
+        ("test-sky", 77, "tun", 0),
+        ("test-sky", 77, "tun,pools-on-aws", 1),
+        ("test-sky", 1, "", 1),
+        ("test-sky", 124, "", 1),
+        ("soak", 1, "", 1),
+    ],
+)
+def test_ci_takes_every_step_and_fails_if_one_failed_or_did_not_run(ci, step, status, must, whole):
+    program(ci / "scripts" / step, f"#!/bin/sh\nexit {status}\n")
+    done = run(ci, ".ci/run", more={"FOGFT_MUST_RUN": must})
+    assert done.returncode == whole, done.stderr
+    assert "reproduce --quick --only planning" in done.stdout
+    assert ("not run: scripts/test-sky" in done.stderr) is (status == 77)
+    assert "not run: detection, segmentation and picking: " in done.stderr
+
+
+def test_ci_asks_for_what_the_tests_can_need(ci):
+    """Each name is one of `tests/needs.py`."""
+    said = run(ci, ".ci/run").stdout
+    [asked] = [line for line in said.splitlines() if line.startswith("test with")]
+    names = set(filter(None, asked.removeprefix("test with ").split(",")))
+    assert {"namespaces", "rclpy"} <= names <= set(NEEDS)
 
 
 def pip(tree: Path, text: str) -> None:
@@ -91,11 +118,15 @@ def pip(tree: Path, text: str) -> None:
     program(tree / ".venv/bin/python", f"#!/bin/sh\n{text}\n")
 
 
-def test_ci_runs_every_experiment_where_the_machine_can(ci):
+def test_at_night_all_that_the_machine_can_do_is_run(ci):
     pip(ci, """echo '{"name": "torch"}'""")
-    done = run(ci, ".ci/run")
+    done = run(ci, ".ci/nightly")
+    assert done.returncode == 0, done.stderr
     assert "reproduce --quick\n" in done.stdout
-    assert "SKIPPED" not in done.stderr
+    assert "fuzz" in done.stdout
+    modes = ("", "--adapter", "--alone", "--container", "--contract")
+    assert all(f"test-sky {mode}\n" in done.stdout for mode in modes)
+    assert "not run" not in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -105,11 +136,11 @@ def test_ci_runs_every_experiment_where_the_machine_can(ci):
         ("exit 1", "pip does not find"),
     ],
 )
-def test_ci_says_which_experiments_it_did_not_run_and_why(ci, plan, why):
+def test_a_night_says_which_experiments_it_did_not_run_and_why(ci, plan, why):
     pip(ci, plan)
-    done = run(ci, ".ci/run")
+    done = run(ci, ".ci/nightly")
     assert done.returncode == 0
     assert "--only planning" in done.stdout
     assert "detection" not in done.stdout
-    assert "SKIPPED: detection, segmentation and picking" in done.stderr
+    assert "not run: detection, segmentation and picking" in done.stderr
     assert why in done.stderr
