@@ -32,7 +32,7 @@ _PLACES = {
     "delhi": (29, 77), "washington-state": (47, -120), "texas": (29, -98), "toronto": (44, -79),
     "illinois": (42, -88), "arizona": (33, -112), "wyoming": (41, -105),
 }  # fmt: skip
-_REGIONS = {
+REGIONS = {
     "aws": {
         "us-east-1": "virginia", "us-east-2": "ohio", "us-west-1": "california",
         "us-west-2": "oregon", "ca-central-1": "montreal", "ca-west-1": "calgary",
@@ -88,7 +88,7 @@ def endpoint(region: str) -> tuple[str, int] | None:
 def position(region: str) -> tuple[float, float] | None:
     """Return latitude and longitude of a ``cloud/region`` in degrees; None where not known."""
     cloud, _, name = region.partition("/")
-    place = _REGIONS.get(cloud, {}).get(name)
+    place = REGIONS.get(cloud, {}).get(name)
     return None if place is None else _PLACES[place]
 
 

@@ -161,7 +161,7 @@ def discovery(_: Situation) -> Iterator[Finding]:
     """Two processes find each other in this environment and one calls the other."""
     name = f"fogft_doctor_{secrets.token_hex(4)}"
     with subprocess.Popen(
-        _command("answer", name),
+        child_command("answer", name),
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -198,7 +198,7 @@ def _self_test(*arguments: str) -> dict[str, Any]:
     """Run `fogft.ros.self_test`; return what it printed, or ``{"error": ...}``."""
     try:
         ended = subprocess.run(
-            _command(*arguments),
+            child_command(*arguments),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -216,7 +216,8 @@ def _self_test(*arguments: str) -> dict[str, Any]:
     return result if isinstance(result, dict) else {"error": "no answer"}
 
 
-def _command(*arguments: str) -> list[str]:
+def child_command(*arguments: str) -> list[str]:
+    """Return the command that tries ROS in a process of its own, which may crash."""
     return [sys.executable, "-m", "fogft.ros.self_test", *arguments]
 
 

@@ -139,7 +139,7 @@ def to_dict(membership: Membership) -> dict[str, Any]:
         "revoked": sorted(membership.revoked),
         "topology": membership.topology.to_plain(),
     }
-    return {**content, "checksum": _checksum(content)}
+    return {**content, "checksum": checksum(content)}
 
 
 def from_dict(raw: Any) -> Membership:
@@ -150,7 +150,7 @@ def from_dict(raw: Any) -> Membership:
     """
     try:
         content = {key: value for key, value in raw.items() if key != "checksum"}
-        if raw["checksum"] != _checksum(content):
+        if raw["checksum"] != checksum(content):
             raise ValueError("its checksum is wrong")
         parts = {key: content[key] for key in ("pool", "pool_uid", "epoch", "version", "members")}
         parts["revoked"] = content.get("revoked", ())  # older versions knew none
@@ -227,6 +227,7 @@ def _text(value: Any) -> str:
     return value
 
 
-def _checksum(content: Mapping[str, Any]) -> str:
+def checksum(content: Mapping[str, Any]) -> str:
+    """Return what a membership's JSON form is checked by."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]

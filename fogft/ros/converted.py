@@ -10,13 +10,19 @@ from typing import Any
 from fogft.errors import RosError, Unreadable
 
 
-def _to_bytes(message: Any) -> bytes:
+def to_bytes(message: Any) -> bytes:
+    """Serialise a message."""
     from rclpy.serialization import serialize_message
 
     return bytes(serialize_message(message))
 
 
-def _from_bytes(payload: bytes, message_type: Any) -> Any:
+def from_bytes(payload: bytes, message_type: Any) -> Any:
+    """Read a serialised message back.
+
+    Raises:
+        Unreadable: It is none of this type.
+    """
     from rclpy.serialization import deserialize_message
 
     try:
@@ -40,11 +46,11 @@ class ConvertedServiceEnd:
             request, header = self._handle.service_take_request(self._type.Request)
         except Exception as error:
             raise RosError(f"a request cannot be taken: {error}") from error
-        return None if header is None else (_to_bytes(request), header.request_id)
+        return None if header is None else (to_bytes(request), header.request_id)
 
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send a serialised response."""
-        response = _from_bytes(payload, self._type.Response)
+        response = from_bytes(payload, self._type.Response)
         try:
             self._handle.service_send_response(response, handle)
         except Exception as error:
@@ -69,11 +75,11 @@ class ConvertedClientEnd:
             raise RosError(f"a response cannot be taken: {error}") from error
         if header is None:
             return None
-        return header.request_id.sequence_number, _to_bytes(response)
+        return header.request_id.sequence_number, to_bytes(response)
 
     def send(self, payload: bytes) -> int:
         """Send a serialised request; return its sequence number."""
-        request = _from_bytes(payload, self._type.Request)
+        request = from_bytes(payload, self._type.Request)
         try:
             return int(self._handle.send_request(request))
         except Exception as error:

@@ -44,8 +44,8 @@ def sweep() -> list[str]:
     cannot be judged stay.
     """
     with _one_at_a_time() as my_turn:
-        candidates = _groups() if my_turn else {}
-        used = _used_names() if candidates else set()
+        candidates = grouped_names() if my_turn else {}
+        used = names_in_use() if candidates else set()
         unused = {group for group, names in candidates.items() if used.isdisjoint(names)}
         return sorted(_remove(unused)) if unused else []
 
@@ -78,13 +78,13 @@ def _lock(descriptor: int, deadline: float) -> bool:
 
 def abandoned() -> list[Path]:
     """Return the files that `sweep` would remove now, sorted; remove nothing."""
-    candidates = _groups()
-    used = _used_names() if candidates else set()
+    candidates = grouped_names()
+    used = names_in_use() if candidates else set()
     unused = [names for names in candidates.values() if used.isdisjoint(names)]
     return sorted(FOLDER / n for names in unused if not any(map(_locked, names)) for n in names)
 
 
-def _groups() -> dict[str, list[str]]:
+def grouped_names() -> dict[str, list[str]]:
     """Return the settled groups of this user's files, by what they belong to."""
     groups: dict[str, list[str]] = {}
     fresh: set[str] = set()
@@ -113,7 +113,7 @@ def _entries() -> list[os.DirEntry[str]]:
         return []  # not Linux, or no shared memory at all
 
 
-def _used_names() -> set[str]:
+def names_in_use() -> set[str]:
     """Return the names in /dev/shm that a process of ours maps or holds open."""
     prefix = f"{FOLDER}/".encode()
     used: set[str] = set()
@@ -140,21 +140,22 @@ def _remove(unused: set[str]) -> list[str]:
     in /proc. One that cannot be had is mapped by a living process, or its holder was
     killed. They go last: until then they keep others from the port.
     """
-    held = [group for group in unused if "_port" in group and _semaphore(group, "sem_trywait")]
+    held = [group for group in unused if "_port" in group and semaphore(group, "sem_trywait")]
     going: list[str] = []
     try:
-        used = _used_names()
-        for group, names in _groups().items():
+        used = names_in_use()
+        for group, names in grouped_names().items():
             if group in unused and used.isdisjoint(names) and not any(map(_locked, names)):
                 going += names
-        removed = [name for name in going if not name.startswith("sem.") and _unlink(name)]
+        removed = [name for name in going if not name.startswith("sem.") and unlink_name(name)]
     finally:
         for group in held:
-            _semaphore(group, "sem_post")
-    return removed + [name for name in going if name.startswith("sem.") and _unlink(name)]
+            semaphore(group, "sem_post")
+    return removed + [name for name in going if name.startswith("sem.") and unlink_name(name)]
 
 
-def _unlink(name: str) -> bool:
+def unlink_name(name: str) -> bool:
+    """Remove a file; return whether that worked."""
     try:
         (FOLDER / name).unlink()
     except OSError:
@@ -162,17 +163,17 @@ def _unlink(name: str) -> bool:
     return True
 
 
-def _semaphore(group: str, operation: str) -> bool:
+def semaphore(group: str, operation: str) -> bool:
     """Do something to the POSIX semaphore of a port; whether there is one and it worked."""
     libc = ctypes.CDLL(None)
     libc.sem_open.restype = ctypes.c_void_p
-    semaphore = libc.sem_open(f"/{group}_mutex".encode(), 0)
-    if not semaphore:  # SEM_FAILED
+    opened = libc.sem_open(f"/{group}_mutex".encode(), 0)
+    if not opened:  # SEM_FAILED
         return False
     try:
-        return bool(getattr(libc, operation)(ctypes.c_void_p(semaphore)) == 0)
+        return bool(getattr(libc, operation)(ctypes.c_void_p(opened)) == 0)
     finally:
-        libc.sem_close(ctypes.c_void_p(semaphore))
+        libc.sem_close(ctypes.c_void_p(opened))
 
 
 def _locked(name: str) -> bool:

@@ -206,7 +206,7 @@ def bool_field(name: str, field: str) -> Callable[[bytes], bool]:
         except Exception as error:  # rclpy's own error types are private and vary by release
             raise RosError(f"{len(payload)} bytes are not a response of `{name}`") from error
 
-    offset = _fixed_offset(fields, field)
+    offset = fixed_offset(fields, field)
     if offset is None:
         return read_all
 
@@ -218,7 +218,7 @@ def bool_field(name: str, field: str) -> Callable[[bytes], bool]:
     return read_byte
 
 
-def _fixed_offset(fields: dict[str, str], field: str) -> int | None:
+def fixed_offset(fields: dict[str, str], field: str) -> int | None:
     """Return where a field lies in every serialised message; None if that varies."""
     offset = 0
     for name, kind in fields.items():

@@ -22,8 +22,8 @@ _SUCCEEDED = 4
 _UNKNOWN = 0
 _CDR_HEADER = b"\x00\x01\x00\x00"
 _NO_TIME = bytes(8)
-_GOALS_KEPT = 4096
-_BYTES_KEPT = 64 << 20
+GOALS_KEPT = 4096
+BYTES_KEPT = 64 << 20
 _AGAIN_AFTER_S = 0.25  # and twice as long each time
 _AGAIN_LIMIT_S = 8.0
 # Which of two statuses says more: done well, then the furthest of those under way, then an end.
@@ -122,7 +122,7 @@ class Goals:
         self._goals: OrderedDict[bytes, _Goal] = OrderedDict()
         self._of_id: dict[bytes, bytes] = {}  # request id -> goal
         self._awaited: dict[bytes, _Goal] = {}
-        self._over: OrderedDict[bytes, bytes] = OrderedDict()  # the same, of goals that ended
+        self.over: OrderedDict[bytes, bytes] = OrderedDict()  # the same, of goals that ended
         self._bytes = 0
 
     # -- giving ---------------------------------------------------------------------------
@@ -137,9 +137,7 @@ class Goals:
         self._note(goal, id)
         for replica in replicas:
             self.gave(goal, id, replica, until)
-        while len(self._goals) > 1 and (
-            len(self._goals) > _GOALS_KEPT or self._bytes > _BYTES_KEPT
-        ):
+        while len(self._goals) > 1 and (len(self._goals) > GOALS_KEPT or self._bytes > BYTES_KEPT):
             oldest = next(iter(self._goals))
             unwanted = (one for one in self._goals if one != goal and one not in self._awaited)
             self._drop(next(unwanted, oldest))
@@ -160,7 +158,7 @@ class Goals:
         """A replica has answered whether it takes a goal. Unknown ids are fine."""
         known = self._given_by(id)
         if known is None:
-            goal = self._over.get(id) if accepts else None
+            goal = self.over.get(id) if accepts else None
             return Took(goal, in_vain=True)
         if accepts:
             known.accepted = True
@@ -225,9 +223,9 @@ class Goals:
         """A goal has its result, or its client has given up. Unknown goals are fine."""
         known = self._drop(goal)
         if known is not None and any(word.since == math.inf for word in known.words.values()):
-            self._over.update(dict.fromkeys(known.ids, goal))
-            while len(self._over) > _GOALS_KEPT:
-                self._over.popitem(last=False)
+            self.over.update(dict.fromkeys(known.ids, goal))
+            while len(self.over) > GOALS_KEPT:
+                self.over.popitem(last=False)
 
     def _drop(self, goal: bytes) -> _Goal | None:
         """Forget a goal, which may well go on."""
@@ -252,6 +250,11 @@ class Goals:
         """All goals are over."""
         for goal in list(self._goals):
             self.ended(goal)
+
+    @property
+    def kept(self) -> int:
+        """How many goals are remembered."""
+        return len(self._goals)
 
     def __contains__(self, goal: bytes) -> bool:
         """Whether a goal is under way: accepted, and without a result."""

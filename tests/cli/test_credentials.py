@@ -35,7 +35,7 @@ def paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PoolPaths:
     """A pool without a manager, in a home of its own."""
     monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(bundle._SCRYPT, "n", 2)
+    monkeypatch.setitem(bundle.SCRYPT, "n", 2)
     paths = PoolPaths.of("planner")
     authority.create_authority(paths.credentials, UID)
     write_identity(paths, Identity("planner", UID, "local", str(tmp_path / "p.yaml"), 0.0))

@@ -179,7 +179,7 @@ def test_what_was_found_is_told_though_taking_the_node_down_crashes(
         "if sys.argv[1] == 'ask': Node.destroy_node = lambda _: os.kill(os.getpid(), 11)\n"
         "sys.exit(self_test.main(sys.argv[1:]))\n"
     )
-    monkeypatch.setattr(ros, "_command", lambda *words: [sys.executable, "-c", crash, *words])
+    monkeypatch.setattr(ros, "child_command", lambda *words: [sys.executable, "-c", crash, *words])
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
     found = the_only(ros.discovery(situation(tmp_path)))
     assert found.verdict is Verdict.OK, found

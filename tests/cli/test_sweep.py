@@ -140,7 +140,7 @@ def test_a_vm_that_only_its_cloud_still_knows_is_found_and_ended(scene, capsys):
     """The pool's folder, our notes and SkyPilot's database are gone; the label is left."""
     scene.launched()
     scene.sky.forget_everything()
-    scene.cloud._journal.close(replica())
+    scene.cloud.journal.close(replica())
     [line], err = run(capsys)
     assert line.split()[:3] == [str(replica()), "aws/us-east-1/us-east-1a", "$0.021/h"]
     assert "asked SkyPilot for all its clouds, and `aws` directly" in err

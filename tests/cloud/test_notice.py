@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -158,10 +159,12 @@ def test_a_file_that_appears_is_a_notice(
 def test_where_there_is_no_metadata_server_nothing_is_heard():
     """`auto` on a robot or a workstation is silent, and its thread ends when told to."""
     told: list[Notice] = []
+    before = set(threading.enumerate())
     one = watch("auto", told.append, poll_s=0.01, metadata="127.0.0.1:1")
+    [thread] = set(threading.enumerate()) - before
     one.close()
-    one._thread.join(WITHIN_S)
-    assert not one._thread.is_alive()
+    thread.join(WITHIN_S)
+    assert not thread.is_alive()
     assert not told
 
 

@@ -101,7 +101,7 @@ class Picking(Defaults):
             for slot, region in _slots(pools).items():
                 _slow(pools, slot, region)
             with _Arm(pools, workspace) as arm:
-                story = _Story(pools, arm, count)
+                story = Story(pools, arm, count)
                 yield lambda _, number: story.row(number)
 
     def findings(self, samples: Samples) -> Sequence[Finding]:
@@ -226,7 +226,7 @@ class _Arm:
 
 
 @dataclass
-class _Story:
+class Story:
     """Takes the arm's requests in their order, and ends machines when it is time.
 
     Args:

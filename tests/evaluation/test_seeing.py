@@ -193,7 +193,7 @@ class TestStory:
                 self.summary = {"cycles": 7, "failed_cycles": 0}
 
         monkeypatch.setattr(picking.time, "time", lambda: world.now)
-        world.story = picking._Story(Pools(), Arm(), 100)
+        world.story = picking.Story(Pools(), Arm(), 100)
         return world
 
     def test_it_goes_from_a_to_e_and_loses_no_request(self, story):

@@ -109,8 +109,8 @@ class MockCloud:
         self.unreachable = False
         self._clock = clock
         self._random = random.Random(seed)
-        self._vms: dict[ReplicaId, _Vm] = {}
-        self._errors: dict[str, list[CloudError]] = {}
+        self.vms: dict[ReplicaId, _Vm] = {}
+        self.errors: dict[str, list[CloudError]] = {}
 
     # -- the port -------------------------------------------------------------------------
 
@@ -136,7 +136,7 @@ class MockCloud:
     def launch(self, order: Launch) -> None:
         """Order a machine; it runs after the zone's boot time."""
         self._meet("launch")
-        if order.id in self._vms:
+        if order.id in self.vms:
             return
         zone = self.zones[order.placement.location]
         here = sum(m.placement.location == zone.placement.location for m in self.present())
@@ -145,13 +145,13 @@ class MockCloud:
         now = self._clock()
         self.calls.launched.append(order.id)
         boot_s = self._random.uniform(*zone.boot_s)
-        self._vms[order.id] = _Vm(order, now, now + boot_s, zone.fails)
+        self.vms[order.id] = _Vm(order, now, now + boot_s, zone.fails)
 
     def terminate(self, id: ReplicaId) -> None:
         """End a machine at once."""
         self._meet("terminate")
         self.calls.terminated.append(id)
-        vm = self._vms.get(id)
+        vm = self.vms.get(id)
         if vm is not None:
             vm.gone_at = min(vm.gone_at, self._clock())
 
@@ -164,27 +164,27 @@ class MockCloud:
     def present(self) -> list[Machine]:
         """Return the machines of all pools, whatever `machines` is told to answer."""
         now = self._clock()
-        return sorted((vm.at(now) for vm in self._vms.values() if now < vm.gone_at), key=_BY_ID)
+        return sorted((vm.at(now) for vm in self.vms.values() if now < vm.gone_at), key=_BY_ID)
 
     def machine(self, id: ReplicaId) -> Machine | None:
         """Return one of them, None if it is not there."""
-        vm, now = self._vms.get(id), self._clock()
+        vm, now = self.vms.get(id), self._clock()
         return vm.at(now) if vm and now < vm.gone_at else None
 
     def fail_next(self, operation: str, error: CloudError) -> None:
         """Let the next call of an operation (``launch``, ``machines``, ...) raise an error."""
-        self._errors.setdefault(operation, []).append(error)
+        self.errors.setdefault(operation, []).append(error)
 
     def preempt(self, id: ReplicaId, *, notice_s: float = 0.0) -> None:
         """Take a machine away, after a notice if `notice_s` is positive."""
-        vm, now = self._vms[id], self._clock()
+        vm, now = self.vms[id], self._clock()
         if notice_s > 0:
             vm.notice_at = min(vm.notice_at, now)
         vm.gone_at = min(vm.gone_at, now + notice_s)
 
     def _meet(self, operation: str) -> None:
-        if self._errors.get(operation):
-            raise self._errors[operation].pop(0)
+        if self.errors.get(operation):
+            raise self.errors[operation].pop(0)
         if self.unreachable:
             raise CloudUnreachable("the mock cloud is told to be unreachable")
 

@@ -200,9 +200,7 @@ def test_closing_in_the_midst_of_a_large_send_leaves_no_thread(
     replica.signal(signal.SIGSTOP)
     assert link.offer(SERVICE, request_id(1), bytes(30_000_000), 600.0)
     if settles:
-        connection = link._live
-        assert connection is not None
-        wait_for(lambda: connection.attempts.sending)
+        wait_for(lambda: link.sending)
     link.close()
     wait_for(lambda: owner.of(1))
     wait_for(lambda: set(threading.enumerate()) <= before)

@@ -158,7 +158,7 @@ def test_a_name_of_nobody_in_the_pool_cannot_be_revoked(name: object) -> None:
     raw["revoked"] = [name]
     del raw["checksum"]
     with pytest.raises(StateError):
-        memberships.from_dict({**raw, "checksum": memberships._checksum(raw)})
+        memberships.from_dict({**raw, "checksum": memberships.checksum(raw)})
 
 
 def test_replicas_started_by_hand_are_members_that_say_where_they_are() -> None:

@@ -50,7 +50,7 @@ class Scene:
         self.store = store_of(home)
         self.paths = self.store.paths
         self.cloud = cloud_of(home)
-        self._started: list[subprocess.Popen[bytes]] = []
+        self.started: list[subprocess.Popen[bytes]] = []
 
     def write(
         self, *, replicas: int = 2, timeout_s: float = 5.0, max_hours: float = 100.0
@@ -75,7 +75,7 @@ class Scene:
         self.home.mkdir(exist_ok=True)
         with (self.home / "manager-output").open("ab") as output:
             process = subprocess.Popen(self.command(), stdout=output, stderr=output)
-        self._started.append(process)
+        self.started.append(process)
         return process
 
     def status(self) -> dict[str, Any]:
@@ -92,7 +92,7 @@ class Scene:
             value = condition()
             if value:
                 return value
-            assert time.monotonic() < end, (self.status(), self._output())
+            assert time.monotonic() < end, (self.status(), self.output())
             time.sleep(0.02)
 
     def whole(self, count: int) -> bool:
@@ -105,12 +105,12 @@ class Scene:
         warnings = [] if warned is None else warned
         return shutdown.end(self.store, lambda _: self.cloud, warned=warnings.append, limit_s=5)
 
-    def _output(self) -> str:
+    def output(self) -> str:
         path = self.home / "manager-output"
         return path.read_text() if path.exists() else ""
 
     def close(self) -> None:
-        for process in self._started:
+        for process in self.started:
             if process.poll() is None:
                 process.kill()
             process.wait()

@@ -90,7 +90,7 @@ def test_a_map_survives_as_it_is(cells: list[int], frame: str) -> None:
     request.map.header.frame_id = frame
     request.initial_pose.pose.covariance[7] = 0.5
     assert through_c(request) == request
-    kept = converted._from_bytes(converted._to_bytes(request), type(request))
+    kept = converted.from_bytes(converted.to_bytes(request), type(request))
     assert through_c(kept) == kept
 
 
@@ -137,7 +137,7 @@ def test_both_ways_refuse_the_same(payload: bytes) -> None:
         message.read(payload)
     message.close()
     with pytest.raises(RosError, match="not a serialised SetBool_Response"):
-        converted._from_bytes(payload, response_type)
+        converted.from_bytes(payload, response_type)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -103,7 +103,7 @@ def test_a_locked_file_stays_though_its_holder_is_hidden(
     leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A lock tells of a process in another container, which /proc does not show."""
-    monkeypatch.setattr(shared_memory, "_used_names", set)
+    monkeypatch.setattr(shared_memory, "names_in_use", set)
     path, lock = leave("fastdds_ab"), leave("fastdds_ab_el")
     with lock.open("rb") as held:
         fcntl.flock(held, fcntl.LOCK_SH)
@@ -135,7 +135,7 @@ def test_a_file_that_comes_into_use_while_sweeping_stays(
     """The second look counts."""
     path = leave("fastdds_ab")
     looks = iter([set[str](), {path.name}])
-    monkeypatch.setattr(shared_memory, "_used_names", lambda: next(looks))
+    monkeypatch.setattr(shared_memory, "names_in_use", lambda: next(looks))
     assert path.name not in shared_memory.sweep()
     assert path.exists()
 
@@ -145,15 +145,15 @@ def test_a_port_is_judged_under_its_mutex(
 ) -> None:
     """Nobody can open a port between the second look and its end; then the mutex is free again."""
     steps: list[str] = []
-    used_names, unlink = shared_memory._used_names, shared_memory._unlink
+    used_names, unlink = shared_memory.names_in_use, shared_memory.unlink_name
     monkeypatch.setattr(
-        shared_memory, "_used_names", lambda: (steps.append("look"), used_names())[1]
+        shared_memory, "names_in_use", lambda: (steps.append("look"), used_names())[1]
     )
     monkeypatch.setattr(
-        shared_memory, "_unlink", lambda name: (steps.append(name), unlink(name))[1]
+        shared_memory, "unlink_name", lambda name: (steps.append(name), unlink(name))[1]
     )
     monkeypatch.setattr(
-        shared_memory, "_semaphore", lambda group, what: steps.append(f"{group} {what}") or True
+        shared_memory, "semaphore", lambda group, what: steps.append(f"{group} {what}") or True
     )
     leave("fastdds_port7411")
     leave("sem.fastdds_port7411_mutex")
@@ -177,14 +177,14 @@ def test_a_mutex_is_had_once_and_leaves_no_mapping() -> None:
     assert made
     libc.sem_close(ctypes.c_void_p(made))
     try:
-        assert shared_memory._semaphore(group, "sem_trywait")
-        assert not shared_memory._semaphore(group, "sem_trywait")
+        assert shared_memory.semaphore(group, "sem_trywait")
+        assert not shared_memory.semaphore(group, "sem_trywait")
         assert group not in Path("/proc/self/maps").read_text()
-        assert shared_memory._semaphore(group, "sem_post")
-        assert shared_memory._semaphore(group, "sem_trywait")
+        assert shared_memory.semaphore(group, "sem_post")
+        assert shared_memory.semaphore(group, "sem_trywait")
     finally:
         Path(f"/dev/shm/sem.{group}_mutex").unlink()
-    assert not shared_memory._semaphore(group, "sem_trywait")
+    assert not shared_memory.semaphore(group, "sem_trywait")
 
 
 def test_sweeps_side_by_side_remove_each_file_once(leave: Callable[[str], Path]) -> None:
@@ -244,18 +244,18 @@ def test_a_live_node_survives_and_a_killed_one_is_swept(
         process.kill()
         process.wait()
     shared_memory.sweep()
-    left = theirs & set(os.listdir(shared_memory.FOLDER)) - shared_memory._used_names()
+    left = theirs & set(os.listdir(shared_memory.FOLDER)) - shared_memory.names_in_use()
     assert left == set()
     assert theirs - _names_of(os.getpid())
 
 
 def _judge_only(names: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Judge these files at once, and leave alone the fresh ones of whoever else runs here."""
-    groups = shared_memory._groups
+    groups = shared_memory.grouped_names
     monkeypatch.setattr(shared_memory, "SETTLED_S", 0.0)
     monkeypatch.setattr(
         shared_memory,
-        "_groups",
+        "grouped_names",
         lambda: {group: found for group, found in groups().items() if names & set(found)},
     )
 

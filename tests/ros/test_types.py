@@ -143,10 +143,10 @@ def test_a_field_that_is_no_boolean_is_an_error(field: str) -> None:
 def test_offsets_follow_cdr_alignment() -> None:
     """Each number is aligned to its own size, counted from after the header."""
     fields = {"a": "uint8", "b": "double", "c": "boolean", "d": "uint16", "e": "boolean"}
-    assert types._fixed_offset(fields, "c") == 4 + 16
-    assert types._fixed_offset(fields, "e") == 4 + 20
-    assert types._fixed_offset({"t": "string", "b": "boolean"}, "b") is None
-    assert types._fixed_offset({"t": "uint8[3]", "b": "boolean"}, "b") is None
+    assert types.fixed_offset(fields, "c") == 4 + 16
+    assert types.fixed_offset(fields, "e") == 4 + 20
+    assert types.fixed_offset({"t": "string", "b": "boolean"}, "b") is None
+    assert types.fixed_offset({"t": "uint8[3]", "b": "boolean"}, "b") is None
 
 
 @pytest.mark.parametrize("payload", [b"", b"\x00\x01\x00\x00", b"\xff\xff\x00\x00\x01"])

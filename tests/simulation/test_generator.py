@@ -80,7 +80,7 @@ def test_traces_that_never_change_cannot_be_fitted():
 )
 def test_a_wrong_model_is_told(text, message):
     with pytest.raises(FogftError, match=message):
-        model.parse(text)
+        model.read_values(text)
 
 
 @pytest.mark.parametrize(
@@ -92,12 +92,12 @@ def test_a_wrong_model_is_told(text, message):
 )
 def test_numbers_that_contradict_one_another_are_told(text, message):
     with pytest.raises(FogftError, match=message):
-        model.applied(MarketModel(), Timing(), model.parse(text))
+        model.applied(MarketModel(), Timing(), model.read_values(text))
 
 
 def test_correlation_stands_for_region_and_cloud():
     market, timing = model.applied(
-        MarketModel(), Timing(), model.parse("correlation=0.22, notice_s=30")
+        MarketModel(), Timing(), model.read_values("correlation=0.22, notice_s=30")
     )
     assert (market.correlation_region, market.correlation_cloud) == (0.22, 0.22)
     assert timing.notice_s == 30

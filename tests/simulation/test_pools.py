@@ -196,7 +196,7 @@ def live_through_faults(world: World, faults: list[Callable[..., object]]) -> No
     for _, mend in mends:
         mend()
     world.kill_in = None
-    world.cloud._errors.clear()
+    world.cloud.errors.clear()
 
 
 def recover(world: World) -> int:
@@ -242,7 +242,7 @@ def test_manager_killed_at_every_point_of_a_launch(point: int, deferred: bool) -
     """Wherever the manager is killed while it starts a pool: no orphan, no duplicate."""
     world = World(7, replace(make_world(3).spec, replicas=3, max_usd_per_hour=None), PLACES)
     world.deferred = deferred
-    world.manager = world._new_manager(1)
+    world.manager = world.new_manager(1)
     world.kill_in = point
     recover(world)
     assert len([m for m in world.truth() if m.id.pool_uid == UID]) == 3

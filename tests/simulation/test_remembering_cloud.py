@@ -17,7 +17,7 @@ def whole_world(seed: int, replicas: int) -> World:
     spec = replace(make_world(0).spec, replicas=replicas, max_usd_per_hour=None, max_surge=1)
     world = World(seed, spec, PLACES, RememberingCloud)
     world.deferred = False
-    world.manager = world._new_manager(1)
+    world.manager = world.new_manager(1)
     recover(world)
     return world
 
@@ -100,7 +100,7 @@ def test_a_machine_lost_while_it_is_set_up_is_noticed() -> None:
     for _ in range(20):
         world.tick()
         world.step(1.0)
-    assert young.id in world._members()
+    assert young.id in world.member_ids()
     world.cloud.preempt(young.id)
     for _ in range(50):
         world.tick()

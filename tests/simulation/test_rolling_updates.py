@@ -105,7 +105,7 @@ def test_a_bad_version_is_given_up_and_the_good_one_restored(seed, wrong, tight)
 
 
 def orders(world: World) -> list:
-    return [vm.order for vm in world.cloud._vms.values() if vm.order.id.pool_uid == UID]
+    return [vm.order for vm in world.cloud.vms.values() if vm.order.id.pool_uid == UID]
 
 
 @pytest.mark.parametrize("seed", range(by_day(3, at_night=40)))

@@ -111,11 +111,11 @@ class World:
         self._ordered: set[ReplicaId] = set()
         self._queue: list[Callable[[], None]] = []
         self._stranger = self._admit_stranger()
-        self.manager = self._new_manager(epoch=1)
+        self.manager = self.new_manager(epoch=1)
 
     # -- the manager ------------------------------------------------------------------------
 
-    def _new_manager(self, epoch: int) -> Reconciler:
+    def new_manager(self, epoch: int) -> Reconciler:
         return Reconciler(
             self.cloud,
             self.store,
@@ -148,7 +148,7 @@ class World:
             self._queue.clear()
             self.store.reopen()
             epoch = self.store.published.epoch if self.store.published else 0
-            self.manager = self._new_manager(epoch + 1)
+            self.manager = self.new_manager(epoch + 1)
             return None
         return tick
 
@@ -167,10 +167,10 @@ class World:
             if machine.phase is MachinePhase.RUNNING:
                 self._ran_at.setdefault(machine.id, self.now)
                 alive = machine.id not in self.frozen and not self.uplink_down
-                if alive and machine.id in self._members():
+                if alive and machine.id in self.member_ids():
                     self._heard_at[machine.id] = self.now
 
-    def _members(self) -> set[ReplicaId]:
+    def member_ids(self) -> set[ReplicaId]:
         return {m.id for m in self.store.published.members} if self.store.published else set()
 
     def truth(self) -> list[Machine]:
@@ -300,7 +300,7 @@ class World:
     def whole(self) -> bool:
         """Whether exactly the wanted replicas exist and all of them serve the robot."""
         ours = [m for m in self.truth() if m.id.pool_uid == UID]
-        members = self._members()
+        members = self.member_ids()
         return len(ours) == self.wanted() and all(
             self.serves(m.id) and m.id in members and not m.notice for m in ours
         )

@@ -60,8 +60,8 @@ class PoolOnSky:
 
     def kill_the_manager(self) -> None:
         """Nothing of the process is left; the next one knows only what is on disk."""
-        self.scene._pending.clear()
-        self.scene._repeated.clear()
+        self.scene.pending_work.clear()
+        self.scene.repeated_work.clear()
         self.scene.cloud = self.scene.another_process()
         self.store.reopen()
         self.manager = self._new_manager(2)
@@ -111,7 +111,7 @@ class PoolOnSky:
 
     def ordered(self) -> list[str]:
         """Return where launches went, in order."""
-        return [one.task["resources"]["infra"] for one in self.sky._launched]
+        return [one.task["resources"]["infra"] for one in self.sky.launched]
 
     def running(self) -> list[str]:
         """Return what costs money now, by the provider's own list."""

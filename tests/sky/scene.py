@@ -24,8 +24,8 @@ class Scene:
         self.provider = ScriptedProvider()
         self.sky = ScriptedSky(self.provider)
         self._with_provider = with_provider
-        self._pending: list[Callable[[], None]] = []
-        self._repeated: list[Callable[[], bool]] = []
+        self.pending_work: list[Callable[[], None]] = []
+        self.repeated_work: list[Callable[[], bool]] = []
         self.cloud = self.another_process()
 
     def another_process(self) -> SkyCloud:
@@ -37,8 +37,8 @@ class Scene:
             owner="ann@robot",
             base=self.folder,
             clock=lambda: self.now,
-            submit=lambda run: self._pending.append(run),
-            repeat=lambda step: self._repeated.append(step),
+            submit=lambda run: self.pending_work.append(run),
+            repeat=lambda step: self.repeated_work.append(step),
             sleep=self.pass_s,
             make_wheel=lambda folder: folder,
         )
@@ -70,10 +70,10 @@ class Scene:
     def work(self, rounds: int = 12) -> None:
         """Let the other threads do what they can do now; a second passes each round."""
         for _ in range(rounds):
-            pending, self._pending = self._pending, []
+            pending, self.pending_work = self.pending_work, []
             for run in pending:
                 run()
-            self._repeated = [step for step in self._repeated if step()]
+            self.repeated_work = [step for step in self.repeated_work if step()]
             self.pass_s(1.0)
 
     def machines(self, cloud: SkyCloud | None = None) -> list[Machine]:

@@ -93,8 +93,8 @@ class ScriptedSky:
         self.full: set[str] = set()  # locations without capacity, for launches that do
         self.unreachable = False
         self.credentials = {"aws": "", "gcp": "run `gcloud auth login`"}
-        self._launched: list[_Launch] = []
-        self._errors: dict[str, list[CloudError]] = {}
+        self.launched: list[_Launch] = []
+        self.errors: dict[str, list[CloudError]] = {}
         self._counter = itertools.count(1)
 
     # -- the surface --------------------------------------------------------------------------
@@ -102,17 +102,17 @@ class ScriptedSky:
     def launch(self, task: Mapping[str, Any], name: str) -> str:
         self._meet("launch", name)
         request = Request(f"r{next(self._counter)}", RequestState.ACTIVE)
-        self._launched.append(_Launch(request, name, task))
+        self.launched.append(_Launch(request, name, task))
         self._meet("launch-heard", name)
         return request.id
 
     def launches(self, name: str) -> Sequence[Request]:
         self._meet("launches", name)
-        return [one.request for one in self._launched if one.name == name]
+        return [one.request for one in self.launched if one.name == name]
 
     def request(self, id: str) -> Request | None:
         self._meet("request", id)
-        for one in self._launched:
+        for one in self.launched:
             if one.request.id == id:
                 if self.boots and one.request.state is RequestState.ACTIVE:
                     if one.task["resources"]["infra"] in self.full:
@@ -124,14 +124,14 @@ class ScriptedSky:
 
     def launched_job(self, id: str) -> int | None:
         self._meet("launched_job", id)
-        one = next(one for one in self._launched if one.request.id == id)
+        one = next(one for one in self.launched if one.request.id == id)
         if one.error is not None:
             raise one.error
         return one.job
 
     def cancel(self, id: str) -> None:
         self._meet("cancel", id)
-        for one in self._launched:
+        for one in self.launched:
             if one.request.id == id and one.request.state is RequestState.ACTIVE:
                 one.request = replace(one.request, state=RequestState.CANCELLED)
                 one.error = RefusedError("RequestCancelled", ["cancelled"])
@@ -175,11 +175,11 @@ class ScriptedSky:
 
     def fail_next(self, call: str, error: CloudError, times: int = 1) -> None:
         """Let the next calls raise. ``launch-heard`` raises after the order was taken."""
-        self._errors.setdefault(call, []).extend([error] * times)
+        self.errors.setdefault(call, []).extend([error] * times)
 
     def task(self, name: str) -> Mapping[str, Any]:
         """Return the task that a cluster was launched with."""
-        return next(one.task for one in self._launched if one.name == name)
+        return next(one.task for one in self.launched if one.name == name)
 
     def boot(self, name: str) -> None:
         """Let the machine exist, while its launch is still under way."""
@@ -226,14 +226,14 @@ class ScriptedSky:
     def forget_everything(self) -> None:
         """Lose SkyPilot's database."""
         self.records.clear()
-        self._launched.clear()
+        self.launched.clear()
 
     def asked(self, call: str) -> list[str]:
         """Return what a call was made about, in order."""
         return [subject for name, subject in self.calls if name == call]
 
     def _of(self, name: str) -> _Launch:
-        return next(one for one in reversed(self._launched) if one.name == name)
+        return next(one for one in reversed(self.launched) if one.name == name)
 
     def _runs(self, name: str) -> bool:
         id = naming.replica_of(name)
@@ -244,8 +244,8 @@ class ScriptedSky:
             self.calls.append((call, subject))
         if self.unreachable:
             raise CloudUnreachable("SkyPilot cannot tell")
-        if self._errors.get(call):
-            raise self._errors[call].pop(0)
+        if self.errors.get(call):
+            raise self.errors[call].pop(0)
 
 
 def replica(slot: int = 0, generation: int = 1, uid: str = "00000000000000aa") -> ReplicaId:

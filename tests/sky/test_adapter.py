@@ -61,7 +61,7 @@ def test_terminate_leaves_nothing_in_any_list_and_can_be_repeated(scene: Scene):
     assert not scene.machines()
     assert not scene.sky.records
     assert not scene.provider.found
-    assert not scene.cloud._journal.files(ID).exists()
+    assert not scene.cloud.journal.files(ID).exists()
 
 
 def test_a_pool_sees_its_own_machines_only(scene: Scene):
@@ -123,7 +123,7 @@ def test_a_launch_that_is_refused_at_once_leaves_no_trace(scene: Scene, text: st
     with pytest.raises(error):
         scene.cloud.launch(scene.order())
     assert not scene.machines()
-    assert not scene.cloud._journal.files(ID).exists()
+    assert not scene.cloud.journal.files(ID).exists()
 
 
 @pytest.mark.parametrize(
@@ -448,7 +448,7 @@ def test_without_a_right_to_ask_the_provider_skypilots_word_has_to_do(scene: Sce
 def test_a_machine_that_only_the_provider_knows_is_found_and_can_be_ended(scene: Scene):
     scene.launched()
     scene.sky.forget_everything()
-    scene.cloud._journal.close(ID)  # and our own notes are lost too
+    scene.cloud.journal.close(ID)  # and our own notes are lost too
     scene.pass_s(60)
     scene.machines()  # begins a census
     scene.work()
@@ -463,7 +463,7 @@ def test_a_machine_that_only_the_provider_knows_is_found_and_can_be_ended(scene:
 def test_without_our_notes_skypilots_labels_tell_the_same(scene: Scene):
     scene.launched()
     before = scene.machine()
-    scene.cloud._journal.close(ID)
+    scene.cloud.journal.close(ID)
     after = scene.machine()
     assert (after.phase, after.endpoint, after.spec_hash, after.usd_per_hour) == (
         before.phase,
@@ -484,7 +484,7 @@ def test_an_audit_finds_machines_of_every_pool_of_this_user_and_of_nobody_else(s
     scene.sky.boot(name)
     record = scene.sky.records.pop(name)
     for id in (lost, theirs):
-        scene.cloud._journal.close(id)
+        scene.cloud.journal.close(id)
     for key, instance in list(scene.provider.found.items()):
         if instance.id == theirs:
             labels = {**record.labels, naming.OWNER: "bob_laptop"}
@@ -499,7 +499,7 @@ def test_an_audit_of_a_pool_asks_the_provider_now_and_not_from_memory(scene: Sce
     scene.launched()
     scene.machines()
     scene.sky.forget_everything()
-    scene.cloud._journal.close(ID)
+    scene.cloud.journal.close(ID)
     scene.pass_s(20)
     assert not scene.machines()
     assert [m.id for m in scene.cloud.audit(ID.pool_uid).machines] == [ID]
@@ -543,7 +543,7 @@ def test_another_process_takes_a_launch_over_at_any_stage(scene: Scene, stage: s
     elif stage == "setting up":
         scene.sky.finish(NAME, JobState.SETTING_UP)
         scene.work()
-    scene._repeated.clear()  # the process is killed: its threads are gone
+    scene.repeated_work.clear()  # the process is killed: its threads are gone
     scene.cloud = scene.another_process()
     assert [m.id for m in scene.machines()] == [ID]
     if stage in ("asked", "booted", "setting up"):
@@ -627,7 +627,7 @@ def test_the_log_is_fetched_from_the_machine(scene: Scene):
 
 def test_secrets_stay_private_on_disk(scene: Scene):
     scene.cloud.launch(scene.order())
-    key = scene.cloud._journal.files(ID) / "replica.key"
+    key = scene.cloud.journal.files(ID) / "replica.key"
     assert key.stat().st_mode & 0o077 == 0
     assert key.parent.stat().st_mode & 0o077 == 0
     assert b"secret" not in b"".join(p.read_bytes() for p in key.parent.parent.glob("*.json"))

@@ -131,12 +131,12 @@ def client_error(code: str) -> Exception:
 def test_not_allowed_is_not_the_same_as_cannot_tell(code: str, expected: type, hint: str):
     """The first hands the question to SkyPilot; from the second nothing may be concluded."""
     aws = Aws()
-    aws._clients["us-east-1"] = Refusing(client_error(code))
+    aws.clients["us-east-1"] = Refusing(client_error(code))
     with pytest.raises(expected) as caught:
         aws.instances(["us-east-1"])
     if hint:
         assert hint in caught.value.hint
-        assert not aws._clients, "renewed credentials are read from the disk again"
+        assert not aws.clients, "renewed credentials are read from the disk again"
 
 
 @needs("moto")
@@ -144,8 +144,8 @@ def test_a_region_that_may_not_be_asked_hides_no_other(account: None):
     """An organisation keeps its accounts out of most regions."""
     aws = Aws()
     launch("us-west-2", labels(replica(0)))
-    aws._clients["us-east-1"] = Refusing(client_error("UnauthorizedOperation"))
-    aws._regions = lambda: ["us-east-1", "us-west-2"]  # type: ignore[method-assign]
+    aws.clients["us-east-1"] = Refusing(client_error("UnauthorizedOperation"))
+    aws.regions = lambda: ["us-east-1", "us-west-2"]  # type: ignore[method-assign]
     assert [i.placement.region for i in aws.instances(None)] == ["us-west-2"]
     with pytest.raises(NotAllowedError):
         aws.instances(["us-east-1", "us-west-2"])
@@ -153,6 +153,6 @@ def test_a_region_that_may_not_be_asked_hides_no_other(account: None):
 
 def test_no_network_is_cannot_tell():
     aws = Aws()
-    aws._clients["us-east-1"] = Refusing(ConnectionError("no route"))
+    aws.clients["us-east-1"] = Refusing(ConnectionError("no route"))
     with pytest.raises(CloudUnreachable):
         aws.instances(["us-east-1"])

@@ -105,7 +105,7 @@ def test_credentials_that_expire_take_nothing_away(pool: PoolOnSky):
     assert pool.notes.startswith("the cloud cannot be reached: nothing is changed")
     assert "ExpiredToken; renew the credentials of this cloud" in pool.notes
     assert (pool.ordered(), pool.store.published) == before
-    pool.sky._errors.clear()
+    pool.sky.errors.clear()
     pool.until(pool.ready)
     assert (pool.ordered(), pool.running()) == (before[0], ["0.1"])
 
@@ -245,7 +245,7 @@ def test_down_without_an_answer_says_what_may_still_run_and_how_to_look(pool: Po
         end(pool, [])
     assert "these replicas did not end: `0.1` (aws/us-east-1/us-east-1a)" in str(stubborn.value)
     assert f"`sky status --refresh {FIRST}`" in stubborn.value.hint  # type: ignore[attr-defined]
-    pool.sky._errors.clear()
+    pool.sky.errors.clear()
     end(pool, [])
     assert pool.running() == []
 

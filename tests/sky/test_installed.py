@@ -211,8 +211,8 @@ def test_the_names_that_are_matched_by_text_exist(home: Path):
     from sky.server.requests.requests import RequestStatus
 
     builtin = dir(__import__("builtins")) + dir(requests.exceptions)
-    assert [n for n in answers._UNKNOWN if not hasattr(exceptions, n) and n not in builtin] == []
-    assert {s.value for s in RequestStatus} >= set(answers._STATES)
+    assert [n for n in answers.UNKNOWN if not hasattr(exceptions, n) and n not in builtin] == []
+    assert {s.value for s in RequestStatus} >= set(answers.STATES)
     assert {s.value for s in JobStatus} >= set(answers.JOBS)
     assert {s.value for s in ClusterStatus} >= {"INIT", "UP", "STOPPED"}
     for name in ("ClusterDoesNotExist", "ResourcesUnavailableError", "CommandError",

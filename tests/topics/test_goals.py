@@ -140,8 +140,8 @@ def test_nobody_has_said_anything_of_a_goal_that_is_not_known():
 
 
 def test_what_is_kept_is_bounded_by_number_and_by_bytes(monkeypatch):
-    monkeypatch.setattr(goals, "_GOALS_KEPT", 3)
-    monkeypatch.setattr(goals, "_BYTES_KEPT", 1000)
+    monkeypatch.setattr(goals, "GOALS_KEPT", 3)
+    monkeypatch.setattr(goals, "BYTES_KEPT", 1000)
     made = Goals()
     for number in range(5):
         made.made(request(number), bytes([number]), (1,), until=5.0)
@@ -185,8 +185,8 @@ def test_nothing_is_left_of_goals_that_ended(steps):
                    for n in (1, 2, 3))  # fmt: skip
     for number in (1, 2, 3):
         made.ended(goal(number))
-    assert len(made._over) <= ids
-    made._over.clear()
+    assert len(made.over) <= ids
+    made.over.clear()
     assert vars(made) == vars(Goals())
 
 
@@ -204,18 +204,18 @@ def test_a_cancellation_names_its_goals_in_either_byte_order(header, order):
 
 
 def test_goals_that_nobody_awaits_are_forgotten_first(monkeypatch):
-    monkeypatch.setattr(goals, "_GOALS_KEPT", 3)
+    monkeypatch.setattr(goals, "GOALS_KEPT", 3)
     made = under_way(1)
     for number in range(2, 9):
         made.made(request(number), bytes([number]), (1,), until=5.0)
     assert made.lacking(2, 9.0) == [request(1)]
-    assert len(made._goals) == 3
+    assert made.kept == 3
     assert made.took(bytes([8]), 1, 1.0, accepts=True).goal == goal(8)
 
 
 def test_who_takes_a_goal_that_was_forgotten_does_not_do_so_in_vain(monkeypatch):
     """Only we have forgotten it: its client has not."""
-    monkeypatch.setattr(goals, "_GOALS_KEPT", 1)
+    monkeypatch.setattr(goals, "GOALS_KEPT", 1)
     made = Goals()
     for number in (1, 2):
         made.made(request(number), bytes([number]), (1,), until=5.0)

@@ -94,15 +94,15 @@ class SkyCloud:
         self._make_wheel = make_wheel
         self._port = port
         by_name = {provider.cloud: provider for provider in providers}
-        self._journal = Journal(folder / "launches")
+        self.journal = Journal(folder / "launches")
         self._census = Census(by_name, clock, submit)
         self._presence = Presence(
-            sky, self._journal, self._census, clock=clock, submit=submit, port=port
+            sky, self.journal, self._census, clock=clock, submit=submit, port=port
         )
-        self._ending = Ending(sky, self._journal, by_name, sleep=sleep, clock=clock)
+        self._ending = Ending(sky, self.journal, by_name, sleep=sleep, clock=clock)
         self._following = Following(
             sky,
-            self._journal,
+            self.journal,
             self._ending,
             clock=clock,
             on_move=self._presence.forget,
@@ -122,7 +122,7 @@ class SkyCloud:
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         """See `Cloud`. Costs one question to SkyPilot's memory; no cloud is asked, as a rule."""
-        entries = self._journal.entries(pool_uid)
+        entries = self.journal.entries(pool_uid)
         machines = self._presence.machines(pool_uid, entries, self._prices.regions)
         for entry in entries:
             if entry.stage in UNDER_WAY:
@@ -139,24 +139,24 @@ class SkyCloud:
         made = task.build(
             order,
             template.read(),
-            files=self._journal.files(order.id),
+            files=self.journal.files(order.id),
             wheel=self._make_wheel(self._folder / "wheels"),
             owner=self._owner,
             base=self._base,
             port=self._port,
         )
         begun = Entry(order.id, order.placement, order.usd_per_hour, order.spec_hash, self._clock())
-        if not self._journal.open(begun, order.files):
+        if not self.journal.open(begun, order.files):
             return
         try:
             request = self._sky.launch(made, cluster_name(order.id))
         except RefusedError as error:
-            self._journal.close(order.id)
+            self.journal.close(order.id)
             raise _refusal(error, order) from error
         except CloudUnreachable:
             self._follow(order.id)
             raise
-        entry = self._journal.update(order.id, stage=Stage.LAUNCHING, request=request)
+        entry = self.journal.update(order.id, stage=Stage.LAUNCHING, request=request)
         if entry is None or entry.stage is Stage.ENDING:  # ended meanwhile, by another process
             self._ending.end(order.id)
             return
@@ -164,24 +164,24 @@ class SkyCloud:
 
     def terminate(self, id: ReplicaId) -> None:
         """See `Cloud`. Returns when SkyPilot, and the provider where it can be asked, agree."""
-        self._journal.update(id, stage=Stage.ENDING)
+        self.journal.update(id, stage=Stage.ENDING)
         try:
             self._ending.end(id)
         finally:
             self._presence.forget()
-        self._journal.close(id)
+        self.journal.close(id)
         self._census.forget(id)
 
     def log(self, id: ReplicaId) -> str | None:
         """See `Cloud`. Fetches the end of the log from the machine first; takes seconds."""
-        entry = self._journal.get(id)
+        entry = self.journal.get(id)
         name = cluster_name(id)
         told = ""
         if entry is None or entry.stage in _ON_THE_MACHINE:
             told = self._sky.job_log(name, entry.job if entry else None, _LOG_LINES)
         if not told and entry is not None:
             told = self._sky.provision_log(name, _LOG_LINES)
-        path = self._journal.provision_log(id)
+        path = self.journal.provision_log(id)
         if told:
             write_whole(path, told, durable=False)
         return str(path) if path.exists() else None
@@ -230,7 +230,7 @@ class SkyCloud:
             machine
             for uid in sorted(uids)
             for machine in self._presence.machines(
-                uid, self._journal.entries(uid), self._prices.regions
+                uid, self.journal.entries(uid), self._prices.regions
             )
         )
         machines = {machine.id: machine for machine in listed}
@@ -246,7 +246,7 @@ class SkyCloud:
 
     def _pools(self) -> set[str]:
         """Return the uids of this user's pools, as the journal and SkyPilot know them."""
-        uids = {entry.id.pool_uid for entry in self._journal.entries()}
+        uids = {entry.id.pool_uid for entry in self.journal.entries()}
         for cluster in self._presence.everywhere():
             id = replica_of(cluster.name)
             if id is not None and self._mine(cluster.labels):

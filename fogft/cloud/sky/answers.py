@@ -17,7 +17,7 @@ from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Placement
 
 # Their meaning is "nobody knows": the server, the network or the credentials, not the cluster.
-_UNKNOWN = frozenset(
+UNKNOWN = frozenset(
     (
         *("ApiServerConnectionError", "ApiServerAuthenticationError", "APIVersionMismatchError"),
         *("ServerTemporarilyUnavailableError", "RequestInterruptedError", "NetworkError"),
@@ -29,7 +29,7 @@ _UNKNOWN = frozenset(
         *("HTTPError", "ChunkedEncodingError"),
     )
 )
-_STATES = {"SUCCEEDED": RequestState.SUCCEEDED, "FAILED": RequestState.FAILED,
+STATES = {"SUCCEEDED": RequestState.SUCCEEDED, "FAILED": RequestState.FAILED,
            "CANCELLED": RequestState.CANCELLED}  # fmt: skip
 JOBS = {
     "INIT": JobState.PENDING, "PENDING": JobState.PENDING, "SETTING_UP": JobState.SETTING_UP,
@@ -43,7 +43,7 @@ def translated(error: BaseException, subject: str) -> CloudError:
         return error
     kind = type(error).__name__
     words = plain(str(error)) or kind
-    if kind in _UNKNOWN or isinstance(error, OSError) or _server_lost(error):
+    if kind in UNKNOWN or isinstance(error, OSError) or _server_lost(error):
         return CloudUnreachable(f"SkyPilot cannot tell about {subject}: {words}", _hint(kind))
     return RefusedError(kind, _texts(error))
 
@@ -64,7 +64,7 @@ def as_answer() -> Iterator[None]:
         kind = type(error).__name__
         said_by_server = kind in ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
                                   "InvalidCloudCredentials")  # fmt: skip
-        if not said_by_server and (kind in _UNKNOWN or isinstance(error, OSError)):
+        if not said_by_server and (kind in UNKNOWN or isinstance(error, OSError)):
             raise
         if _server_lost(error):
             raise
@@ -108,7 +108,7 @@ def cluster_of(record: Any) -> Cluster:
 
 def request_of(payload: Any) -> Request:
     """Return a `RequestPayload` of SkyPilot's as our record."""
-    state = _STATES.get(payload.status, RequestState.ACTIVE)
+    state = STATES.get(payload.status, RequestState.ACTIVE)
     return Request(payload.request_id, state, plain(payload.status_msg or ""))
 
 

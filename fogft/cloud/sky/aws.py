@@ -35,7 +35,7 @@ class Aws:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._session: Any = None
-        self._clients: dict[str, Any] = {}
+        self.clients: dict[str, Any] = {}  # by region: safe to share, and each costs megabytes
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
         """See `Provider`. Regions are asked side by side.
@@ -43,7 +43,7 @@ class Aws:
         Where everything is asked, a region may refuse as long as another one answers: many
         accounts are kept out of most regions, and nothing of theirs can run there.
         """
-        where = sorted(set(self._regions() if regions is None else regions))
+        where = sorted(set(self.regions() if regions is None else regions))
         if not where:
             return []
         found: list[Instance] = []
@@ -113,16 +113,18 @@ class Aws:
 
         return self._ask(region, instances)
 
-    def _regions(self) -> list[str]:
-        def regions(ec2: Any) -> list[str]:
+    def regions(self) -> list[str]:
+        """Return every region's name."""
+
+        def names(ec2: Any) -> list[str]:
             return [str(region["RegionName"]) for region in ec2.describe_regions()["Regions"]]
 
-        return self._ask(_HOME, regions)
+        return self._ask(_HOME, names)
 
     def _client(self, region: str) -> Any:
-        """Return a region's client: safe to share, unlike sessions, and each costs megabytes."""
+        """Return a region's client."""
         with self._lock:
-            if region not in self._clients:
+            if region not in self.clients:
                 if self._session is None:
                     self._session = importlib.import_module("boto3").session.Session()
                 config = importlib.import_module("botocore.config").Config(
@@ -130,10 +132,10 @@ class Aws:
                     read_timeout=10,
                     retries={"max_attempts": 2, "mode": "standard"},
                 )
-                self._clients[region] = self._session.client(
+                self.clients[region] = self._session.client(
                     "ec2", region_name=region, config=config
                 )
-            return self._clients[region]
+            return self.clients[region]
 
     def _ask(self, region: str, call: Callable[[Any], T]) -> T:
         try:
@@ -149,7 +151,7 @@ class Aws:
             if classify(code, [str(error)]).cause is Cause.CREDENTIALS:
                 with self._lock:  # renewed ones are read by a new session only
                     self._session = None
-                    self._clients.clear()
+                    self.clients.clear()
                 hint = "renew the AWS credentials; `sky check aws` tests them"
             raise CloudUnreachable(f"AWS cannot tell about `{region}`: {error}", hint) from error
 

@@ -25,7 +25,7 @@ VERSION = 1
 SIZE_LIMIT = 1 << 20
 PASSPHRASE_LEAST = 12
 # 64 MiB and about a fifth of a second a guess. Fixed by the version: a file cannot ask for more.
-_SCRYPT: dict[str, int] = {"n": 1 << 16, "r": 8, "p": 1}
+SCRYPT: dict[str, int] = {"n": 1 << 16, "r": 8, "p": 1}
 _SCRYPT_MEMORY = 128 << 20
 _SALT_BYTES, _NONCE_BYTES = 16, 12
 _ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # without what looks alike
@@ -166,7 +166,7 @@ def _parse(data: bytes) -> tuple[Label, dict[str, Any], bytes]:
 
 def _key(passphrase: str, salt: bytes) -> bytes:
     return hashlib.scrypt(
-        passphrase.strip().encode(), salt=salt, dklen=32, maxmem=_SCRYPT_MEMORY, **_SCRYPT
+        passphrase.strip().encode(), salt=salt, dklen=32, maxmem=_SCRYPT_MEMORY, **SCRYPT
     )
 
 

@@ -36,7 +36,7 @@ LABEL = Label("id", "pool", f"robot.ada.1.{UID}", NOW, NOW + 60)
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A passphrase is not made slow to guess here."""
-    monkeypatch.setitem(bundle._SCRYPT, "n", 2)
+    monkeypatch.setitem(bundle.SCRYPT, "n", 2)
 
 
 @pytest.fixture

@@ -59,7 +59,7 @@ class Scene:
 
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
-    monkeypatch.setitem(bundle._SCRYPT, "n", 2)
+    monkeypatch.setitem(bundle.SCRYPT, "n", 2)
     paths = PoolPaths(tmp_path / "pool")
     authority = Authority(tmp_path / "rendezvous", ca=paths.credentials)
     place = Rendezvous(authority, "a")

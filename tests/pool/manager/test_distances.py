@@ -116,7 +116,7 @@ def test_estimates_grow_with_the_distance():
 
 
 def test_every_place_and_cloud_has_an_endpoint():
-    for cloud, regions in geography._REGIONS.items():
+    for cloud, regions in geography.REGIONS.items():
         for region in regions:
             host, port = geography.endpoint(f"{cloud}/{region}")
             assert region in host

@@ -62,7 +62,7 @@ def test_second_manager_is_refused(scene: Scene) -> None:
     scene.wait(lambda: scene.whole(2))
     second = scene.start_manager()
     assert second.wait(20) == 1
-    assert "has a manager already (pid" in scene._output()
+    assert "has a manager already (pid" in scene.output()
     assert scene.cloud.launched() == ["0.1", "1.1"]
 
 
@@ -73,7 +73,7 @@ def test_manager_of_an_older_epoch_steps_down(scene: Scene) -> None:
     scene.wait(lambda: scene.whole(1))
     disk.write_json(scene.paths.lease, {"epoch": 99, "pid": 1, "beat": 0})
     assert process.wait(20) == 1
-    assert "has a later manager" in scene._output()
+    assert "has a later manager" in scene.output()
 
 
 def test_scale_and_file_change_reach_a_running_manager(scene: Scene) -> None:

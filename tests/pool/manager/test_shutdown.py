@@ -41,7 +41,7 @@ def test_down_works_when_the_manager_is_dead_or_frozen(scene: Scene) -> None:
     scene.write(replicas=1)
     scene.start_manager()
     scene.wait(lambda: scene.whole(1))
-    frozen = scene._started[0]
+    frozen = scene.started[0]
     frozen.send_signal(signal.SIGSTOP)
     told = scene.end()
     frozen.wait(10)

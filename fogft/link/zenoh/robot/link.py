@@ -91,6 +91,12 @@ class ZenohLink:
         return self._live is not None
 
     @property
+    def sending(self) -> bool:
+        """Whether an attempt is just being handed to the network."""
+        live = self._live
+        return live is not None and live.attempts.sending
+
+    @property
     def ready(self) -> frozenset[str]:
         """Services that the last probe answer called ready; empty unless UP."""
         return self._ready

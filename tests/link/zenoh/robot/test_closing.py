@@ -37,9 +37,7 @@ def usable(dial: Dials, replica: ReplicaProcess, **options: Any) -> ZenohLink:
 def sends_large(link: ZenohLink, number: int) -> None:
     """Return when it has begun, and a moment after."""
     assert link.offer(SERVICE, request_id(number), bytes(LARGE_BYTES), 600.0)
-    connection = link._live
-    assert connection is not None
-    wait_for(lambda: connection.attempts.sending)
+    wait_for(lambda: link.sending)
     time.sleep(random.Random(number).random() * 0.02)
 
 
