@@ -166,9 +166,7 @@ def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> No
 def test_slots_are_listed_by_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In hints and completions: 9 before 10, and 99 before 100."""
     rows = [replace(seen().replicas[0], slot=slot) for slot in (100, 9, 10, 99)]
-    monkeypatch.setattr(
-        wishes.seen, "read", lambda *_: Seen(replace(seen(), replicas=rows), 0.0, True)
-    )
+    monkeypatch.setattr(wishes, "read", lambda *_: Seen(replace(seen(), replicas=rows), 0.0, True))
     with pytest.raises(FogftError) as caught:
         wishes.generation_in(PoolPaths(tmp_path), 5, NOW)
     assert caught.value.hint == "slots with a replica: 9, 10, 99, 100"
