@@ -1,4 +1,4 @@
 """The command line: arguments in, text out.
 
-Not here: what a command does (`fogft.app`).
+Not here: what a command does (`fogft.pool.commands`).
 """

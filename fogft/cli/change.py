@@ -6,28 +6,26 @@ still does after it was killed.
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft.cli import complete, output
-from fogft.cli.complete import PoolOption
-from fogft.cli.sections import Command
+from fogft import disk
+from fogft.cli import options, output
+from fogft.cli.commands import Command, group
+from fogft.cli.options import PoolOption, Slot
+
+if TYPE_CHECKING:
+    from fogft.pool.folder.store import PoolStore
 
 Count = Annotated[int, typer.Argument(min=1, max=16, metavar="N", help="How many.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add these commands to the application."""
-    group = typer.Typer(rich_markup_mode=None, help="Ask for more or fewer replicas.")
-    group.command("up", cls=Command)(scale_up)
-    group.command("down", cls=Command)(scale_down)
-    app.add_typer(group, name="scale")
-    app.command("drain", cls=Command)(drain)
-    app.command("exclude", cls=Command)(exclude)
-    app.command("include", cls=Command)(include)
+scale = group("Ask for more or fewer replicas.")
 
 
+@scale.command("up", cls=Command)
 def scale_up(count: Count, pool: PoolOption = None) -> None:
     """Ask for N more replicas.
 
@@ -40,6 +38,7 @@ def scale_up(count: Count, pool: PoolOption = None) -> None:
     _scale(pool, count)
 
 
+@scale.command("down", cls=Command)
 def scale_down(count: Count, pool: PoolOption = None) -> None:
     """Ask for N fewer replicas; at least one stays.
 
@@ -53,15 +52,7 @@ def scale_down(count: Count, pool: PoolOption = None) -> None:
     _scale(pool, -count)
 
 
-def drain(
-    slot: Annotated[
-        int,
-        typer.Argument(
-            min=0, metavar="SLOT", help="See `fogft status`.", autocompletion=complete.slots
-        ),
-    ],
-    pool: PoolOption = None,
-) -> None:
+def drain(slot: Slot, pool: PoolOption = None) -> None:
     """Replace one replica, the new one first.
 
     The old one finishes what it works on, and goes.
@@ -70,12 +61,12 @@ def drain(
     Example:
       fogft drain 2
     """
-    from fogft import app
+    from fogft.pool.commands import composition, wishes
 
-    name = app.pool_name(pool)
-    replica = app.drain(name, slot)
-    output.done(f"replica `{replica}` of `{name}` is to be replaced")
-    _remark_on_manager(name)
+    store = composition.store_of(pool)
+    replica = wishes.drain(store, slot, time.time())
+    output.done(f"replica `{replica}` of `{store.name}` is to be replaced")
+    _remark_on_manager(store)
 
 
 def exclude(
@@ -83,7 +74,7 @@ def exclude(
         str,
         typer.Argument(
             metavar="LOCATION",
-            autocompletion=complete.locations,
+            autocompletion=options.locations,
             help="`cloud`, `cloud/region` or `cloud/region/zone`.",
         ),
     ],
@@ -95,12 +86,13 @@ def exclude(
     Example:
       fogft exclude local/us-west-2
     """
-    from fogft import app
+    from fogft.pool.commands import composition, wishes
 
-    name = app.pool_name(pool)
-    changed = app.exclude(name, location)
-    output.done(f"`{location}` {'is now' if changed else 'was already'} excluded from `{name}`")
-    _remark_on_manager(name)
+    store = composition.store_of(pool)
+    is_new = wishes.exclude(store, location, composition.cloud_of(store.identity()))
+    since = "is now" if is_new else "was already"
+    output.done(f"`{location}` {since} excluded from `{store.name}`")
+    _remark_on_manager(store)
 
 
 def include(
@@ -108,7 +100,7 @@ def include(
         str,
         typer.Argument(
             metavar="LOCATION",
-            autocompletion=complete.excluded,
+            autocompletion=options.excluded,
             help="As it was given to `exclude`.",
         ),
     ],
@@ -120,26 +112,24 @@ def include(
     Example:
       fogft include local/us-west-2
     """
-    from fogft import app
+    from fogft.pool.commands import composition, wishes
 
-    name = app.pool_name(pool)
-    app.include(name, location)
-    output.done(f"`{location}` may be used by `{name}` again")
-    _remark_on_manager(name)
+    store = composition.store_of(pool)
+    wishes.include(store, location)
+    output.done(f"`{location}` may be used by `{store.name}` again")
+    _remark_on_manager(store)
 
 
 def _scale(pool: str | None, by: int) -> None:
-    from fogft import app
+    from fogft.pool.commands import composition, wishes
 
-    name = app.pool_name(pool)
-    before, after = app.scale(name, by)
-    output.done(f"`{name}` shall have {after} replicas (was {before})")
-    _remark_on_manager(name)
+    store = composition.store_of(pool)
+    before, after = wishes.scale(store, by)
+    output.done(f"`{store.name}` shall have {after} replicas (was {before})")
+    _remark_on_manager(store)
 
 
-def _remark_on_manager(pool: str) -> None:
-    from fogft import app
-
-    if not app.manager_alive(pool):
-        output.warn(f"no manager of `{pool}` runs: this happens once one does")
-        output.hint(f"start it with `fogft up {app.file_of(pool)}`")
+def _remark_on_manager(store: PoolStore) -> None:
+    if not disk.is_locked(store.paths.manager_lock):
+        output.warn(f"no manager of `{store.name}` runs: this happens once one does")
+        output.hint(f"start it with `fogft up {store.identity().file}`")

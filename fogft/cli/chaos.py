@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft.cli import complete, output
-from fogft.cli.complete import PoolOption
-from fogft.cli.sections import Command
+from fogft.cli import options, output
+from fogft.cli.commands import Command, group
+from fogft.cli.options import PoolOption, Slot
+from fogft.errors import FogftError, known_slots
 
-Slot = Annotated[
-    int,
-    typer.Argument(
-        min=0, metavar="SLOT", help="See `fogft status`.", autocompletion=complete.slots
-    ),
-]
+if TYPE_CHECKING:
+    from fogft.cloud.local.chaos import Chaos
+    from fogft.model.replica import ReplicaId
+
 Location = Annotated[
     str,
     typer.Argument(
         metavar="LOCATION",
         help="`local/region` or `local/region/zone`.",
-        autocompletion=complete.locations,
+        autocompletion=options.locations,
     ),
 ]
 Duration = Annotated[
@@ -32,16 +31,10 @@ Duration = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add this family to the application."""
-    group = typer.Typer(
-        rich_markup_mode=None, help="Make things go wrong in a pool on the local cloud."
-    )
-    for command in (preempt, kill, freeze, thaw, slow, blackhole, outage, capacity, clear):
-        group.command(command.__name__, cls=Command)(command)
-    app.add_typer(group, name="chaos")
+chaos = group("Make things go wrong in a pool on the local cloud.")
 
 
+@chaos.command(cls=Command)
 def preempt(
     slot: Slot,
     notice: Annotated[
@@ -62,13 +55,12 @@ def preempt(
     Example:
       fogft chaos preempt 0
     """
-    from fogft import app
-
-    machine = app.machine_in(app.pool_name(pool), slot)
-    left_s = app.chaos().preempt(machine, notice)
+    machine = _machine(pool, slot)
+    left_s = _chaos().preempt(machine, notice)
     output.done(f"replica `{machine.short}` has notice and ends in {left_s:.0f} s")
 
 
+@chaos.command(cls=Command)
 def kill(slot: Slot, pool: PoolOption = None) -> None:
     """End a replica's machine at once, with SIGKILL.
 
@@ -76,13 +68,12 @@ def kill(slot: Slot, pool: PoolOption = None) -> None:
     Example:
       fogft chaos kill 0
     """
-    from fogft import app
-
-    machine = app.machine_in(app.pool_name(pool), slot)
-    app.chaos().kill(machine)
+    machine = _machine(pool, slot)
+    _chaos().kill(machine)
     output.done(f"replica `{machine.short}` was killed")
 
 
+@chaos.command(cls=Command)
 def freeze(slot: Slot, pool: PoolOption = None) -> None:
     """Stop a replica's machine without ending it, with SIGSTOP.
 
@@ -90,13 +81,12 @@ def freeze(slot: Slot, pool: PoolOption = None) -> None:
     Example:
       fogft chaos freeze 1
     """
-    from fogft import app
-
-    machine = app.machine_in(app.pool_name(pool), slot)
-    count = app.chaos().freeze(machine)
+    machine = _machine(pool, slot)
+    count = _chaos().freeze(machine)
     output.done(f"replica `{machine.short}` is frozen ({count} processes)")
 
 
+@chaos.command(cls=Command)
 def thaw(slot: Slot, pool: PoolOption = None) -> None:
     """Let a frozen machine go on.
 
@@ -104,13 +94,12 @@ def thaw(slot: Slot, pool: PoolOption = None) -> None:
     Example:
       fogft chaos thaw 1
     """
-    from fogft import app
-
-    machine = app.machine_in(app.pool_name(pool), slot)
-    count = app.chaos().thaw(machine)
+    machine = _machine(pool, slot)
+    count = _chaos().thaw(machine)
     output.done(f"replica `{machine.short}` goes on ({count} processes)")
 
 
+@chaos.command(cls=Command)
 def slow(
     slot: Slot,
     delay_ms: Annotated[
@@ -131,15 +120,14 @@ def slow(
     Example:
       fogft chaos slow 1 80
     """
-    from fogft import app
-
-    machine = app.machine_in(app.pool_name(pool), slot)
+    machine = _machine(pool, slot)
     bytes_per_s = None if rate is None else rate * 1e6 / 8
-    app.chaos().slow(machine, delay_ms / 1000, bytes_per_s, lasting)
+    _chaos().slow(machine, delay_ms / 1000, bytes_per_s, lasting)
     limit = "" if rate is None else f" and passes {rate:g} Mbit/s"
     output.done(f"the link to `{machine.short}` takes {delay_ms:g} ms more each way{limit}")
 
 
+@chaos.command(cls=Command)
 def blackhole(slot: Slot, lasting: Duration = None, pool: PoolOption = None) -> None:
     """Let nothing pass over the link to a replica, without closing it.
 
@@ -147,13 +135,12 @@ def blackhole(slot: Slot, lasting: Duration = None, pool: PoolOption = None) -> 
     Example:
       fogft chaos blackhole 1
     """
-    from fogft import app
-
-    machine = app.machine_in(app.pool_name(pool), slot)
-    app.chaos().blackhole(machine, lasting)
+    machine = _machine(pool, slot)
+    _chaos().blackhole(machine, lasting)
     output.done(f"nothing passes over the link to `{machine.short}` any more")
 
 
+@chaos.command(cls=Command)
 def outage(location: Location, lasting: Duration = None) -> None:
     """End all machines in a location, and launch none there, until `clear`.
 
@@ -161,13 +148,12 @@ def outage(location: Location, lasting: Duration = None) -> None:
     Example:
       fogft chaos outage local/us-west-2
     """
-    from fogft import app
-
-    hit = app.chaos().outage(location, lasting)
+    hit = _chaos().outage(location, lasting)
     names = ", ".join(f"`{machine.short}`" for machine in hit) or "no machine"
     output.done(f"`{location}` is out; it hits {names}")
 
 
+@chaos.command(cls=Command)
 def capacity(
     location: Location,
     machines: Annotated[int, typer.Argument(min=0, metavar="N", help="How many fit in.")],
@@ -178,12 +164,11 @@ def capacity(
     Example:
       fogft chaos capacity local/us-west-2 0
     """
-    from fogft import app
-
-    app.chaos().capacity(location, machines)
+    _chaos().capacity(location, machines)
     output.done(f"`{location}` has room for {machines} machines; those that run stay")
 
 
+@chaos.command(cls=Command)
 def clear() -> None:
     """Undo what lasts: slow and dead links, frozen machines, outages, capacities.
 
@@ -191,7 +176,27 @@ def clear() -> None:
     Example:
       fogft chaos clear
     """
-    from fogft import app
-
-    app.chaos().clear()
+    _chaos().clear()
     output.done("nothing is slow, dead, frozen, out or full on purpose any more")
+
+
+def _chaos() -> Chaos:
+    from fogft.cloud.local.chaos import Chaos
+    from fogft.pool.commands import composition
+
+    return Chaos(composition.local_root())
+
+
+def _machine(pool: str | None, slot: int) -> ReplicaId:
+    """Return the newest machine that the cloud lists in a slot of a pool."""
+    from fogft.pool.commands import composition
+
+    identity = composition.store_of(pool).identity()
+    machines = composition.cloud_of(identity).machines(identity.uid)
+    found = [machine.id for machine in machines if machine.id.slot == slot]
+    if not found:
+        known = known_slots(machine.id.slot for machine in machines)
+        raise FogftError(
+            f"no machine runs in slot {slot} of `{identity.name}`", f"slots with one: {known}"
+        )
+    return max(found)

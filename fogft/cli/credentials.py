@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fogft.cli import output
-from fogft.cli.complete import PoolOption
-from fogft.cli.sections import Command
+from fogft.cli.commands import Command, group
+from fogft.cli.options import AsJson, PoolOption
 from fogft.errors import CredentialError, FogftError
 from fogft.model.certificate_holder import Holder, Role
 
@@ -38,20 +38,10 @@ PassphraseFile = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add these commands to the application."""
-    group = typer.Typer(rich_markup_mode=None, help="Say who is let in, and who no longer is.")
-    for name, command in (
-        ("issue", issue),
-        ("list", list_),
-        ("revoke", revoke),
-        ("rotate", rotate),
-    ):
-        group.command(name, cls=Command)(command)
-    app.add_typer(group, name="credentials")
-    app.command("join", cls=Command)(join)
+credentials = group("Say who is let in, and who no longer is.")
 
 
+@credentials.command(cls=Command)
 def issue(
     role: RoleName,
     name: Annotated[str, typer.Argument(metavar="NAME", help="Its name; a replica's slot.")],
@@ -76,13 +66,15 @@ def issue(
     Example:
       fogft credentials issue robot ada
     """
-    from fogft import app
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.credentials import issue_credentials
     from fogft.pool.credentials.bundle import new_passphrase
 
     own = None if passphrase_file is None else _read_passphrase(passphrase_file)
     passphrase = own or new_passphrase()
-    issued, file = app.issue_credentials(
-        app.pool_name(pool), _role(role), name, out, passphrase, open_for_s=hours * 3600
+    store = composition.store_of(pool)
+    issued, file = issue_credentials(
+        store, _role(role), name, out, passphrase, open_for_s=hours * 3600
     )
     holder = issued.holder
     output.data(str(file))
@@ -94,8 +86,9 @@ def issue(
     output.hint(f"copy `{file}` to the other machine, and run `fogft join {file.name}` there")
 
 
+@credentials.command("list", cls=Command)
 def list_(
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
     pool: PoolOption = None,
 ) -> None:
     """Show the certificates that the pool's CA has issued. Keys are never shown.
@@ -104,21 +97,22 @@ def list_(
     Example:
       fogft credentials list
     """
-    from fogft import app
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.credentials import certificates
 
     now = time.time()
-    entries = app.certificates(app.pool_name(pool))
-    if json:
+    entries = certificates(composition.store_of(pool))
+    if as_json:
         output.json_data([_as_data(entry, now) for entry in entries])
         return
-    rows = [("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL")]
-    rows += [
+    rows = [
         (e.holder.role.value, e.holder.short, e.state(now), _utc(e.not_after), e.serial[:16])
         for e in entries
     ]
-    output.data(output.aligned(rows))
+    output.show(output.table(("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL"), rows))
 
 
+@credentials.command(cls=Command)
 def revoke(
     role: RoleName,
     name: Annotated[
@@ -134,10 +128,10 @@ def revoke(
     Example:
       fogft credentials revoke robot ada
     """
-    from fogft import app
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.credentials import revoke_credentials
 
-    chosen = app.pool_name(pool)
-    holders, told = app.revoke_credentials(chosen, _role(role), name)
+    holders, told = revoke_credentials(composition.store_of(pool), _role(role), name)
     listed = ", ".join(f"`{holder.short}`" for holder in holders)
     if told:
         output.done(f"{role} {listed} is let in no more")
@@ -146,6 +140,7 @@ def revoke(
         output.hint("`fogft up` starts one")
 
 
+@credentials.command(cls=Command)
 def rotate(
     role: RoleName,
     name: Annotated[
@@ -166,23 +161,24 @@ def rotate(
     Example:
       fogft credentials rotate robot
     """
-    from fogft import app
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.credentials import rotate_replicas, rotate_robot
 
-    chosen, which = app.pool_name(pool), _role(role)
+    store, which = composition.store_of(pool), _role(role)
     if which is Role.REPLICA:
         if name and not name.isdecimal():
             raise FogftError(f"`{name}` is no slot", "see `fogft status`")
-        replaced = app.rotate_replicas(chosen, int(name) if name else None)
+        replaced = rotate_replicas(store, int(name) if name else None)
         listed = ", ".join(f"`{one}`" for one in replaced)
         output.done(f"{listed} will be replaced, each with a new key; see `fogft status`")
         return
     if which is not Role.ROBOT or name:
         raise FogftError(
-            f"the keys of {role} `{name}` are on another machine".replace(" ``", ""),
+            f"the keys of {f'{role} `{name}`' if name else role} are on another machine",
             f"`fogft credentials issue {role} {name or 'NAME'}`, `fogft join` there, then "
             f"`fogft credentials revoke {role} {name or 'NAME'}.1`",
         )
-    holder, old, in_use = app.rotate_robot(chosen)
+    holder, old, in_use = rotate_robot(store)
     if not in_use:
         output.warn(
             f"robot `{holder.short}` is certified, but its client proxy does not use it yet"
@@ -210,14 +206,14 @@ def join(
     Example:
       fogft join ada.join
     """
-    from fogft import app
     from fogft.pool.commands import joining
+    from fogft.pool.commands.credentials import join_here
     from fogft.pool.credentials.bundle import read_label
 
     label = read_label(joining.read(bundle))
     whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"
     output.say(f"this bundle is for {whom}")
-    joined = app.join(bundle, _read_passphrase(passphrase_file))
+    joined = join_here(bundle, _read_passphrase(passphrase_file))
     output.data(str(joined.config))
     output.done(f"this machine is {whom}")
     if joined.alone:

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fogft.cli import output
-from fogft.cli.sections import Command
+from fogft.cli.options import AsJson
 
 if TYPE_CHECKING:
     from fogft.doctor.finding import Finding
 
-_STYLES = {"ok": "\033[32m", "warn": "\033[1;33m", "fail": "\033[1;31m"}
-_NAME_WIDTH = 18
-
-
-def register(app: typer.Typer) -> None:
-    """Add this command to the application."""
-    app.command("doctor", cls=Command)(doctor)
+_STYLES = {"ok": "green", "warn": "bold yellow", "fail": "bold red"}
 
 
 def doctor(
@@ -28,7 +22,7 @@ def doctor(
         Path | None,
         typer.Argument(metavar="FILE", help="A pool file to check as well.", show_default=False),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list instead.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check this machine, ROS 2 and the pools on it; say what to do.
 
@@ -38,38 +32,31 @@ def doctor(
     Example:
       fogft doctor pool.yaml
     """
-    from fogft import app
+    from fogft.doctor import checks
+    from fogft.doctor.finding import Verdict
 
     found: list[Finding] = []
-    for finding in app.doctor(file):
+    for finding in checks.examine(file):
         found.append(finding)
         if not as_json:
-            output.data(text(finding, colour=output.coloured(sys.stdout)))
+            _show(finding)
     if as_json:
-        output.json_data([as_dict(finding) for finding in found])
-    failed = sum(f.verdict.value == "fail" for f in found)
-    warned = sum(f.verdict.value == "warn" for f in found)
+        output.json_data([asdict(finding) for finding in found])
+    failed = sum(f.verdict is Verdict.FAIL for f in found)
+    warned = sum(f.verdict is Verdict.WARN for f in found)
     output.say(f"\n{len(found)} checks: {failed} failed, {warned} to look at")
     if failed:
         raise typer.Exit(1)
 
 
-def text(finding: Finding, *, colour: bool = False) -> str:
-    """Return a finding as one line, and its advice as another."""
-    verdict = finding.verdict.value.ljust(4)
-    if colour:
-        verdict = f"{_STYLES[finding.verdict.value]}{verdict}\033[0m"
-    line = f"{verdict}  {finding.check.ljust(_NAME_WIDTH)}  {finding.text}"
-    if not finding.advice:
-        return line
-    return f"{line}\n{' ' * (_NAME_WIDTH + 8)}-> {finding.advice}"
+def _show(finding: Finding) -> None:
+    """Print a finding as one line, and its advice as another."""
+    from rich.text import Text
 
-
-def as_dict(finding: Finding) -> dict[str, str]:
-    """Return a finding as it stands in the JSON list."""
-    return {
-        "check": finding.check,
-        "verdict": finding.verdict.value,
-        "text": finding.text,
-        "advice": finding.advice,
-    }
+    verdict = finding.verdict.value
+    text = output.printable(finding.text)
+    output.show(
+        Text.assemble((f"{verdict:<4}", _STYLES[verdict]), f"  {finding.check:<18}  {text}")
+    )
+    if finding.advice:
+        output.data(f"{'':<26}-> {output.printable(finding.advice)}")

@@ -9,32 +9,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft.cli import complete, output
-from fogft.cli.complete import PoolArgument
-from fogft.cli.sections import Command
+from fogft.cli import options, output
+from fogft.cli.options import DEFAULT_FILE, PoolArgument, PoolFile
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from fogft.pool.commands.preview import Preview
     from fogft.pool.commands.status import Seen
 
-DEFAULT_FILE = Path("pool.yaml")
 LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
-ROLLED_BACK = "rolled back"  # `fogft.planning.rollout.UpdateState`
-HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
-
-
-def register(app: typer.Typer) -> None:
-    """Add these commands to the application."""
-    for command in (init, up, down):
-        app.command(command.__name__, cls=Command)(command)
 
 
 def init(
     name: Annotated[
         str,
-        typer.Argument(metavar="NAME", help="Which example.", autocompletion=complete.examples),
+        typer.Argument(metavar="NAME", help="Which example.", autocompletion=options.examples),
     ] = "",
     into: Annotated[
         Path | None,
@@ -53,16 +43,17 @@ def init(
     Example:
       fogft init planner --into my_pool
     """
-    from fogft import app
+    from fogft.pool.commands.init import DEFAULT_EXAMPLE, copy_example
 
-    files = app.init(name, into, force=force)
+    name = name or DEFAULT_EXAMPLE
+    files = copy_example(name, into or Path(name), force=force)
     for file in files:
         output.data(str(file))
     output.hint(f"look at `{files[0]}`, then run `fogft up {files[0]}`")
 
 
 def up(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The pool file.")] = DEFAULT_FILE,
+    file: PoolFile = DEFAULT_FILE,
     cloud: Annotated[
         str | None,
         typer.Option(
@@ -96,56 +87,52 @@ def up(
     Example:
       fogft up pool.yaml
     """
-    from fogft import app
     from fogft.cli import progress
+    from fogft.pool.commands import preview, startup
+    from fogft.pool.commands.outcome import Awaited, Outcome
+    from fogft.pool.folder.paths import PoolPaths
 
-    order = app.order(file, cloud, told=output.say)
+    order = preview.order(file, cloud, told=output.say)
     progress.announce(order.preview)
     if not yes and must_ask(order.preview) and not output.confirm(question(order.preview)):
         output.say("nothing was done")
         raise typer.Exit(1)
     limit_s = timeout or (REAL_LIMIT_S if order.preview.costs_money else LIMIT_S)
     applied_at = time.time()
-    if app.start(order) and not order.preview.is_new:
+    if startup.start(order) and not order.preview.is_new:
         output.say("it had no manager: one was started, and takes over what runs")
     name = order.spec.name
-    wanted = {service.name for service in order.spec.services}
-    awaited = order.digest if order.preview.replaces_replicas or order.preview.rolled_back else ""
-
-    def is_over(seen: Seen) -> bool:
-        if awaited not in ("", seen.status.applied):
-            return False
-        if is_updating(seen, awaited):
-            return keeps_ending(seen)
-        if gave_up(seen) or is_answering(seen, wanted, applied_at):
-            return True
-        return keeps_ending(seen) or differs(seen)
-
+    replaces = order.preview.replaces_replicas or order.preview.rolled_back
+    awaited = Awaited(
+        frozenset(service.name for service in order.spec.services),
+        applied_at,
+        order.digest if replaces else "",
+    )
     try:
-        seen, _ = progress.wait(lambda: managed(name), is_over, limit_s)
+        seen, outcome = progress.wait(PoolPaths.of(name), awaited, limit_s)
     except KeyboardInterrupt:
         output.say(f"interrupted: `{name}` goes on starting; `fogft down {name}` ends it")
         raise typer.Exit(130) from None
-    if why := gave_up(seen):
+    if outcome is Outcome.WITHDRAWN and seen.status.update is not None:
         raise FogftError(
-            f"`{name}` was not updated: {why}",
+            f"`{name}` was not updated: {seen.status.update.fault}",
             "see `fogft logs`; change the file and `fogft up` it again: this one is not retried",
         )
-    if keeps_ending(seen):
-        raise not_answering(seen, "does not answer: `run` ends again and again")
-    if differs(seen):
-        raise not_answering(seen, "cannot answer: the types are not the same on both sides")
-    if not is_answering(seen, wanted, applied_at):
-        raise not_answering(seen, f"does not answer after {limit_s:.0f} s")
+    if outcome is not Outcome.ANSWERING:
+        what = {
+            Outcome.RUN_KEEPS_ENDING: "does not answer: `run` ends again and again",
+            Outcome.TYPES_DIFFER: "cannot answer: the types are not the same on both sides",
+        }
+        raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
     status = seen.status
     if not status.target:
         output.done(f"`{name}` is set up; its schedule wants no replica now")
         return
     missing = max(0, status.target - status.ready)
     rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
-    if is_updating(seen, awaited):
+    if awaited.is_updating(seen):
         rest = "; the update goes on, see `fogft status`"
-    for service in () if wanted else status.services:
+    for service in () if awaited.services else status.services:
         output.say(f"offers {service.name} ({service.type})")
     output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
 
@@ -163,69 +150,10 @@ def question(preview: Preview) -> str:
     return f"launch {count} machine{'' if count == 1 else 's'} at these prices?"
 
 
-def managed(pool: str) -> Seen:
-    """Return a pool's status; raise when nobody manages it any more."""
-    from fogft import app
-    from fogft.pool.folder.paths import PoolPaths
-
-    seen = app.status(pool)
-    if not seen.manager_alive:
-        raise FogftError(
-            f"the manager of `{pool}` has ended:\n{app.tail(PoolPaths.of(pool).manager_log)}",
-            f"start it again with `fogft up`; `fogft down {pool}` ends what runs",
-        )
-    return seen
-
-
-def is_answering(seen: Seen, services: set[str], since: float) -> bool:
-    """Whether every service has a ready replica and a client proxy, as seen after `since`.
-
-    Without services to look for, every one that was discovered.
-
-    A pool whose schedule wants no replica now is as it should be.
-    """
-    status = seen.status
-    if status.observed_at >= since and status.cloud_reachable and not status.target:
-        return True
-    ready = {service.name for service in status.services if service.ready_replicas}
-    return (
-        status.observed_at >= since
-        and status.proxy_alive
-        and bool(ready)
-        and {service.name for service in status.services} == (services or ready) == ready
-    )
-
-
-def is_updating(seen: Seen, file: str) -> bool:
-    """Whether an update to the file of this digest is yet to end; empty for no update."""
-    if not file:
-        return False
-    update = seen.status.update
-    return seen.status.applied != file or (update is not None and update.state != ROLLED_BACK)
-
-
-def gave_up(seen: Seen) -> str:
-    """Return why the file that was applied last was given up; empty where it was not."""
-    return seen.status.update.fault if seen.status.update is not None else ""
-
-
-def keeps_ending(seen: Seen) -> bool:
-    """Whether `run` has ended so often on every replica that waiting longer is no use."""
-    replicas = seen.status.replicas
-    return bool(replicas) and not any(
-        replica.phase == "ready" or replica.restarts < HOPELESS_RESTARTS for replica in replicas
-    )
-
-
-def differs(seen: Seen) -> bool:
-    """Whether every replica has another definition of a service's type than this machine."""
-    replicas = seen.status.replicas
-    return bool(replicas) and all(replica.differs for replica in replicas)
-
-
 def not_answering(seen: Seen, what: str) -> FogftError:
     """Return the error of a start that came to nothing, with all that is known of the reason."""
-    from fogft import app
+    from fogft import logfile
+    from fogft.pool.commands import composition, logs
 
     status = seen.status
     silent = [service.name for service in status.services if not service.ready_replicas]
@@ -235,10 +163,11 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     lines = [f"{listed} of `{status.pool}` {what}"]
     lines += [f"  {note}" for note in status.notes]
     lines += [f"  replica {r.slot}.{r.generation}: {r.detail}" for r in status.replicas if r.detail]
-    logs = app.logs(status.pool)
-    label, path = logs[-1] if status.proxy_alive else logs[1]
+    store = composition.make_store(status.pool)
+    found = logs.find(store, composition.cloud_of(store.identity()))
+    label, path = found[-1] if status.proxy_alive else found[1]
     lines += [f"the end of the log of `{label}`:"]
-    lines += [f"  {line}" for line in app.tail(path).splitlines()]
+    lines += [f"  {line}" for line in logfile.tail(path, lines=8).splitlines()]
     return FogftError(
         "\n".join(lines),
         "the manager goes on trying: see `fogft status` and `fogft logs`; "
@@ -261,18 +190,26 @@ def down(
     Example:
       fogft down
     """
-    from fogft import app
+    from fogft.pool.commands import composition
+    from fogft.pool.manager import shutdown
+    from fogft.ros import shared_memory
 
-    if not app.pools():
+    if not composition.pools():
         output.say("nothing to end: there is no pool here")
         return
-    name = app.pool_name(pool)
-    paid = app.costs_money(name)
+    store = composition.store_of(pool)
+    paid = store.identity().cloud != composition.LOCAL
     asks = paid and not yes and output.is_terminal(sys.stdin)
-    if asks and not output.confirm(f"end `{name}` and all its machines?"):
+    if asks and not output.confirm(f"end `{store.name}` and all its machines?"):
         output.say("nothing was done")
         raise typer.Exit(1)
-    app.down(name, lambda what: output.say(f"ended {what}"), output.warn)
-    output.done(f"nothing of `{name}` is left")
-    if paid and not app.pools():
+
+    def told(what: str) -> None:
+        output.say(f"ended {what}")
+
+    shutdown.end(store, composition.cloud_of, told=told, warned=output.warn)
+    if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
+        told(f"{len(swept)} shared-memory files of dead processes")
+    output.done(f"nothing of `{store.name}` is left")
+    if paid and not composition.pools():
         output.hint("SkyPilot's own API server runs on; `sky api stop` ends one on this machine")

@@ -1,4 +1,4 @@
-"""The ``fogft`` command: which commands there are, and how each of them ends.
+"""The ``fogft`` command, and how each of its commands ends.
 
 Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage; 130
 interrupted; 141 nobody reads stdout any more. Anything else is a defect of ours and
@@ -8,7 +8,7 @@ Every import that costs more than a few milliseconds is made inside the command 
 needs it, so that ``fogft --help`` and completion stay quick (tests/cli/test_laziness).
 
 Owns: the entry point and exit statuses.
-Not here: what commands do (`fogft.app`) and how text looks (`output`).
+Not here: which commands there are (`commands`) and how text looks (`output`).
 """
 
 from __future__ import annotations
@@ -21,20 +21,8 @@ from typing import Annotated
 import typer
 
 from fogft import __version__
-from fogft.cli import (
-    change,
-    chaos,
-    credentials,
-    doctor,
-    lifecycle,
-    output,
-    parts,
-    plan,
-    simulate,
-    sweep,
-    watch,
-)
-from fogft.cli.sections import Commands
+from fogft.cli import output
+from fogft.cli.commands import Commands
 from fogft.errors import FogftError
 
 INTERRUPTED = 130
@@ -55,16 +43,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-lifecycle.register(app)
-sweep.register(app)
-plan.register(app)
-watch.register(app)
-doctor.register(app)
-change.register(app)
-simulate.register(app)
-chaos.register(app)
-credentials.register(app)
-parts.register(app)
 
 
 @app.callback(invoke_without_command=True)
@@ -135,5 +113,6 @@ def _explain_usage(problem: Exception) -> None:
     path = context.command_path if context else "fogft"
     for theirs, ours in _OTHER_WORDS:
         message = message.replace(theirs, ours)
-    slot = "; the slot of replica `2.1` is 2" if "'SLOT'" in message else ""
+    metavar = getattr(getattr(problem, "param", None), "metavar", None)
+    slot = "; the slot of replica `2.1` is 2" if metavar == "SLOT" else ""
     output.error(message[:1].lower() + message[1:].rstrip("."), f"see `{path} --help`{slot}")

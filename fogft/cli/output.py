@@ -1,9 +1,10 @@
-"""Where text goes and how it looks: data to stdout, messages to stderr, both fine without colour.
+"""Print to the terminal: data to stdout, messages to stderr, both readable without colour.
 
 What a command answers (a table, JSON, a log) is data. Progress, hints and errors are
-messages. A script may therefore read stdout and ignore stderr.
+messages. A script may therefore read stdout and ignore stderr. Rich draws tables, trees and
+whatever is redrawn; it is loaded when the first of them is shown.
 
-Owns: streams, colour, width, the shape of an error.
+Owns: streams, colour, width, the shape of an error, and escaping control characters.
 Not here: what is said (the commands).
 """
 
@@ -12,24 +13,22 @@ from __future__ import annotations
 import json
 import os
 import select
-import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from fogft.errors import FogftError
 
-# A table that is read by another program is never cut.
-_WIDTH_OF_A_PIPE = 240
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.table import Table
+    from rich.text import Text
 
-_RED, _YELLOW, _CYAN, _GREEN, _RESET = (
-    "\033[1;31m",
-    "\033[1;33m",
-    "\033[1;36m",
-    "\033[1;32m",
-    "\033[0m",
-)
+# Wide enough that nothing is ever cut: a terminal breaks a long line by itself.
+_UNLIMITED = 100_000
+# What counts as the width of a line where no person looks.
+_WIDTH_OF_A_PIPE = 240
 
 
 def data(text: str) -> None:
@@ -43,30 +42,90 @@ def json_data(value: Any) -> None:
     data(json.dumps(value, indent=2, default=str))
 
 
+def show(*parts: RenderableType, stream: IO[str] | None = None) -> None:
+    """Write tables, trees and lines, uncut and without blanks at the ends of lines.
+
+    Args:
+        parts: What to write, one below the other.
+        stream: Where; stdout if not given.
+    """
+    # With a height: of a dumb terminal rich else takes both to be small.
+    console = _console(stream or sys.stdout, width=_UNLIMITED, height=25)
+    with console.capture() as captured:
+        console.print(*parts, sep="\n")
+    for line in captured.get().splitlines():
+        console.file.write(line.rstrip() + "\n")
+    console.file.flush()
+
+
+def table(
+    header: Collection[str],
+    rows: Iterable[Iterable[str | Text]],
+    *,
+    right: Collection[str] = (),
+    titled: bool = True,
+) -> Table:
+    """Return a table without lines, for `show` or `redrawn`.
+
+    Args:
+        header: The columns' names.
+        rows: As many cells each.
+        right: Names of the columns that are aligned to the right.
+        titled: Whether the header is shown.
+    """
+    from rich.table import Table
+
+    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim",
+                 show_header=titled)  # fmt: skip
+    for name in header:
+        made.add_column(name, justify="right" if name in right else "left", no_wrap=True)
+    for row in rows:
+        made.add_row(*(cell(one) if isinstance(one, str) else one for one in row))
+    return made
+
+
+def cell(text: str, style: str = "") -> Text:
+    """Return text for a table or tree, with its control characters escaped."""
+    from rich.text import Text
+
+    return Text(printable(text).replace("\n", "\\n"), style)
+
+
+def printable(text: str) -> str:
+    """Return text with all control characters but newlines escaped.
+
+    A probe's detail or a pool file's value comes from elsewhere: it must not move the cursor.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+
+
 def say(text: str) -> None:
     """Write a message to stderr, at once."""
-    sys.stderr.write(text + "\n")
+    sys.stderr.write(printable(text) + "\n")
     sys.stderr.flush()
 
 
 def done(text: str) -> None:
     """Write a message of success: ``done: text``."""
-    say(f"{_painted('done:', _GREEN)} {text}")
+    _tagged("done:", "bold green", text)
 
 
 def warn(text: str) -> None:
     """Write a warning: ``warning: text``."""
-    say(f"{_painted('warning:', _YELLOW)} {text}")
+    _tagged("warning:", "bold yellow", text)
 
 
 def hint(text: str) -> None:
     """Write what to do next, after a blank line: ``hint: text``."""
-    say(f"\n{_painted('hint:', _CYAN)} {text}")
+    say("")
+    _tagged("hint:", "bold cyan", text)
 
 
 def error(message: str, hint_text: str = "") -> None:
     """Write what went wrong and, after a blank line, what to do about it."""
-    say(f"{_painted('error:', _RED)} {message}")
+    _tagged("error:", "bold red", message)
     if hint_text:
         hint(hint_text)
 
@@ -89,12 +148,6 @@ def confirm(question: str) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def coloured(stream: IO[str]) -> bool:
-    """Whether a stream wants colour: a terminal that is not dumb, and no ``NO_COLOR``."""
-    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
-    return not plain and is_terminal(stream)
-
-
 def is_terminal(stream: IO[str]) -> bool:
     """Whether a person looks at this stream."""
     try:
@@ -107,31 +160,18 @@ def width(stream: IO[str]) -> int:
     """Return how many characters fit in a line of a stream."""
     if not is_terminal(stream) and not os.environ.get("COLUMNS"):
         return _WIDTH_OF_A_PIPE
-    return shutil.get_terminal_size().columns
+    return _console(stream).width
 
 
 @contextmanager
-def redrawn(stream: IO[str]) -> Iterator[Callable[[Sequence[str]], None]]:
-    """Yield a function that shows lines on a terminal in place of those that it showed before."""
-    from rich.console import Console
+def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
+    """Yield a function that shows something on a terminal in place of what it showed before."""
     from rich.live import Live
-    from rich.text import Text
 
-    console = Console(file=stream, color_system="auto" if coloured(stream) else None)
-    with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
-        yield lambda lines: live.update(
-            Text.from_ansi("\n".join(lines), no_wrap=True, overflow="ellipsis"), refresh=True
-        )
-
-
-def aligned(rows: Iterable[Iterable[str]], gap: int = 2) -> str:
-    """Lay rows out in columns of plain text; the last column is left as it is."""
-    cells = [list(row) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*(r[:-1] for r in cells), strict=True)]
-    return "\n".join(
-        "".join(cell.ljust(width + gap) for cell, width in zip(row, widths, strict=False)) + row[-1]
-        for row in cells
-    )
+    with Live(
+        console=_console(stream), auto_refresh=False, vertical_overflow="crop"
+    ) as live:  # fmt: skip
+        yield lambda shown: live.update(shown, refresh=True)
 
 
 def stdout_closed() -> bool:
@@ -151,5 +191,20 @@ def silence_stdout() -> None:
     os.close(nowhere)
 
 
-def _painted(text: str, code: str, wants: Callable[[IO[str]], bool] = coloured) -> str:
-    return f"{code}{text}{_RESET}" if wants(sys.stderr) else text
+def _tagged(tag: str, style: str, text: str) -> None:
+    if not is_terminal(sys.stderr):
+        say(f"{tag} {text}")
+        return
+    from rich.text import Text
+
+    show(Text.assemble((tag, style), " ", printable(text)), stream=sys.stderr)
+
+
+def _console(stream: IO[str], **options: Any) -> Console:
+    from rich.console import Console
+
+    # Under NO_COLOR rich still sends bold and dim; without a colour system it sends nothing.
+    system: Any = None if os.environ.get("NO_COLOR") else "auto"
+    return Console(
+        file=stream, color_system=system, markup=False, highlight=False, emoji=False, **options
+    )

@@ -11,8 +11,7 @@ from typing import Annotated
 
 import typer
 
-from fogft.cli import complete
-from fogft.cli.sections import Command
+from fogft.cli import options
 
 
 def _endpoint(value: str | None) -> str | None:
@@ -22,6 +21,13 @@ def _endpoint(value: str | None) -> str | None:
         raise typer.BadParameter(f"`{value}` is not HOST:PORT, such as 127.0.0.1:9464")
     return value
 
+
+Listen = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
+    ),
+]
 
 Config = Annotated[
     Path, typer.Option("--config", "-c", metavar="FILE", help="Its configuration (YAML).")
@@ -38,12 +44,6 @@ Metrics = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add these commands to the application."""
-    for command in (proxy, serve, manager, rendezvous, gateway):
-        app.command(command.__name__, cls=Command)(command)
-
-
 def proxy(config: Config, metrics: Metrics = None) -> None:
     """Run a client proxy: the robot's side of a pool.
 
@@ -53,20 +53,15 @@ def proxy(config: Config, metrics: Metrics = None) -> None:
     Example:
       fogft proxy --config ~/.local/state/fogft/pools/planner/proxy.yaml
     """
-    from fogft import app
+    from fogft.proxy.robot import process
 
-    app.run_proxy(config, metrics=metrics)
+    process.run(config, metrics=metrics)
 
 
 def serve(
     config: Config,
     *,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
-        ),
-    ] = None,
+    listen: Listen = None,
     domain_id: Annotated[
         int | None,
         typer.Option(
@@ -103,9 +98,9 @@ def serve(
     Example:
       fogft serve --config replica.yaml --listen 0.0.0.0:7447
     """
-    from fogft import app
+    from fogft.proxy.replica import process
 
-    app.run_server(
+    process.run(
         config,
         listen=listen,
         domain_id=domain_id,
@@ -118,7 +113,7 @@ def serve(
 
 def manager(
     pool: Annotated[
-        str, typer.Argument(metavar="POOL", help="Its name.", autocompletion=complete.pools)
+        str, typer.Argument(metavar="POOL", help="Its name.", autocompletion=options.pools)
     ],
     metrics: Metrics = None,
 ) -> None:
@@ -128,21 +123,13 @@ def manager(
     Example:
       fogft manager planner
     """
-    from fogft import app
+    from fogft.pool.commands import composition
+    from fogft.pool.manager.manager import run
 
-    app.run_manager(pool, metrics=metrics)
+    run(composition.make_store(pool), composition.cloud_of, metrics=metrics)
 
 
-def rendezvous(
-    config: Config,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
-        ),
-    ] = None,
-    metrics: Metrics = None,
-) -> None:
+def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
     """Run a rendezvous: it tells robots and replicas where others are.
 
     It needs a port that all can reach and carries no requests. Run two, on two machines.
@@ -151,21 +138,12 @@ def rendezvous(
     Example:
       fogft rendezvous --config rendezvous.yaml --listen 0.0.0.0:7450
     """
-    from fogft import app
+    from fogft.pool.commands.rendezvous import read_config, run
 
-    app.run_rendezvous(config, listen=listen, metrics=metrics)
+    run(read_config(config, listen, metrics))
 
 
-def gateway(
-    config: Config,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
-        ),
-    ] = None,
-    metrics: Metrics = None,
-) -> None:
+def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
     """Run a gateway: robots ask it once, and it asks all replicas.
 
     Run it where the uplink is wide: on a machine of its own, or on a replica's.
@@ -174,6 +152,6 @@ def gateway(
     Example:
       fogft gateway --config gateway.yaml --listen 0.0.0.0:7470
     """
-    from fogft import app
+    from fogft.proxy.gateway import process
 
-    app.run_gateway(config, listen=listen, metrics=metrics)
+    process.run(config, listen=listen, metrics=metrics)

@@ -8,17 +8,11 @@ from typing import Annotated
 import typer
 
 from fogft.cli import output
-from fogft.cli.lifecycle import DEFAULT_FILE
-from fogft.cli.sections import Command
-
-
-def register(app: typer.Typer) -> None:
-    """Add this command to the application."""
-    app.command("plan", cls=Command)(plan)
+from fogft.cli.options import DEFAULT_FILE, AsJson, PoolFile
 
 
 def plan(  # noqa: PLR0917 - Typer reads the command line from them
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The pool file.")] = DEFAULT_FILE,
+    file: PoolFile = DEFAULT_FILE,
     cloud: Annotated[
         str | None,
         typer.Option(
@@ -43,7 +37,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     everything: Annotated[
         bool, typer.Option("--all", help="Show every offer, not the best of each region.")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
     plot: Annotated[
         Path | None,
         typer.Option(
@@ -60,17 +54,14 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     Example:
       fogft plan pool.yaml
     """
-    import sys
-
-    from fogft import app
     from fogft.cli import plan_plot, plan_text
+    from fogft.pool.commands.plan import plan_file
 
-    shown = app.plan(file, cloud, prices=prices, offline=offline, told=output.say)
-    if json:
+    shown = plan_file(file, cloud, prices=prices, offline=offline, told=output.say)
+    if as_json:
         output.json_data(plan_text.to_json(shown))
     else:
-        colour = output.coloured(sys.stdout)
-        output.data("\n".join(plan_text.lines(shown, everything=everything, colour=colour)))
+        plan_text.show(shown, everything=everything)
     for note in (*shown.notes, *shown.explanation.notes):
         output.warn(note)
     if plot is not None:

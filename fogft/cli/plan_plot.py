@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
-    from fogft.app.planning import PlanShown
+    from fogft.pool.commands.plan import PlanShown
 
 _WIDTH, _HEIGHT, _EDGE = 720, 480, 64
 _COLOURS = ("#1b6ca8", "#c1440e", "#3a7d44", "#7b4f9d", "#8a6d00")

@@ -9,28 +9,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fogft.cli.table import Cell, columns
+from fogft.cli import output
 
 if TYPE_CHECKING:
-    from fogft.app.planning import PlanShown
+    from rich.text import Text
+
     from fogft.model.replica import Offer
     from fogft.model.spec import ServiceSpec
     from fogft.planning.cost import Cost
     from fogft.planning.explain import Considered
+    from fogft.pool.commands.plan import PlanShown
 
 _HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST", "WHY NOT")
+# The units of ages, their lengths, and from which age on each is used.
+_UNITS = (("days", 86400.0, 2 * 86400.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
 
 
-def lines(shown: PlanShown, *, everything: bool = False, colour: bool = False) -> list[str]:
-    """Return the plan as lines of text."""
+def show(shown: PlanShown, *, everything: bool = False) -> None:
+    """Print the plan: the table of offers and a summary."""
     found = sorted(shown.explanation.considered, key=_order)
     listed = found if everything else _best_of_regions(found)
-    out = columns(
-        _HEADER, [_row(shown, one) for one in listed], right=("$/H", "RTT", "LOST"), colour=colour
-    )
+    rows = [_row(shown, one) for one in listed]
+    output.show(output.table(_HEADER, rows, right=("$/H", "RTT", "LOST")))
     if len(listed) < len(found):
-        out.append(f"and {len(found) - len(listed)} more offers in these regions (--all)")
-    return [*out, "", *_summary(shown)]
+        output.data(f"and {len(found) - len(listed)} more offers in these regions (--all)")
+    output.data("\n".join(["", *_summary(shown)]))
 
 
 def to_json(shown: PlanShown) -> dict[str, Any]:
@@ -109,25 +112,34 @@ def _best_of_regions(found: Iterable[Considered]) -> list[Considered]:
     return out
 
 
-def _row(shown: PlanShown, one: Considered) -> list[Cell]:
+def _row(shown: PlanShown, one: Considered) -> list[str | Text]:
     place = one.offer.placement
     return [
-        Cell(",".join(map(str, one.slots)) or "-", "good" if one.slots else "dim"),
-        Cell(place.location.rstrip("/")),
-        Cell(place.instance),
-        Cell("spot" if place.spot else "on demand"),
-        Cell(f"{one.offer.usd_per_hour:.3f}"),
-        Cell(_price(one.offer, shown.now)),
-        Cell("?" if one.rtt_s is None else f"{one.rtt_s * 1000:.0f} ms"),
-        Cell(str(one.losses)),
-        Cell(one.why_not, "dim"),
+        output.cell(",".join(map(str, one.slots)) or "-", "green" if one.slots else "dim"),
+        place.location.rstrip("/"),
+        place.instance,
+        "spot" if place.spot else "on demand",
+        f"{one.offer.usd_per_hour:.3f}",
+        price_source(one.offer, shown.now) or "made up",
+        "?" if one.rtt_s is None else f"{one.rtt_s * 1000:.0f} ms",
+        str(one.losses),
+        output.cell(one.why_not, "dim"),
     ]
 
 
-def _price(offer: Offer, now: float) -> str:
-    from fogft.pool.commands.preview import price_told
+def price_source(offer: Offer, now: float) -> str:
+    """Return where an offer's price comes from and how old it is; empty where it is made up."""
+    if not offer.source or not offer.as_of:
+        return offer.source
+    return f"{offer.source}, {_age(now - offer.as_of)} old"
 
-    return price_told(offer, now) or "made up"
+
+def _age(seconds: float) -> str:
+    """Return an age in its one largest unit: ``3 s``, ``5 min``, ``7 h``, ``2 days``."""
+    for unit, length_s, from_s in _UNITS:
+        if seconds >= from_s:
+            return f"{seconds / length_s:.0f} {unit}"
+    return f"{max(0.0, seconds):.0f} s"
 
 
 def _summary(shown: PlanShown) -> list[str]:

@@ -4,7 +4,7 @@ On a terminal a table that is redrawn; elsewhere one line for each change. All o
 to stderr.
 
 Owns: the words and the waiting.
-Not here: what is done (`fogft.app`).
+Not here: what is done (`fogft.pool.commands`).
 """
 
 from __future__ import annotations
@@ -15,12 +15,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from fogft import logfile
 from fogft.cli import output
+from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from fogft.model.spec import PoolSpec
+    from fogft.pool.commands.outcome import Awaited, Outcome
     from fogft.pool.commands.preview import Preview
     from fogft.pool.commands.status import Seen
+    from fogft.pool.folder.paths import PoolPaths
 
 LOOK_EVERY_S = 0.2
 
@@ -33,7 +37,7 @@ def announce(preview: Preview) -> None:
     if preview.is_new:
         count = _count(preview.wanted or spec.replicas, "replica")
         output.say(f"pool `{spec.name}`: {count} on `{preview.cloud}`")
-        _say_launches(preview)
+        _show_launches(preview)
     elif preview.changes:
         output.say(f"pool `{spec.name}` changes:")
         for change in preview.changes:
@@ -62,36 +66,55 @@ def _no_room(spec: PoolSpec) -> str:
     return f"{why}: meanwhile one fewer answers"
 
 
-def _say_launches(preview: Preview) -> None:
+def _show_launches(preview: Preview) -> None:
     """Say where each replica will go, at what price, and how sure that is."""
+    from fogft.cli.plan_text import price_source
+
     rows = [
-        (f"  {x.slot}", x.location, x.instance, f"${x.usd_per_hour:.3f}/h", x.price)
-        for x in preview.launches
+        (
+            f"  {launch.slot}",
+            launch.offer.placement.location,
+            launch.offer.placement.instance,
+            f"${launch.offer.usd_per_hour:.3f}/h",
+            price_source(launch.offer, preview.observed_at),
+        )
+        for launch in preview.launches
     ]
     if rows:
-        told = any(launch.price for launch in preview.launches)
-        output.say(output.aligned(row if told else row[:-1] for row in rows))
+        output.show(output.table([""] * 5, rows, titled=False), stream=sys.stderr)
         output.say(f"  together ${preview.usd_per_hour:.3f}/h")
 
 
-def wait(
-    look: Callable[[], Seen], until: Callable[[Seen], bool], timeout_s: float
-) -> tuple[Seen, bool]:
-    """Show a pool's progress until it is as wanted; return what was last seen, and whether it is.
+def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Outcome]:
+    """Show a pool's progress until an `up` has led to something; return what was last seen.
 
     Args:
-        look: Returns the pool's status; raises what ends the waiting.
-        until: Whether a status is good enough.
+        paths: The pool.
+        awaited: What the `up` is for.
         timeout_s: The longest to wait.
+
+    Raises:
+        FogftError: Nobody manages the pool any more.
     """
+    from fogft.pool.commands import status
+    from fogft.pool.commands.outcome import Outcome
+
     deadline = time.monotonic() + timeout_s
     with _shown() as show:
         while True:
-            seen = look()
+            seen = status.read(paths, time.time())
+            if not seen.manager_alive:
+                name, log = paths.folder.name, logfile.tail(paths.manager_log, lines=8)
+                raise FogftError(
+                    f"the manager of `{name}` has ended:\n{log}",
+                    f"start it again with `fogft up`; `fogft down {name}` ends what runs",
+                )
             show(seen)
-            good = until(seen)
-            if good or time.monotonic() >= deadline:
-                return seen, good
+            outcome = awaited.outcome(seen)
+            if outcome is not Outcome.PENDING:
+                return seen, outcome
+            if time.monotonic() >= deadline:
+                return seen, awaited.outcome(seen, is_last=True)
             time.sleep(LOOK_EVERY_S)
 
 
@@ -103,9 +126,9 @@ def _shown() -> Iterator[Callable[[Seen], None]]:
         return
     from fogft.cli import status_text
 
-    room, colour = output.width(sys.stderr), output.coloured(sys.stderr)
+    width = output.width(sys.stderr)
     with output.redrawn(sys.stderr) as show:
-        yield lambda seen: show(status_text.starting(seen.status, width=room, colour=colour))
+        yield lambda seen: show(status_text.starting(seen.status, width=width))
 
 
 class PhaseLines:

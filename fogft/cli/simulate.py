@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fogft.cli import output
-from fogft.cli.sections import Command
-from fogft.cli.table import Cell, columns
+from fogft.cli.options import AsJson
 
 if TYPE_CHECKING:
+    from rich.text import Text
+
     from fogft.simulation.comparison import Row
     from fogft.simulation.report import Report
-
-
-def register(app: typer.Typer) -> None:
-    """Add this command to the application."""
-    app.command("simulate", cls=Command)(simulate)
 
 
 def simulate(
@@ -54,7 +49,7 @@ def simulate(
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw a PNG, SVG or PDF file as well.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run a pool in spot markets under simulated time, beside fixed policies.
 
@@ -64,11 +59,12 @@ def simulate(
     Example:
       fogft simulate pool.yaml --traces recorded/ --plot report.png
     """
-    from fogft import app
+    from fogft.simulation import run
+    from fogft.simulation.plot import check, draw
 
     if plot is not None:
-        app.check_plot(plot)
-    report = app.simulate(
+        check(plot)
+    report = run.simulate(
         file,
         traces=traces,
         fit=fit,
@@ -80,11 +76,11 @@ def simulate(
     if as_json:
         output.json_data(report.to_json())
     else:
-        output.data("\n".join(text(report, colour=output.coloured(sys.stdout))))
+        _show(report)
     for note in report.notes:
         output.say(f"note: {note}")
     if plot is not None:
-        app.draw(report, plot)
+        draw(report, plot)
         output.done(f"`{plot}` is drawn")
 
 
@@ -94,38 +90,35 @@ HEADER = (
 )
 
 
-def text(report: Report, *, colour: bool) -> list[str]:
-    """Return the table, with what independent replicas would reach below it."""
-    rows = [_cells(row) for row in report.rows]
-    lines = columns(HEADER, rows, right=HEADER[1:], colour=colour)
+def _show(report: Report) -> None:
+    """Print the table, with what independent replicas would reach below it."""
+    output.show(output.table(HEADER, map(_cells, report.rows), right=HEADER[1:]))
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "made up"
-    lines += [
-        "",
-        f"{report.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
-        f"{scenario.days:.4g} days.",
-    ]
+    output.data(
+        f"\n{report.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
+        f"{scenario.days:.4g} days."
+    )
     if report.expected is not None:
         moving, staying = (percent(report.expected[k]) for k in ("moving", "staying"))
-        lines.append(
+        output.data(
             f"If replicas failed independently: {moving} with replacement elsewhere, "
             f"{staying} where they stay."
         )
-    return lines
 
 
-def _cells(row: Row) -> list[Cell]:
+def _cells(row: Row) -> list[str | Text]:
     up, cost = row.estimate("available"), row.estimate("usd_per_hour")
     return [
-        Cell(row.name, "bold" if row.name == "fogft" else ""),
-        Cell(percent(up.mean)),
-        Cell(f"{percent(up.low)}-{percent(up.high)}", "dim"),
-        Cell(percent(row.estimate("under_target").mean)),
-        Cell(f"{cost.mean:.4f}"),
-        Cell(f"{cost.mean * 730:.0f}"),
-        Cell(f"{row.estimate('launches_per_day').mean:.1f}"),
-        Cell(f"{row.estimate('preemptions_per_day').mean:.1f}"),
-        Cell(duration(row.longest_outage_s)),
+        output.cell(row.name, "bold" if row.name == "fogft" else ""),
+        percent(up.mean),
+        output.cell(f"{percent(up.low)}-{percent(up.high)}", "dim"),
+        percent(row.estimate("under_target").mean),
+        f"{cost.mean:.4f}",
+        f"{cost.mean * 730:.0f}",
+        f"{row.estimate('launches_per_day').mean:.1f}",
+        f"{row.estimate('preemptions_per_day').mean:.1f}",
+        duration(row.longest_outage_s),
     ]
 
 

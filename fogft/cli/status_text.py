@@ -1,23 +1,27 @@
-"""How a pool's status looks: a line, a table of replicas, a table of services, notes.
+"""How a pool's status looks: a line, tables of replicas and services, who talks through whom.
 
 Owns: words, columns, units and styles.
-Not here: getting the status (`fogft.app`) and printing it (`watch`, `progress`).
+Not here: getting the status (`fogft.pool.commands.status`), printing it (`status`, `progress`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from fogft.cli.table import GAP, Cell, columns, milliseconds, with_remark
-from fogft.cli.tree_text import tree
+from fogft.cli.output import cell, table
 
 if TYPE_CHECKING:
+    from rich.console import Group, RenderableType
+    from rich.table import Table
+    from rich.text import Text
+    from rich.tree import Tree
+
     from fogft.pool.commands.status import Seen
     from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
 
-PHASES = {"provisioning": "soon", "starting": "soon", "ready": "good", "draining": "leaving"}
-LINKS = {"up": "good", "connecting": "soon", "suspect": "bad"}
+PHASES = {"provisioning": "yellow", "starting": "yellow", "ready": "green", "draining": "magenta"}
+LINKS = {"up": "green", "connecting": "yellow", "suspect": "bold red"}
 REPLICA_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "LINK", "RTT", "WON", "AGE")
 STARTING_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "AGE")
 SERVICE_COLUMNS = (
@@ -27,119 +31,171 @@ SERVICE_COLUMNS = (
 NUMBERS = ("$/H", "RTT", "WON", "AGE", *SERVICE_COLUMNS[1:])
 
 
-def rendered(seen: Seen, *, width: int, colour: bool) -> list[str]:
-    """Return the whole screen, line by line."""
+def rendered(seen: Seen, *, width: int) -> Group:
+    """Return the whole screen for lines of a width."""
     status = seen.status
-    lines = [headline(seen, colour=colour)]
     rows = [*status.replicas, *status.by_hand]
-    if rows:
-        lines += ["", *replicas(rows, REPLICA_COLUMNS, width=width, colour=colour)]
-    if status.services:
-        lines += ["", *services(status.services, colour=colour)]
-    drawn = tree(status.topology, colour=colour)
-    lines += ["", *drawn] if drawn else []
-    remarks = notes(status, colour=colour)
-    return [*lines, "", *remarks] if remarks else lines
+    parts: list[Sequence[RenderableType]] = [
+        [headline(seen)],
+        replicas(rows, REPLICA_COLUMNS, width=width),
+        [services(status.services)] if status.services else [],
+        topology(status.topology),
+        notes(status),
+    ]
+    return _lines([line for part in parts if part for line in ("", *part)][1:])
 
 
-def starting(status: PoolStatus, *, width: int, colour: bool) -> list[str]:
+def starting(status: PoolStatus, *, width: int) -> Group:
     """Return what `up` shows meanwhile: without what only matters later."""
-    lines = replicas(status.replicas, STARTING_COLUMNS, width=width, colour=colour)
-    return [*(lines if status.replicas else ()), *notes(status, colour=colour)]
+    return _lines([*replicas(status.replicas, STARTING_COLUMNS, width=width), *notes(status)])
 
 
-def headline(seen: Seen, *, colour: bool) -> str:
+def _lines(parts: Sequence[RenderableType]) -> Group:
+    from rich.console import Group
+
+    return Group(*parts)
+
+
+def headline(seen: Seen) -> Text:
     """Return the line on top: how many are ready, the price, and how old all this is."""
     status = seen.status
-    ready, target = status.ready, status.target
-    enough = "good" if ready >= target > 0 else "soon" if ready else "bad"
-    age_s = seen.age_s
-    cells = [
-        Cell(status.pool, "bold"),
-        Cell(f"{ready} of {target} ready", enough),
-        Cell(f"{price(status.usd_per_hour)}/h on {status.cloud}"),
-        Cell("not observed yet" if age_s is None else f"seen {age(age_s)} ago"),
-    ]
+    pool = cell(status.pool, "bold")
     if status.ended and not seen.manager_alive:
-        return GAP.join([Cell(status.pool, "bold").painted(colour=colour), f"ended {status.ended}"])
+        return _joined([pool, cell(f"ended {status.ended}")])
+    ready, target = status.ready, status.target
+    enough = "green" if ready >= target > 0 else "yellow" if ready else "bold red"
     alarms = {
         "NO MANAGER": not seen.manager_alive,
         "NO CLIENT PROXY": not status.proxy_alive,
         "UPLINK SUSPECTED": status.uplink_suspected,
         "ENDING": status.stopping,
     }
-    cells += [Cell(text, "bad") for text, sounds in alarms.items() if sounds]
-    return GAP.join(cell.painted(colour=colour) for cell in cells)
+    return _joined(
+        [
+            pool,
+            cell(f"{ready} of {target} ready", enough),
+            cell(f"{price(status.usd_per_hour)}/h on {status.cloud}"),
+            cell("not observed yet" if seen.age_s is None else f"seen {age(seen.age_s)} ago"),
+            *(cell(text, "bold red") for text, sounds in alarms.items() if sounds),
+        ]
+    )
 
 
-def notes(status: PoolStatus, *, colour: bool) -> list[str]:
+def _joined(words: Sequence[Text]) -> Text:
+    return cell("  ").join(words)
+
+
+def notes(status: PoolStatus) -> list[Text]:
     """Return the sentences below the tables."""
-    found = [*status.notes, *_orders(status.services)]
-    if status.excluded:
-        found.append(f"excluded: {', '.join(status.excluded)}")
-    return [f"{Cell('note:', 'note').painted(colour=colour)} {note}" for note in found]
-
-
-def _orders(rows: Sequence[ServiceStatus]) -> list[str]:
-    """Return which stateful services cannot be had, and why."""
-    found = []
-    for row in rows:
+    found = list(status.notes)
+    for row in status.services:
         order = row.counters.get("order") or {}
         if order.get("trouble"):
             found.append(f"`{row.name}` cannot be had: {order['trouble']}")
-    return found
+    if status.excluded:
+        found.append(f"excluded: {', '.join(status.excluded)}")
+    return [cell("note:", "bold cyan") + cell(f" {note}") for note in found]
 
 
 def replicas(
-    rows: Sequence[ReplicaStatus], names: Sequence[str], *, width: int, colour: bool
-) -> list[str]:
-    """Return the table of replicas; a detail stands behind its replica, or below it."""
-    cells = [[_of_replica(row)[name] for name in names] for row in rows]
-    # One more column, empty, so that lines are filled up where a detail follows.
-    header, *lines = columns([*names, ""], [[*row, Cell("")] for row in cells], right=NUMBERS,
-                             colour=colour)  # fmt: skip
-    plain = columns(names, cells, right=NUMBERS)
-    taken, indent = max(map(len, plain)), len(names[0]) + len(GAP)
-    found = [header]
-    for row, line in zip(rows, lines, strict=True):
-        found += with_remark(line, row.detail, taken=taken, width=width, indent=indent)
-    return found
+    rows: Sequence[ReplicaStatus], names: Sequence[str], *, width: int
+) -> list[RenderableType]:
+    """Return the table of replicas; details stand in it where there is room, else below it."""
+    from rich.console import Console
+
+    if not rows:
+        return []
+    cells = [[*map(_of_replica(row).__getitem__, names)] for row in rows]
+    details = [cell(row.detail) for row in rows]
+    if not any(details):
+        return [table(names, cells, right=NUMBERS)]
+    whole = table([*names, ""], [[*row, one] for row, one in zip(cells, details, strict=True)],
+                  right=NUMBERS)  # fmt: skip
+    if Console(width=1000).measure(whole).maximum <= width:
+        return [whole]
+    below = [(row[0], one) for row, one in zip(cells, details, strict=True) if one]
+    return [table(names, cells, right=NUMBERS), "", table(("", ""), below, titled=False)]
 
 
-def _of_replica(row: ReplicaStatus) -> dict[str, Cell]:
+def _of_replica(row: ReplicaStatus) -> dict[str, str | Text]:
     return {
-        "REPLICA": Cell(f"{row.slot}.{row.generation}"),
-        "PHASE": Cell(row.phase, PHASES.get(row.phase, "")),
-        "LOCATION": Cell(row.location),
-        "$/H": Cell(price(row.usd_per_hour).removeprefix("$")),
-        "LINK": Cell(row.link or "-", LINKS.get(row.link, "dim")),
-        "RTT": Cell(milliseconds(row.rtt_s)),
-        "WON": Cell(number(row.won)),
-        "AGE": Cell("-" if row.age_s is None else age(row.age_s)),
+        "REPLICA": f"{row.slot}.{row.generation}",
+        "PHASE": cell(row.phase, PHASES.get(row.phase, "")),
+        "LOCATION": row.location,
+        "$/H": price(row.usd_per_hour).removeprefix("$"),
+        "LINK": cell(row.link or "-", LINKS.get(row.link, "dim")),
+        "RTT": milliseconds(row.rtt_s),
+        "WON": number(row.won),
+        "AGE": "-" if row.age_s is None else age(row.age_s),
     }
 
 
-def services(rows: Sequence[ServiceStatus], *, colour: bool) -> list[str]:
+def services(rows: Sequence[ServiceStatus]) -> Table:
     """Return the table of services and what became of their requests."""
-    cells = []
+    cells: list[list[str | Text]] = []
     for row in rows:
         count = row.counters
         unanswered = sum(count.get(key, 0) for key in ("silent", "empty", "turned_away"))
         cells.append(
             [
-                Cell(row.name),
-                Cell(number(row.ready_replicas), "" if row.ready_replicas else "bad"),
-                Cell(number(count.get("received", 0))),
-                Cell(number(count.get("answered", 0))),
-                Cell(number(count.get("fallback", 0))),
-                Cell(number(unanswered), "bad" if unanswered else ""),
-                Cell(number(count.get("late", 0))),
-                Cell(number(count.get("pending", 0))),
-                Cell(milliseconds(count.get("p50_s"))),
-                Cell(milliseconds(count.get("p99_s"))),
+                row.name,
+                cell(number(row.ready_replicas), "" if row.ready_replicas else "bold red"),
+                number(count.get("received", 0)),
+                number(count.get("answered", 0)),
+                number(count.get("fallback", 0)),
+                cell(number(unanswered), "bold red" if unanswered else ""),
+                number(count.get("late", 0)),
+                number(count.get("pending", 0)),
+                milliseconds(count.get("p50_s")),
+                milliseconds(count.get("p99_s")),
             ]
         )
-    return columns(SERVICE_COLUMNS, cells, right=NUMBERS, colour=colour)
+    return table(SERVICE_COLUMNS, cells, right=NUMBERS)
+
+
+def topology(drawn: Mapping[str, Any]) -> list[RenderableType]:
+    """Return who talks through whom, a tree for each robot; nothing where there are no gateways.
+
+    How a link does is known for this machine's robot only, and for its own gateways.
+    """
+    if not drawn:
+        return []
+    from rich.tree import Tree
+
+    gateways = {one["name"]: one for one in drawn["gateways"]}
+    # Of several links to a gateway, such as of two generations, the one that is up counts.
+    links = {one["name"]: one for one in sorted(drawn["links"], key=lambda x: x["state"] == "up")}
+    here, named = drawn["robot"], drawn["robots"]
+    robots = {here or "this robot": named.get(here, drawn["through"])}
+    robots |= {name: through for name, through in named.items() if name != here}
+
+    def below(tree: Tree, through: Sequence[str], links: Mapping[str, Any]) -> Tree:
+        for name in through:
+            branch = tree.add(_gateway(gateways[name], links.get(name)))
+            below(branch, gateways[name]["through"], {})
+        if not through:
+            tree.add("replicas")
+        return tree
+
+    trees: list[RenderableType] = [cell("TOPOLOGY", "bold")]
+    for at, (robot, through) in enumerate(robots.items()):
+        trees.append(below(Tree(cell(f"robot {robot}")), through, {} if at else links))
+    if here and drawn["through"] and len(robots) > 1:
+        trees.append(below(Tree("all other robots"), drawn["through"], {}))
+    return trees
+
+
+def _gateway(gateway: Mapping[str, Any], link: Mapping[str, Any] | None) -> Text:
+    words = [cell(f"gateway {gateway['name']}"), cell(gateway["endpoint"])]
+    if not gateway["generations"]:
+        words.append(cell("no certificate", "bold red"))
+    if link is not None:
+        words.append(cell(link["state"], LINKS.get(link["state"], "")))
+        if link["rtt_s"] is not None and link["state"] == "up":
+            words.append(cell(milliseconds(link["rtt_s"])))
+        if link["detail"]:
+            words.append(cell(link["detail"]))
+    return _joined(words)
 
 
 def price(usd: float) -> str:
@@ -150,6 +206,16 @@ def price(usd: float) -> str:
 def number(value: int) -> str:
     """Return a count with its thousands apart."""
     return f"{value:,}".replace(",", " ")
+
+
+def milliseconds(seconds: float | None) -> str:
+    """Return a short duration with three digits: ``0.42 ms``, ``12.3 ms``, ``1.20 s``."""
+    if seconds is None:
+        return "-"
+    if seconds >= 1:
+        return f"{seconds:.2f} s"
+    value = seconds * 1000
+    return f"{value:.{2 if value < 10 else 1 if value < 100 else 0}f} ms"
 
 
 def age(seconds: float) -> str:

@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fogft.cli import output
-from fogft.cli.sections import Command
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
-    from fogft.app.sweeping import Swept
-
-
-def register(app: typer.Typer) -> None:
-    """Add this command to the application."""
-    app.command("sweep", cls=Command)(sweep)
+    from fogft.pool.commands.sweep import Swept
 
 
 def sweep(
@@ -44,9 +38,9 @@ def sweep(
     Example:
       fogft sweep
     """
-    from fogft import app
+    from fogft.pool.commands.sweep import clouds_used, end_found, sweep_cloud
 
-    found = [app.sweep(name) for name in ([cloud] if cloud else app.clouds_to_sweep())]
+    found = [sweep_cloud(name) for name in ([cloud] if cloud else clouds_used())]
     for one in found:
         _show(one)
     unowned = [machine for one in found for machine in one.unowned]
@@ -64,7 +58,7 @@ def sweep(
     if not yes and not output.confirm(f"end {len(unowned)}?"):
         output.say("nothing was done")
         raise typer.Exit(1)
-    problems = [problem for one in found for problem in app.end_unowned(one, output.say)]
+    problems = [problem for one in found for problem in end_found(one, output.say)]
     if problems:
         hints = dict.fromkeys(problem.hint for problem in problems if problem.hint)
         raise FogftError("\n".join(problem.message for problem in problems), "; ".join(hints))
@@ -90,4 +84,4 @@ def _show(found: Swept) -> None:
         for one in found.unowned
     ]
     if rows:
-        output.data(output.aligned(rows))
+        output.show(output.table([""] * 5, rows, titled=False))

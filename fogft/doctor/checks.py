@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
-from fogft.doctor import leftovers, machine, pools, ros
-from fogft.doctor.finding import Check
+from collections.abc import Iterator
+from pathlib import Path
+
+from fogft.doctor import finding, leftovers, machine, pools, ros
+from fogft.doctor.finding import Check, Finding
+from fogft.pool.folder import known_pools
+from fogft.pool.folder.paths import home
+from fogft.poolfile.file import read
 
 ALL: tuple[Check, ...] = (*machine.CHECKS, *ros.CHECKS, *leftovers.CHECKS, *pools.CHECKS)
+
+
+def examine(file: Path | None = None) -> Iterator[Finding]:
+    """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come.
+
+    Raises:
+        SpecError: The first mistake in the pool file.
+    """
+    spec = None if file is None else read(file)
+    yield from finding.run(ALL, finding.situation(home(), known_pools.names(home()), spec))

@@ -4,7 +4,7 @@ Needs ROS 2's `launch` and `launch_ros`, which are loaded when a name is first u
 
     from fogft.launch import CloudNode, FogPool
 
-Not here: what starting and ending a pool means (`fogft.app`).
+Not here: what starting and ending a pool means (`fogft.pool.commands`).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.cli import complete
+from fogft.cli import options
 from tests.cli.pools import STATUS, lay_down
 
 
@@ -57,7 +57,7 @@ def test_what_cannot_be_known_is_not_offered(home):
     paths.status.write_text("{")
     paths.intent.write_text("{")
     assert offered("drain", "") == []
-    assert complete.excluded("") == []
+    assert options.excluded("") == []
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -16,6 +16,7 @@ import pytest
 from fogft.cli import main
 from fogft.model import names
 from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.pool.commands import composition
 from fogft.pool.credentials import authority, bundle
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
@@ -109,9 +110,7 @@ def test_revoking_what_is_known_to_all_says_so(paths, capsys):
     issue_ada(capsys)
     revoked = frozenset({names.robot_certificate_name(UID, "ada")})
     membership = Membership("planner", UID, 1, 1, (Member(ReplicaId(UID, 0, 1), "h:1"),), revoked)
-    from fogft import app
-
-    app.make_store("planner").write_membership(membership)
+    composition.make_store("planner").write_membership(membership)
     assert run("credentials", "revoke", "robot", "ada") == 0
     assert "is let in no more" in capsys.readouterr().err
     assert Ledger(paths.credentials).revoked() == revoked

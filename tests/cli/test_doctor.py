@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from fogft import app, disk
+from fogft import disk
 from fogft.cli import main
-from fogft.cli.doctor import text
 from fogft.cloud.local import faults
 from fogft.cloud.local.faults import CloudFaults
 from fogft.doctor import checks, finding, leftovers, machine, pools, ros
@@ -48,16 +47,20 @@ def folder(tmp_path: Path) -> Path:
 # --- its text
 
 
-def test_a_finding_is_a_line_and_its_advice_another():
-    assert text(ok("clock", "2026-11-21")) == "ok    clock               2026-11-21"
-    assert text(warn("ports", "7447 is taken", "free it")) == (
-        "warn  ports               7447 is taken\n                          -> free it"
-    )
+def test_a_finding_is_a_line_and_its_advice_another(monkeypatch, capsys):
+    findings = [ok("clock", "2026-11-21"), warn("ports", "7447 is taken", "free it")]
+    monkeypatch.setattr(checks, "examine", lambda _: iter(findings))
+    assert main.run(["doctor"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "ok    clock               2026-11-21",
+        "warn  ports               7447 is taken",
+        "                          -> free it",
+    ]
 
 
 def test_it_fails_when_something_does_not_work(monkeypatch, capsys):
     findings = [ok("a", "fine"), warn("b", "odd", "look"), fail("c", "broken", "mend")]
-    monkeypatch.setattr(app, "doctor", lambda _: iter(findings))
+    monkeypatch.setattr(checks, "examine", lambda _: iter(findings))
     assert main.run(["doctor"]) == 1
     said = capsys.readouterr()
     assert said.err == "\n3 checks: 1 failed, 1 to look at\n"
@@ -66,7 +69,7 @@ def test_it_fails_when_something_does_not_work(monkeypatch, capsys):
 
 
 def test_warnings_alone_are_no_failure(monkeypatch, capsys):
-    monkeypatch.setattr(app, "doctor", lambda _: iter([warn("b", "odd", "look")]))
+    monkeypatch.setattr(checks, "examine", lambda _: iter([warn("b", "odd", "look")]))
     assert main.run(["doctor", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [
         {"check": "b", "verdict": "warn", "text": "odd", "advice": "look"}

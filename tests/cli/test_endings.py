@@ -9,16 +9,16 @@ import sys
 
 import pytest
 
-from fogft import app
 from fogft.cli import main
 from fogft.errors import PoolNotFound
+from fogft.pool.commands import composition
 
 
 def run_failing(monkeypatch: pytest.MonkeyPatch, problem: BaseException) -> int:
     def fail(*_: object) -> None:
         raise problem
 
-    monkeypatch.setattr(app, "pool_name", fail)
+    monkeypatch.setattr(composition, "store_of", fail)
     return main.run(["drain", "0"])
 
 
@@ -124,8 +124,8 @@ def test_a_reader_that_left_gets_no_trace():
 def test_control_c_while_it_waits_is_one_line(tmp_path):
     """A real SIGINT to a real process: one line, status 130, no trace."""
     code = (
-        "import time; from fogft import app; from fogft.cli import main\n"
-        "app.pool_name = lambda name: (print('waiting', flush=True), time.sleep(60))\n"
+        "import time; from fogft.cli import main; from fogft.pool.commands import composition\n"
+        "composition.store_of = lambda name: (print('waiting', flush=True), time.sleep(60))\n"
         "main.main(['drain', '0'])"
     )
     with subprocess.Popen(

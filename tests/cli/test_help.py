@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from fogft.cli import main
-from fogft.cli.sections import SECTIONS
+from fogft.cli.commands import SECTIONS
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "commands.md"
 

@@ -24,7 +24,7 @@ def loaded(code: str) -> set[str]:
     "code",
     [
         "import fogft",
-        "import fogft.app",
+        "import fogft.pool.commands.composition",
         "import fogft.cli.main",
         "from fogft.cli import main; assert main.run(['--help']) == 0",
         "from fogft.cli import main; assert main.run(['up', '--help']) == 0",

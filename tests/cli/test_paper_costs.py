@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft import app
+from fogft.pool.commands.plan import plan_file
 
 ROOT = Path(__file__).parents[2]
 TABLE = ROOT / "fogft" / "cloud" / "table" / "paper.csv"
@@ -34,7 +34,7 @@ def cost(tmp_path: Path, asks: str, replicas: int, *, spot: bool) -> float:
         "fogft:\n  services: [{name: /plan, type: nav_msgs/srv/GetPlan}]\n"
         f"  replicas: {replicas}\n"
     )
-    shown = app.plan(file, prices=TABLE, offline=True)
+    shown = plan_file(file, prices=TABLE, offline=True)
     assert len(shown.explanation.replicas) == replicas
     return shown.explanation.cost.usd_per_hour
 
@@ -57,7 +57,7 @@ def test_a_row_is_reproduced_and_each_difference_marked(row, tmp_path):
 
 def test_two_replicas_are_in_the_papers_two_regions(tmp_path):
     cost(tmp_path, "cpus: 32", 2, spot=True)
-    shown = app.plan(tmp_path / "pool.yaml", prices=TABLE, offline=True)
+    shown = plan_file(tmp_path / "pool.yaml", prices=TABLE, offline=True)
     assert {r.offer.placement.region for r in shown.explanation.replicas} == {
         "us-west-1",
         "us-west-2",

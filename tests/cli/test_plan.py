@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from fogft import app
 from fogft.cli import main
-from fogft.pool.commands import startup
+from fogft.pool.commands import composition, preview, startup
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import traffic
 
@@ -46,9 +45,9 @@ def test_the_plan_is_what_up_would_launch(pool, capsys):
     """The same planner: the places shown are those that `fogft up` announces."""
     assert main.run(["plan", str(pool), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
-    announced = app.order(pool).preview.launches
+    announced = preview.order(pool).preview.launches
     assert [(r["slot"], r["usd_per_hour"]) for r in shown["replicas"]] == [
-        (launch.slot, launch.usd_per_hour) for launch in announced
+        (launch.slot, launch.offer.usd_per_hour) for launch in announced
     ]
     assert not PoolPaths.of("planner").folder.exists()
 
@@ -97,8 +96,8 @@ def test_egress_is_what_leaves_every_replica(pool, tmp_path, capsys):
 def test_egress_is_measured_where_it_is_not_stated(pool, tmp_path, capsys):
     """1000 requests in 100 s with responses of 100 kB: as if the file had said 10 a second."""
     pool.write_text(re.sub(r",\s*traffic: {[^}]*}", "", POOL))
-    order = app.order(pool)
-    store = app.make_store("planner")
+    order = preview.order(pool)
+    store = composition.make_store("planner")
     startup.write(store, order.spec, source=order.source, file=pool, cloud="local")
     count = {"received": 1000, "answered": 500, "request_bytes": 5e5, "response_bytes": 5e7}
     report = {
@@ -153,10 +152,10 @@ def test_a_report_that_says_nothing_is_not_guessed_from(tmp_path, report):
 
 def test_losses_of_the_pool_are_shown(pool, capsys):
     """History of a pool that exists counts: a place that lost a replica is avoided, and says so."""
-    order = app.order(pool)
-    store = app.make_store("planner")
+    order = preview.order(pool)
+    store = composition.make_store("planner")
     startup.write(store, order.spec, source=order.source, file=pool, cloud="local")
-    place = order.preview.launches[0].location
+    place = order.preview.launches[0].offer.placement.location
     now = time.time()
     with store.paths.history.open("a") as lines:
         for at, event in ((now - 200, "launch"), (now - 190, "ready"), (now - 60, "gone")):

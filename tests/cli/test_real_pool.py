@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from fogft import app
 from fogft.cloud.local import processes
+from fogft.pool.commands import composition
+from fogft.pool.commands.status import read
 from tests.cli.pools import lay_down
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
@@ -51,7 +52,7 @@ def wait_for(look: Callable[[], dict], good: Callable[[dict], bool]) -> dict:
 
 def test_a_pool_from_init_to_down(fogft, home, tmp_path):
     def look() -> dict:
-        return app.status("echo").to_json()
+        return read(composition.paths_of("echo"), time.time()).to_json()
 
     def ready(status: dict) -> dict[int, int]:
         return {r["slot"]: r["generation"] for r in status["replicas"] if r["phase"] == "ready"}

@@ -14,8 +14,7 @@ import pytest
 
 from fogft import disk
 from fogft.cli import main
-from fogft.cli.status_text import age, number
-from fogft.cli.table import milliseconds
+from fogft.cli.status_text import age, milliseconds, number
 from fogft.pool.manager.status import PoolStatus
 from tests.cli.pools import FILE, STATUS, lay_down
 
@@ -25,9 +24,10 @@ planner  1 of 3 ready  $0.063/h on local  seen 0.4 s ago
 REPLICA  PHASE     LOCATION                $/H  LINK            RTT    WON    AGE
 0.1      ready     local/us-west-2/a     0.021  up          0.42 ms  1 412  7 min
 1.12     starting  local/eu-central-1/b  0.020  connecting        -      0  4.2 s
-         `/plan` is not up yet
 2.3      draining  local/us-west-2/a     0.021  suspect      1.25 s      7   26 h
-         silent for 17 s, and so it is replaced by another one elsewhere
+
+1.12  `/plan` is not up yet
+2.3   silent for 17 s, and so it is replaced by another one elsewhere
 
 SERVICE  READY  REQUESTS  ANSWERED  FALLBACK  UNANSWERED   LATE  WAITING      P50     P99
 /plan        1     1 424     1 416         3           5  2 801        2  21.3 ms  148 ms

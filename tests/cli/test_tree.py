@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from fogft.cli.tree_text import tree
+from fogft.cli import output
+from fogft.cli.status_text import topology
 
 
 def gateway(name, through=(), generations=(1,)):
@@ -11,12 +12,12 @@ def gateway(name, through=(), generations=(1,)):
 
 
 def test_a_pool_without_gateways_draws_nothing():
-    assert tree({}, colour=False) == []
+    assert topology({}) == []
 
 
-def test_robots_gateways_and_what_lies_behind():
+def test_robots_gateways_and_what_lies_behind(capsys):
     """This robot's links with their state; others' and deeper ones without: nobody here knows."""
-    topology = {
+    seen = {
         "robot": "ada",
         "gateways": [gateway("edge"), gateway("lab", ["edge"], [])],
         "robots": {"bob": []},
@@ -26,20 +27,21 @@ def test_robots_gateways_and_what_lies_behind():
             {"name": "edge", "generation": 2, "state": "up", "rtt_s": 0.0012, "detail": ""},
         ],
     }
-    assert tree(topology, colour=False) == [
+    output.show(*topology(seen))
+    assert capsys.readouterr().out.splitlines() == [
         "TOPOLOGY",
         "robot ada",
-        "├─ gateway edge  edge:7470  up  1.20 ms",
-        "│  └─ replicas",
-        "└─ gateway lab  lab:7470  no certificate",
-        "   └─ gateway edge  edge:7470",
-        "      └─ replicas",
+        "├── gateway edge  edge:7470  up  1.20 ms",
+        "│   └── replicas",
+        "└── gateway lab  lab:7470  no certificate",
+        "    └── gateway edge  edge:7470",
+        "        └── replicas",
         "robot bob",
-        "└─ replicas",
+        "└── replicas",
         "all other robots",
-        "├─ gateway edge  edge:7470",
-        "│  └─ replicas",
-        "└─ gateway lab  lab:7470  no certificate",
-        "   └─ gateway edge  edge:7470",
-        "      └─ replicas",
+        "├── gateway edge  edge:7470",
+        "│   └── replicas",
+        "└── gateway lab  lab:7470  no certificate",
+        "    └── gateway edge  edge:7470",
+        "        └── replicas",
     ]

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from fogft import app, disk
+from fogft import disk
 from fogft.cli import main, progress
-from fogft.cli.lifecycle import is_answering
 from fogft.errors import FogftError, SpecError
 from fogft.planning.rollout import Trial
-from fogft.pool.commands.status import Seen
+from fogft.pool.commands import composition, init, preview, startup
+from fogft.pool.commands.outcome import Awaited, Outcome
+from fogft.pool.commands.status import Seen, refreshed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from tests.cli.pools import REPLICA, SPEC, STATUS, lay_down
@@ -34,15 +35,15 @@ def file(tmp_path: Path) -> Path:
 def looks(monkeypatch: pytest.MonkeyPatch):
     """Have `up` start nothing and see one status after the other."""
 
-    def script(*statuses: object, started: bool = True) -> None:
-        left = iter(statuses)
+    def script(*shown: object, started: bool = True) -> None:
+        left = iter(shown)
 
-        def look(_: str) -> Seen:
+        def look(*_: object) -> Seen:
             status = next(left)
             return status if isinstance(status, Seen) else Seen(status, 0.1, True)
 
-        monkeypatch.setattr(app, "start", lambda _: started)
-        monkeypatch.setattr(app, "status", look)
+        monkeypatch.setattr(startup, "start", lambda _: started)
+        monkeypatch.setattr("fogft.pool.commands.status.read", look)
         monkeypatch.setattr(progress, "LOOK_EVERY_S", 0.0)
 
     return script
@@ -141,10 +142,10 @@ def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, capsy
 def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
     looks()
 
-    def interrupt(_: str) -> Seen:
+    def interrupt(*_: object) -> Seen:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(app, "status", interrupt)
+    monkeypatch.setattr("fogft.pool.commands.status.read", interrupt)
     assert main.run(["up", str(file)]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "interrupted: `planner` goes on starting; `fogft down planner` ends it"
@@ -162,7 +163,8 @@ def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
     ],
 )
 def test_when_a_pool_answers(status, answers):
-    assert is_answering(Seen(status, 0.1, True), {"/plan"}, since=10.0) is answers
+    outcome = Awaited(frozenset({"/plan"}), since=10.0).outcome(Seen(status, 0.1, True))
+    assert outcome is (Outcome.ANSWERING if answers else Outcome.PENDING)
 
 
 # --- what is refused, and changes nothing
@@ -321,19 +323,19 @@ OWN_TYPES = {
 }
 
 
-@pytest.mark.parametrize("name", [name for name in app.examples() if name not in OWN_TYPES])
+@pytest.mark.parametrize("name", [name for name in init.examples() if name not in OWN_TYPES])
 def test_every_example_is_a_good_pool_file(tmp_path, name):
-    files = app.init(name, tmp_path / name)
-    preview = app.order(files[0]).preview
-    assert len(preview.launches) == preview.spec.replicas
-    assert preview.notes == ()
+    files = init.copy_example(name, tmp_path / name)
+    found = preview.order(files[0]).preview
+    assert len(found.launches) == found.spec.replicas
+    assert found.notes == ()
 
 
 @pytest.mark.parametrize(("name", "package"), OWN_TYPES.items())
 def test_an_example_with_a_type_of_its_own_asks_for_its_workspace(tmp_path, name, package):
-    files = app.init(name, tmp_path / name)
+    files = init.copy_example(name, tmp_path / name)
     with pytest.raises(SpecError, match=f"no package `{package}`") as caught:
-        app.order(files[0])
+        preview.order(files[0])
     assert "workspace sourced?" in caught.value.hint
 
 
@@ -403,13 +405,13 @@ def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
     paths = lay_down(home)
     with disk.locked(paths.manager_lock):
         with pytest.raises(FogftError, match="did not look again"):
-            app.refresh("planner", limit_s=0.2)
+            refreshed(composition.make_store("planner"), limit_s=0.2)
 
 
 def test_a_schedule_that_wants_nobody_now_is_no_failure():
     """`up` of a pool that sleeps at night does not wait for the morning."""
     status = replace(UP, target=0, ready=0, replicas=(), observed_at=20.0)
-    assert is_answering(Seen(status, 0.1, True), {"/plan"}, since=10.0)
-    assert not is_answering(
-        Seen(replace(status, observed_at=5.0), 0.1, True), {"/plan"}, since=10.0
-    )
+    awaited = Awaited(frozenset({"/plan"}), since=10.0)
+    assert awaited.outcome(Seen(status, 0.1, True)) is Outcome.ANSWERING
+    earlier = Seen(replace(status, observed_at=5.0), 0.1, True)
+    assert awaited.outcome(earlier) is Outcome.PENDING

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from fogft import app
 from fogft.cli import main, progress
 from fogft.cloud import sky
 from fogft.errors import CloudUnreachable
+from fogft.pool.commands import startup
 from fogft.pool.commands.status import Seen
 from tests.cli.pools import SPEC, lay_down
 from tests.cli.test_up import UP
@@ -51,8 +51,9 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
 def started(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     """What `up` has started; the pool answers at once."""
     started: list[object] = []
-    monkeypatch.setattr(app, "start", lambda order: bool(started.append(order)) or True)
-    monkeypatch.setattr(app, "status", lambda _: Seen(replace(UP, cloud="sky"), 0.1, True))
+    monkeypatch.setattr(startup, "start", lambda order: bool(started.append(order)) or True)
+    seen = Seen(replace(UP, cloud="sky"), 0.1, True)
+    monkeypatch.setattr("fogft.pool.commands.status.read", lambda *_: seen)
     monkeypatch.setattr(progress, "LOOK_EVERY_S", 0.0)
     return started
 

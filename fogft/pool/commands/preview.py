@@ -6,41 +6,27 @@ Not here: doing it (`startup`) and saying it (`fogft.cli`).
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fogft.cloud.port import Accounts, Cloud
+from fogft.cloud.port import Accounts
 from fogft.errors import CloudError, PoolNotFound, SpecError
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
+from fogft.planning.buying import PlannedLaunch
 from fogft.planning.observed.history import History
 from fogft.planning.planner import plan
 from fogft.planning.rollout import has_room
+from fogft.pool.commands.composition import cloud_named_by, make_cloud, make_store
+from fogft.pool.commands.plan import far
 from fogft.pool.folder.store import PoolStore, digest
 from fogft.pool.manager import offers
 from fogft.poolfile.changes import changes, replaces_replicas
+from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import clouds_named, located
-
-Far = Callable[[PoolSpec, Sequence[Offer]], Mapping[str, float]]
-# What an age is told in: the unit, its length, and from which age on.
-_UNITS = (("days", 86400.0, 2 * 86400.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
-
-
-@dataclass(frozen=True)
-class PreviewedLaunch:
-    """Where a replica would go now, and what it would cost there.
-
-    Attributes:
-        price: Where the price comes from and how old it is, in words; empty where it is made up.
-    """
-
-    slot: int
-    location: str
-    instance: str
-    usd_per_hour: float
-    price: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,6 +36,7 @@ class Preview:
     Attributes:
         wanted: Replicas wanted now: the file's number, or what follows from it.
         launches: Of a new pool; by slot. Of one that exists: what it would get if it were new.
+        observed_at: When the launches' prices were asked for, in seconds since the epoch.
         costs_money: Its machines are paid for: nothing is ordered unasked.
         accounts: Of each cloud whose credentials were tested: empty, or what is wrong.
         changes: Of a pool that exists: what the file now says otherwise, in words.
@@ -62,7 +49,8 @@ class Preview:
     cloud: str
     is_new: bool
     wanted: int = 0
-    launches: tuple[PreviewedLaunch, ...] = ()
+    launches: tuple[PlannedLaunch, ...] = ()
+    observed_at: float = 0.0
     changes: tuple[str, ...] = ()
     replaces_replicas: bool = False
     new_before_old: bool = True
@@ -74,7 +62,7 @@ class Preview:
     @property
     def usd_per_hour(self) -> float:
         """What the launches cost together."""
-        return sum(launch.usd_per_hour for launch in self.launches)
+        return sum(launch.offer.usd_per_hour for launch in self.launches)
 
 
 @dataclass(frozen=True)
@@ -97,50 +85,55 @@ class Order:
 
 
 def order(
-    store: PoolStore,
-    cloud: Cloud,
-    spec: PoolSpec,
-    *,
-    cloud_name: str,
-    source: str,
-    file: Path,
-    now: float = 0.0,
-    far: Far = lambda spec, sold: spec.placement.rtt_s,
+    file: Path, cloud: str | None = None, *, told: Callable[[str], None] = lambda _: None
 ) -> Order:
-    """Return what applying a pool file would do. Changes nothing.
+    """Read and judge a pool file, and find out what applying it would do. Changes nothing.
 
     Args:
-        store: The pool's folder, which may not exist yet.
-        cloud: Where the pool shall run.
-        spec: The file, read.
-        cloud_name: The cloud's name.
-        source: The file's text.
-        file: Where it is.
-        now: Seconds since the epoch.
-        far: Says how far the regions of offers are: ``cloud/region`` -> seconds.
+        file: The pool file.
+        cloud: Where to run it; None for what its resources name, else `local`.
+        told: Called with what takes long, before it is done.
 
     Raises:
-        SpecError: The cloud can never meet the file's resources.
-        CloudError: A new pool, and none of the clouds that it names can be used.
+        SpecError: The first mistake in the file, or the cloud can never meet its resources.
+        CloudError: There is no such cloud, or a new pool cannot use any that it names.
     """
-    before, rolled_back = _before(store, source)
+    from fogft.ros.comparison import check_tolerances
+    from fogft.ros.state_bytes import check_state
+    from fogft.ros.types import check_ok_field, check_type
+
+    source = read_text(file)
+    spec = parse(
+        source,
+        file=str(file),
+        check_types=check_type,
+        check_fields=check_ok_field,
+        check_states=check_state,
+        check_tolerances=check_tolerances,
+        folder=file.parent,
+    )
+    cloud_name = cloud or cloud_named_by(spec, source, file)
+    concrete = make_cloud(cloud_name, file.resolve().parent)
+    before, rolled_back = _before(make_store(spec.name), source)
     notes: list[str] = []
     accounts: Mapping[str, str] = {}
-    if isinstance(cloud, Accounts):
-        try:
-            cloud.check_task(spec.task)
-        except SpecError as error:
-            raise located(error, source, file) from None
-        accounts, found = _tested(cloud, clouds_named(spec), may_fail=before is not None)
-        notes += found
     sold: tuple[Offer, ...] = ()
     try:
-        sold = offers.ask(cloud, spec)
+        if isinstance(concrete, Accounts):
+            told("asking SkyPilot which clouds can be used, and for their prices")
+            concrete.check_task(spec.task)
+            accounts, found = _tested(concrete, clouds_named(spec), may_fail=before is not None)
+            notes += found
+        try:
+            sold = offers.ask(concrete, spec)
+        except CloudError as error:
+            notes.append(f"prices cannot be had now: {error.message}")
     except SpecError as error:
         raise located(error, source, file) from None
-    except CloudError as error:
-        notes.append(f"prices cannot be had now: {error.message}")
-    observed = Observed(now, (), None, sold, rtt_s=far(spec, sold))
+    known, _ = far(spec, sold, told=told)
+    rtt_s = {region: distance.rtt_s for region, distance in known.items()}
+    now = time.time()
+    observed = Observed(now, (), None, sold, rtt_s=rtt_s)
     planned = plan("0" * 16, spec, Intent(), observed, History())
     replaces = before is not None and not rolled_back and replaces_replicas(before, spec)
     usd_per_hour = sum(launch.offer.usd_per_hour for launch in planned.launches)
@@ -150,13 +143,14 @@ def order(
         cloud_name,
         is_new=before is None,
         wanted=planned.wanted,
-        launches=tuple(_launch(launch.slot, launch.offer, now) for launch in planned.launches),
+        launches=tuple(planned.launches),
+        observed_at=now,
         changes=() if before is None or rolled_back else tuple(changes(before, spec)),
         replaces_replicas=replaces,
         new_before_old=has_room(spec, usd_per_hour, cheapest),
         rolled_back=rolled_back,
         notes=(*notes, *(planned.notes if before is None and sold else ())),
-        costs_money=isinstance(cloud, Accounts),
+        costs_money=isinstance(concrete, Accounts),
         accounts=accounts,
     )
     return Order(preview, source, file)
@@ -191,25 +185,3 @@ def _tested(
             "set one up as `sky check` says, or try the pool on this machine with `--cloud local`",
         )
     return accounts, [reason for name in usable if (reason := cloud.unverified(name))]
-
-
-def _launch(slot: int, offer: Offer, now: float) -> PreviewedLaunch:
-    place = offer.placement
-    return PreviewedLaunch(
-        slot, place.location, place.instance, offer.usd_per_hour, price_told(offer, now)
-    )
-
-
-def price_told(offer: Offer, now: float) -> str:
-    """Return where an offer's price comes from and how old it is, in words."""
-    if not offer.source or not offer.as_of:
-        return offer.source
-    return f"{offer.source}, {age_told(now - offer.as_of)} old"
-
-
-def age_told(seconds: float) -> str:
-    """Return an age in its one largest unit, in words: ``3 s``, ``5 min``, ``7 h``, ``2 days``."""
-    for unit, length_s, from_s in _UNITS:
-        if seconds >= from_s:
-            return f"{seconds / length_s:.0f} {unit}"
-    return f"{max(0.0, seconds):.0f} s"

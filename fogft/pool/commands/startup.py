@@ -24,8 +24,11 @@ from fogft.model import intent
 from fogft.model.intent import Intent
 from fogft.model.spec import PoolSpec
 from fogft.planning import lifetime
+from fogft.pool.commands.composition import make_store
+from fogft.pool.commands.preview import Order
 from fogft.pool.credentials import authority
 from fogft.pool.folder.lease import read_pid
+from fogft.pool.folder.paths import home
 from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
 from fogft.pool.manager import process_control
 
@@ -44,6 +47,18 @@ class Written:
     identity: Identity
     created: bool
     changed: bool
+
+
+def start(order: Order) -> bool:
+    """Create the pool or apply the changed file; return whether a manager had to be started.
+
+    Raises:
+        FogftError: The pool is another one's, is being ended, or its manager did not start.
+    """
+    disk.make_folder(home())
+    store, cloud = make_store(order.spec.name), order.preview.cloud
+    write(store, order.spec, source=order.source, file=order.file.resolve(), cloud=cloud)
+    return start_manager(store)
 
 
 def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: str) -> Written:

@@ -89,6 +89,24 @@ def renewed(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.
         time.sleep(_LOOK_EVERY_S)
 
 
+def refreshed(store: PoolStore, limit_s: float = 15.0) -> Seen:
+    """Have the manager look again; without one, ask the cloud and the client proxy's report.
+
+    Raises:
+        StateError: The manager did not look again within `limit_s`.
+    """
+    from fogft.pool.commands.composition import cloud_of
+
+    if disk.is_locked(store.paths.manager_lock):
+        return renewed(store.paths, limit_s)
+    return ask(store, cloud_of(store.identity()), time.time())
+
+
+def slots(paths: PoolPaths) -> list[int]:
+    """Return the slots that hold a replica, sorted."""
+    return sorted({replica.slot for replica in read(paths, time.time()).status.replicas})
+
+
 def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
     """Look at the cloud and at the client proxy's report, without a manager.
 

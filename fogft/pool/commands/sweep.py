@@ -18,8 +18,9 @@ from fogft import disk
 from fogft.cloud.port import Audit, Auditing, Cloud
 from fogft.errors import CloudError, FogftError, PoolNotFound
 from fogft.model.replica import Machine
+from fogft.pool.commands.composition import LOCAL, SKY, make_cloud
 from fogft.pool.folder import known_pools
-from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import read_identity
 
 
@@ -35,6 +36,39 @@ class Unowned:
     machine: Machine
     pool: str
     why: str
+
+
+@dataclass(frozen=True)
+class Swept:
+    """What was found in one cloud.
+
+    Attributes:
+        cloud: Its name, one of `composition.CLOUDS`.
+        asked: Clouds whose own list was read.
+    """
+
+    cloud: str
+    unowned: Sequence[Unowned]
+    asked: frozenset[str]
+
+
+def clouds_used() -> list[str]:
+    """Return the clouds where this user's machines can be, as far as is known here."""
+    return [LOCAL, *([SKY] if (home() / SKY).exists() else [])]
+
+
+def sweep_cloud(cloud: str) -> Swept:
+    """Return the machines of this user's pools in a cloud that no manager owns.
+
+    Raises:
+        CloudUnreachable: It cannot tell what exists.
+        CloudError: There is no such cloud, or it is not usable here.
+    """
+    concrete = make_cloud(cloud, Path.cwd())
+    if not isinstance(concrete, Auditing):
+        raise FogftError(f"cloud `{cloud}` cannot be swept")
+    unowned, audit = find(concrete, home())
+    return Swept(cloud, unowned, audit.asked)
 
 
 def find(cloud: Auditing, root: Path) -> tuple[list[Unowned], Audit]:
@@ -57,6 +91,11 @@ def find(cloud: Auditing, root: Path) -> tuple[list[Unowned], Audit]:
             why = f"pool `{pool}` has no manager" if pool else f"no pool of this uid in `{root}`"
             found.append(Unowned(machine, pool, why))
     return found, audit
+
+
+def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
+    """End what was found in a cloud, as `end` does; return what went wrong."""
+    return end(make_cloud(found.cloud, Path.cwd()), found.unowned, home(), told=told)
 
 
 def end(

@@ -12,12 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fogft import disk
+from fogft.cloud.port import Cloud
 from fogft.errors import FogftError, PoolBusy, known_slots
 from fogft.model import intent
 from fogft.model.intent import Intent
 from fogft.pool.commands.status import read
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
+from fogft.poolfile.tree import nearest
 
 
 def scale(store: PoolStore, by: int) -> tuple[int, int]:
@@ -38,9 +40,24 @@ def drain(store: PoolStore, slot: int, now: float) -> str:
     return f"{slot}.{generation}"
 
 
-def exclude(store: PoolStore, location: str) -> bool:
-    """Keep out of a location; return whether that is new."""
-    before, after = _change(store, lambda now: intent.exclude(now, location))
+def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
+    """Keep out of a location; return whether that is new.
+
+    Raises:
+        FogftError: The pool's cloud has no such location.
+    """
+    identity, place = store.identity(), intent.checked_location(location)
+    resources = store.spec().task.get("resources") or {}
+    sold = [offer.placement for offer in cloud.offers(resources)]
+    known = {name for p in sold for name in (p.cloud, f"{p.cloud}/{p.region}", p.location)}
+    if place not in known:
+        meant = [f"{cloud}/{place}" for cloud in sorted({p.cloud for p in sold})]
+        meant = [name for name in meant if name in known]
+        raise FogftError(
+            f"the cloud `{identity.cloud}` of pool `{identity.name}` has no location `{place}`",
+            f"did you mean `{meant[0]}`?" if meant else nearest(place, known),
+        )
+    before, after = _change(store, lambda now: intent.exclude(now, place))
     return before != after
 
 

@@ -104,6 +104,11 @@ class PoolStore:
         self._spec: tuple[bytes, PoolSpec] | None = None
         self._good: tuple[bytes, PoolSpec] | None = None
 
+    @property
+    def name(self) -> str:
+        """The pool's name."""
+        return self.paths.folder.name
+
     def identity(self) -> Identity:
         """Return what the pool is.
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.cli import complete, status_text
+from fogft import disk
+from fogft.cli import output, status_text
 from fogft.cloud.local.folder import MachineFolder
 from fogft.cloud.sky import naming
 from fogft.doctor import pools
@@ -20,7 +21,7 @@ from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.replica import LinkReport, LinkState, Member, Membership, ReplicaId
 from fogft.model.spec import GroupSpec
 from fogft.pool.commands import wishes
-from fogft.pool.commands.status import Seen
+from fogft.pool.commands.status import Seen, slots
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
@@ -132,7 +133,9 @@ def seen() -> status.PoolStatus:
     )  # fmt: skip
 
 
-def test_status_shows_replicas_by_hand_beside_the_managers() -> None:
+def test_status_shows_replicas_by_hand_beside_the_managers(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """They count for what a service can do, and for no number of what the pool wants."""
     found = seen()
     assert (found.target, found.ready, found.services[0].ready_replicas) == (4, 4, 5)
@@ -142,7 +145,8 @@ def test_status_shows_replicas_by_hand_beside_the_managers() -> None:
         (1001, "starting", ""),
     ]
     assert status.from_json(found.to_json()) == found
-    lines = status_text.rendered(Seen(found, 0.4, True), width=100, colour=False)
+    output.show(status_text.rendered(Seen(found, 0.4, True), width=100))
+    lines = capsys.readouterr().out.splitlines()
     first = next(n for n, line in enumerate(lines) if line.startswith("REPLICA"))
     table = lines[first : first + 7]
     assert [line.split()[0] for line in table[1:]] == [
@@ -163,16 +167,14 @@ def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> No
     assert "`fogft logs 105`" in launched.advice
 
 
-def test_slots_are_listed_by_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In hints and completions: 9 before 10, and 99 before 100."""
+def test_slots_are_listed_by_number(tmp_path: Path) -> None:
+    """In hints and lists: 9 before 10, and 99 before 100."""
     rows = [replace(seen().replicas[0], slot=slot) for slot in (100, 9, 10, 99)]
-    monkeypatch.setattr(wishes, "read", lambda *_: Seen(replace(seen(), replicas=rows), 0.0, True))
+    disk.write_json(PoolPaths(tmp_path).status, replace(seen(), replicas=rows).to_json())
     with pytest.raises(FogftError) as caught:
         wishes.generation_in(PoolPaths(tmp_path), 5, NOW)
     assert caught.value.hint == "slots with a replica: 9, 10, 99, 100"
     with pytest.raises(FogftError, match="started by hand") as caught:
         wishes.generation_in(PoolPaths(tmp_path), 1000, NOW)
     assert "`fogft credentials revoke replica 1000`" in caught.value.hint
-    monkeypatch.setattr("fogft.app.pools", lambda: ["p"])
-    monkeypatch.setattr("fogft.app.slots", lambda _: [9, 10, 100, 1])
-    assert complete.slots("1") == ["1", "10", "100"]
+    assert slots(PoolPaths(tmp_path)) == [9, 10, 99, 100]

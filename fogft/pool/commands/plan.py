@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fogft.app.clouds import LOCAL, cloud_names, make_cloud, make_store
 from fogft.errors import CloudError, PoolNotFound, SpecError
+from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
 from fogft.pool.folder.paths import latency_file
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class PlanShown:
     traffic: Mapping[str, Measured] = field(default_factory=dict)
 
 
-def plan(
+def plan_file(
     file: Path,
     cloud: str | None = None,
     *,
@@ -79,7 +79,7 @@ def plan(
     if prices is not None:
         name, seller = str(prices), PriceTable(prices)
     else:
-        name = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL
+        name = cloud or cloud_named_by(spec, source, file)
         seller = make_cloud(name, file.resolve().parent)
         if name != LOCAL:
             told("asking for prices")

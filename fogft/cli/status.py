@@ -9,24 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft.cli import complete, output
-from fogft.cli.complete import PoolArgument, PoolOption
-from fogft.cli.sections import Command
+from fogft.cli import options, output
+from fogft.cli.options import PoolArgument, PoolOption
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from fogft.pool.commands.status import Seen
+    from fogft.pool.folder.paths import PoolPaths
 
 REDRAW_EVERY_S = 1.0
 STALE_AFTER_S = 15.0
 FOLLOW_EVERY_S = 0.2
-
-
-def register(app: typer.Typer) -> None:
-    """Add these commands to the application."""
-    app.command("status", cls=Command)(status)
-    app.command("logs", cls=Command)(logs)
 
 
 def status(
@@ -47,45 +41,41 @@ def status(
     Example:
       fogft status --watch
     """
-    from fogft import app
+    from fogft.cli import status_text
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.status import read, refreshed
 
-    name = app.pool_name(pool)
-    seen = app.refresh(name) if refresh else app.status(name)
+    paths = composition.paths_of(pool)
+    seen = refreshed(composition.store_of(pool)) if refresh else read(paths, time.time())
     if watch:
-        _watch(name, as_json=as_json)
-        return
-    if as_json:
+        _watch(paths, as_json=as_json)
+    elif as_json:
         output.json_data(seen.to_json())
     else:
-        output.data(_screen(seen))
+        output.show(status_text.rendered(seen, width=output.width(sys.stdout)))
     _remark(seen)
 
 
-def _watch(pool: str, *, as_json: bool) -> None:
+def _watch(paths: PoolPaths, *, as_json: bool) -> None:
     """Show the status each second until interrupted, or until the pool is gone."""
-    from fogft import app
+    from fogft.cli import status_text
+    from fogft.pool.commands.status import read
 
     def looks() -> Iterator[Seen]:
         while True:
-            yield app.status(pool)
+            yield read(paths, time.time())
             time.sleep(REDRAW_EVERY_S)
 
     if as_json:
         for seen in looks():
             output.data(json.dumps(seen.to_json()))
+    width = output.width(sys.stdout)
     if not output.is_terminal(sys.stdout):
         for seen in looks():
-            output.data(f"{_screen(seen)}\n")
+            output.show(status_text.rendered(seen, width=width), "")
     with output.redrawn(sys.stdout) as show:
         for seen in looks():
-            show(_screen(seen).split("\n"))
-
-
-def _screen(seen: Seen) -> str:
-    from fogft.cli import status_text
-
-    room, colour = output.width(sys.stdout), output.coloured(sys.stdout)
-    return "\n".join(status_text.rendered(seen, width=room, colour=colour))
+            show(status_text.rendered(seen, width=width))
 
 
 def _remark(seen: Seen) -> None:
@@ -107,7 +97,7 @@ def logs(
             min=0,
             metavar="SLOT",
             help="Only this replica's; everything unless given.",
-            autocompletion=complete.slots,
+            autocompletion=options.slots,
             show_default=False,
         ),
     ] = None,
@@ -127,14 +117,16 @@ def logs(
     Example:
       fogft logs 2 -f
     """
-    from fogft import app
     from fogft.cli.tail import Tail, in_order
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.logs import find
 
-    name = app.pool_name(pool)
+    store = composition.store_of(pool)
+    cloud = composition.cloud_of(store.identity())
     tails: dict[str, Tail] = {}
     begin: int | None = lines
     while True:
-        for label, path in app.logs(name, slot):
+        for label, path in find(store, cloud, slot):
             if label not in tails:
                 tails[label] = Tail(path, begin)
         for label, line in in_order({name: tail.new_lines() for name, tail in tails.items()}):

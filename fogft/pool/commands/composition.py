@@ -1,4 +1,8 @@
-"""Which cloud, which store, which pool: the one place that picks concrete adapters."""
+"""The composition root: the one place that picks the concrete cloud and store of a pool.
+
+Owns: which adapter stands behind a cloud's name, and which pool a command is about.
+Not here: what a command does to a pool (its siblings).
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft.errors import CloudError
+from fogft.pool.folder import known_pools
 from fogft.pool.folder.paths import PoolPaths, home
 
 if TYPE_CHECKING:
     from fogft.cloud.port import Cloud
+    from fogft.model.spec import PoolSpec
     from fogft.pool.folder.store import Identity, PoolStore
 
 LOCAL = "local"
@@ -20,20 +26,33 @@ CLOUDS = (LOCAL, SKY)
 
 def pools() -> list[str]:
     """Return the names of the pools on this machine, sorted."""
-    from fogft.pool.folder import known_pools
-
     return known_pools.names(home())
 
 
-def pool_name(name: str | None = None) -> str:
-    """Return the pool that is meant: the one named, else the only one there is.
+def paths_of(name: str | None = None) -> PoolPaths:
+    """Return where the pool that is named is kept, else the only one there is.
 
     Raises:
         PoolNotFound: There is no such pool, none, or more than one to choose from.
     """
-    from fogft.pool.folder import known_pools
+    return PoolPaths.of(known_pools.meant(home(), name))
 
-    return known_pools.meant(home(), name)
+
+def store_of(name: str | None = None) -> PoolStore:
+    """Return the store of the pool that is named, else of the only one there is.
+
+    Raises:
+        PoolNotFound: As for `paths_of`.
+    """
+    return make_store(paths_of(name).folder.name)
+
+
+def make_store(pool: str) -> PoolStore:
+    """Return the store of a pool, which need not exist yet."""
+    from fogft.pool.folder.store import PoolStore
+    from fogft.poolfile.file import parse
+
+    return PoolStore(PoolPaths.of(pool), lambda text, file: parse(text, file=file), time.time)
 
 
 def make_cloud(name: str, base: Path) -> Cloud:
@@ -70,32 +89,17 @@ def cloud_of(identity: Identity) -> Cloud:
     return make_cloud(identity.cloud, Path(identity.file).parent)
 
 
-def costs_money(pool: str) -> bool:
-    """Whether a pool's machines are paid for.
+def cloud_named_by(spec: PoolSpec, source: str, file: Path) -> str:
+    """Return the one of `CLOUDS` that a pool file's resources name, else `local`.
 
     Raises:
-        PoolNotFound: There is no such pool.
+        SpecError: They name a cloud that does not exist, or real clouds and the local one.
     """
-    return make_store(pool).identity().cloud != LOCAL
-
-
-def make_store(pool: str) -> PoolStore:
-    """Return the store of a pool."""
-    from fogft.pool.folder.store import PoolStore
-    from fogft.poolfile.file import parse
-
-    return PoolStore(
-        PoolPaths.of(pool),
-        lambda text, file: parse(text, file=file),
-        time.time,
-    )
-
-
-def cloud_names() -> dict[str, str]:
-    """Return which cloud of `CLOUDS` each name stands for that a pool file can name."""
     from fogft.model.clouds import NO_VM_CLOUDS, VM_CLOUDS
+    from fogft.poolfile import named_clouds
 
-    return {LOCAL: LOCAL, **dict.fromkeys((*VM_CLOUDS, *NO_VM_CLOUDS), SKY)}
+    known = {LOCAL: LOCAL, **dict.fromkeys((*VM_CLOUDS, *NO_VM_CLOUDS), SKY)}
+    return named_clouds.cloud_of(spec, known, source, file) or LOCAL
 
 
 def local_root() -> Path:

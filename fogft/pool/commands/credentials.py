@@ -1,4 +1,8 @@
-"""A pool's certificates: who has one, who gets one, whose is taken back."""
+"""Who holds a certificate of a pool: issue, join with, revoke and rotate them.
+
+Owns: what `fogft credentials` and `fogft join` do, and waiting until it has taken effect.
+Not here: bundles (`joining`), the CA and its ledger (`fogft.pool.credentials`).
+"""
 
 from __future__ import annotations
 
@@ -6,69 +10,59 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fogft import disk
-from fogft.app.clouds import make_store
 from fogft.errors import FogftError
 from fogft.model.certificate_holder import Holder, Role
+from fogft.pool.commands import joining, wishes
+from fogft.pool.commands.joining import Issued, Joined
+from fogft.pool.commands.status import slots
+from fogft.pool.credentials.ledger import Entry, Ledger
 from fogft.pool.folder.paths import PoolPaths, home
-
-if TYPE_CHECKING:
-    from fogft.pool.commands.joining import Issued, Joined
-    from fogft.pool.credentials.ledger import Entry
+from fogft.pool.folder.store import PoolStore
+from fogft.pool.manager import configuration
 
 PUBLISH_LIMIT_S = 10.0
 _POLL_S = 0.05
 
 
-def certificates(pool: str) -> Sequence[Entry]:
+def certificates(store: PoolStore) -> Sequence[Entry]:
     """Return the certificates that a pool's CA has issued, oldest first. Keys are not in it."""
-    from fogft.pool.credentials.ledger import Ledger
-    from fogft.pool.folder.store import read_identity
-
-    paths = PoolPaths.of(pool)
-    read_identity(paths)
-    return Ledger(paths.credentials).entries()
+    store.identity()
+    return Ledger(store.paths.credentials).entries()
 
 
 def issue_credentials(
-    pool: str, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
+    store: PoolStore, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
 ) -> tuple[Issued, Path]:
     """Write a join bundle for the next generation of a holder; return both.
 
     Raises:
-        CredentialError: The name or the passphrase will not do, the CA cannot be used, or
+        CredentialError: The name or the passphrase is refused, the CA cannot be used, or
             whoever joined would find nobody.
         FogftError: The file exists, or there is no such pool.
     """
-    from fogft.pool.commands import joining
-
     file = out or Path(f"{name}.join")
     if file.exists():
         raise FogftError(f"`{file}` exists", "choose another name with `--out`")
-    issued = joining.issue(
-        make_store(pool), role, name, passphrase, time.time(), open_for_s=open_for_s
-    )
+    issued = joining.issue(store, role, name, passphrase, time.time(), open_for_s=open_for_s)
     disk.write_whole(file, issued.data)
     return issued, file
 
 
-def join(file: Path, passphrase: str) -> Joined:
+def join_here(file: Path, passphrase: str) -> Joined:
     """Set this machine up from a join bundle, which is destroyed by it.
 
     Raises:
         CredentialError: It is none, too old, or was used, here or elsewhere.
     """
-    from fogft.pool.commands import joining
-
     logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # an error says what matters
     disk.make_folder(home())
     return joining.join(file, passphrase, home(), time.time())
 
 
-def revoke_credentials(pool: str, role: Role, name: str) -> tuple[list[Holder], bool]:
-    """Take certificates back; return them, and whether the pool has been told.
+def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Holder], bool]:
+    """Revoke certificates; return their holders, and whether the pool has been told.
 
     A replica that is revoked is replaced, too.
 
@@ -76,10 +70,6 @@ def revoke_credentials(pool: str, role: Role, name: str) -> tuple[list[Holder], 
         CredentialError: There is none of that name.
         FogftError: There is no such pool.
     """
-    from fogft.pool.commands import wishes
-    from fogft.pool.credentials.ledger import Ledger
-
-    store = make_store(pool)
     store.identity()
     ledger = Ledger(store.paths.credentials)
     holders = ledger.named(role, name)
@@ -88,37 +78,31 @@ def revoke_credentials(pool: str, role: Role, name: str) -> tuple[list[Holder], 
         now = time.time()
         if holder.generation == _generation_in(store.paths, int(holder.name), now):
             wishes.drain(store, int(holder.name), now)
-    return holders, _published(pool, holders)
+    return holders, _published(store, holders)
 
 
 def _generation_in(paths: PoolPaths, slot: int, now: float) -> int | None:
-    from fogft.pool.commands import wishes
-
     try:
         return wishes.generation_in(paths, slot, now)
     except FogftError:
         return None  # it is gone already, or was started by hand
 
 
-def rotate_robot(pool: str) -> tuple[Holder, list[Holder], bool]:
-    """Give this machine's client proxy new credentials, and take the old ones back once they
-    are in use; return the new holder, the old ones, and whether that has happened.
+def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:
+    """Give this machine's client proxy new credentials, and revoke the old ones once the new
+    ones are in use; return the new holder, the old ones, and whether that has happened.
 
     Raises:
         CredentialError: The pool's CA cannot be used.
         FogftError: There is no such pool.
     """
-    from fogft.pool.credentials.ledger import Ledger
-    from fogft.pool.manager import configuration
-
-    store = make_store(pool)
     ledger = Ledger(store.paths.credentials)
     holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
     old = [h for h in ledger.named(Role.ROBOT, holder.name) if h != holder]
     in_use = _wait(lambda: _in_use(store.paths, holder))
     if in_use and old:
         ledger.revoke(old)
-        _published(pool, old)
+        _published(store, old)
     return holder, old, in_use
 
 
@@ -128,26 +112,20 @@ def _in_use(paths: PoolPaths, holder: Holder) -> bool:
     return isinstance(report, dict) and report.get("certificate") == holder.common_name
 
 
-def rotate_replicas(pool: str, slot: int | None = None) -> list[str]:
+def rotate_replicas(store: PoolStore, slot: int | None = None) -> list[str]:
     """Have replicas replaced, the new one first, each with a key of its own; return which."""
-    from fogft.app.looking import slots
-    from fogft.pool.commands import wishes
-
-    store = make_store(pool)
-    chosen = slots(pool) if slot is None else [slot]
+    chosen = slots(store.paths) if slot is None else [slot]
     return [wishes.drain(store, one, time.time()) for one in chosen]
 
 
-def _published(pool: str, holders: Sequence[Holder]) -> bool:
-    from fogft.app.looking import manager_alive
-
-    store, names = make_store(pool), {holder.common_name for holder in holders}
+def _published(store: PoolStore, holders: Sequence[Holder]) -> bool:
+    names = {holder.common_name for holder in holders}
 
     def told() -> bool:
         membership = store.membership()
         return membership is not None and names <= membership.revoked
 
-    return told() or (manager_alive(pool) and _wait(told))
+    return told() or (disk.is_locked(store.paths.manager_lock) and _wait(told))
 
 
 def _wait(condition: Callable[[], bool], limit_s: float = PUBLISH_LIMIT_S) -> bool:

@@ -1,4 +1,4 @@
-"""What a pool would have been worth in a recorded or made-up spot market."""
+"""Simulate a pool file: read it, the prices and the traces, and run every policy on them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fogft.app.clouds import LOCAL, cloud_names, make_cloud
+from fogft.pool.commands.composition import cloud_named_by, make_cloud
 
 if TYPE_CHECKING:
     from fogft.model.replica import Offer, Placement
@@ -43,7 +43,6 @@ def simulate(
         FogftError: The file, the traces or the numbers are wrong.
     """
     from fogft.errors import FogftError
-    from fogft.poolfile import named_clouds
     from fogft.poolfile.file import parse, read_text
     from fogft.simulation import fitting, report
     from fogft.simulation.comparison import Scenario, spot_locations
@@ -53,7 +52,7 @@ def simulate(
 
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.parent)
-    chosen = cloud or named_clouds.cloud_of(spec, cloud_names(), source, file) or LOCAL
+    chosen = cloud or cloud_named_by(spec, source, file)
     find = remembered(_pricing(make_cloud(chosen, file.resolve().parent).offers, source, file))
     values = read_values(model)
     market, timing = MarketModel(), Timing()
@@ -92,28 +91,6 @@ def simulate(
     market, timing = applied(market, timing, values)
     scenario = Scenario(spec, find, timing, market, recorded=lines, days=days, seeds=tuple(seeds))
     return report.simulate(scenario, notes=notes, told=told)
-
-
-def draw(report: Report, path: Path) -> None:
-    """Draw a report to a PNG, SVG or PDF file.
-
-    Raises:
-        FogftError: It cannot be drawn or written.
-    """
-    from fogft.simulation import plot
-
-    plot.draw(report, path)
-
-
-def check_plot(path: Path) -> None:
-    """Check that a plot can be drawn to a file.
-
-    Raises:
-        FogftError: It cannot.
-    """
-    from fogft.simulation import plot
-
-    plot.check(path)
 
 
 def _pricing(find: FindOffers, source: str, file: Path) -> FindOffers:

@@ -1,0 +1,119 @@
+"""Which commands there are, by what people want to do, and how their help looks.
+
+A command's module is imported when the command is run or described, so that each starts
+without loading the others. A name stands for a function of that name in its module, or for a
+group of commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+# Section -> command -> its module in this package.
+SECTIONS: Mapping[str, Mapping[str, str]] = {
+    "Begin and end": {
+        "init": "lifecycle",
+        "up": "lifecycle",
+        "join": "credentials",
+        "down": "lifecycle",
+        "sweep": "sweep",
+    },
+    "Look": {"plan": "plan", "status": "status", "logs": "status", "doctor": "doctor"},
+    "Change what runs": {
+        "scale": "change",
+        "drain": "change",
+        "exclude": "change",
+        "include": "change",
+        "credentials": "credentials",
+    },
+    "Try what happens when": {"simulate": "simulate", "chaos": "chaos"},
+    "Run one part by hand": dict.fromkeys(
+        ("proxy", "serve", "manager", "rendezvous", "gateway"), "parts"
+    ),
+}
+_MODULES = {name: module for names in SECTIONS.values() for name, module in names.items()}
+
+
+class _Loaded(Mapping[str, Any]):
+    """The commands by name, each imported when it is looked up."""
+
+    def __getitem__(self, name: str) -> Any:
+        return _load(_MODULES[name], name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULES)
+
+    def __len__(self) -> int:
+        return len(_MODULES)
+
+
+@cache
+def _load(module: str, name: str) -> Any:
+    found = getattr(import_module(f"fogft.cli.{module}"), name)
+    if isinstance(found, typer.Typer):
+        return typer.main.get_command(found)
+    alone = typer.Typer(add_completion=False)
+    alone.command(name, cls=Command)(found)
+    return typer.main.get_command(alone)
+
+
+def group(help: str) -> typer.Typer:
+    """Return a group of commands, to which a module adds its own."""
+    return typer.Typer(rich_markup_mode=None, add_completion=False, help=help)
+
+
+class Commands(TyperGroup):
+    """The root of all commands, listed by section."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.commands: Any = _Loaded()
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write one list a section."""
+        for title, names in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(n, self.commands[n].get_short_help_str(formatter.width)) for n in names]
+                )
+
+
+class Command(TyperCommand):
+    """A command whose arguments stand as ``SLOT`` or ``[FILE]``, without types and ranges."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **{**options, "rich_markup_mode": None})
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return what stands behind the command's name in its usage line."""
+        return ["[OPTIONS]", *map(_word, self._arguments(ctx))]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, then the options."""
+        arguments = [(_word(one), _meaning(one)) for one in self._arguments(ctx)]
+        options = [one for one in self.get_params(ctx) if one.param_type_name == "option"]
+        records = [record for one in options if (record := one.get_help_record(ctx))]
+        for title, rows in (("Arguments", arguments), ("Options", records)):
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+    def _arguments(self, ctx: Any) -> list[Any]:
+        return [one for one in self.get_params(ctx) if one.param_type_name == "argument"]
+
+
+def _word(argument: Any) -> str:
+    name = (argument.metavar or argument.name or "").upper()
+    return name if argument.required else f"[{name}]"
+
+
+def _meaning(argument: Any) -> str:
+    default = argument.default if argument.show_default else None
+    text: str = argument.help or ""
+    return text + (f"  [default: {default}]" if default not in (None, "") else "")

@@ -1,0 +1,97 @@
+"""What became of an `up`: whether its pool answers, still starts, or cannot answer. Pure.
+
+Owns: the verdict on a status.
+Not here: looking and waiting (`fogft.cli.progress`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from fogft.model.replica import Phase
+from fogft.planning.rollout import UpdateState
+from fogft.pool.commands.status import Seen
+
+HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
+
+
+class Outcome(Enum):
+    """What an `up` has led to."""
+
+    PENDING = auto()
+    ANSWERING = auto()
+    WITHDRAWN = auto()  # the update was stopped and rolled back
+    RUN_KEEPS_ENDING = auto()  # on every replica
+    TYPES_DIFFER = auto()  # every replica defines a service's type otherwise than this machine
+
+
+@dataclass(frozen=True)
+class Awaited:
+    """What an `up` waits for.
+
+    Attributes:
+        services: Their names; empty for those that will be discovered.
+        since: When the file was applied, in seconds since the epoch.
+        digest: Of the file whose update is waited for; empty for no update.
+    """
+
+    services: frozenset[str]
+    since: float
+    digest: str = ""
+
+    def outcome(self, seen: Seen, *, is_last: bool = False) -> Outcome:
+        """Judge a status.
+
+        Args:
+            seen: The status.
+            is_last: There is no time left to wait for the end of an update.
+        """
+        if self.is_updating(seen) and not is_last:
+            hopeless = seen.status.applied == self.digest and keeps_ending(seen)
+            return Outcome.RUN_KEEPS_ENDING if hopeless else Outcome.PENDING
+        if seen.status.update is not None and seen.status.update.fault:
+            return Outcome.WITHDRAWN
+        if keeps_ending(seen):
+            return Outcome.RUN_KEEPS_ENDING
+        if types_differ(seen):
+            return Outcome.TYPES_DIFFER
+        return Outcome.ANSWERING if self.is_answering(seen) else Outcome.PENDING
+
+    def is_updating(self, seen: Seen) -> bool:
+        """Whether the update that is waited for has yet to end."""
+        if not self.digest:
+            return False
+        update = seen.status.update
+        return seen.status.applied != self.digest or (
+            update is not None and update.state != UpdateState.ROLLED_BACK.value
+        )
+
+    def is_answering(self, seen: Seen) -> bool:
+        """Whether every service has a ready replica and a client proxy.
+
+        A pool whose schedule wants no replica now is as it should be.
+        """
+        status = seen.status
+        if status.observed_at < self.since:
+            return False
+        if status.cloud_reachable and not status.target:
+            return True
+        names = {service.name for service in status.services}
+        ready = {service.name for service in status.services if service.ready_replicas}
+        return status.proxy_alive and bool(ready) and names == (self.services or ready) == ready
+
+
+def keeps_ending(seen: Seen) -> bool:
+    """Whether `run` has ended so often on every replica that waiting longer is no use."""
+    replicas = seen.status.replicas
+    return bool(replicas) and not any(
+        replica.phase == Phase.READY.value or replica.restarts < HOPELESS_RESTARTS
+        for replica in replicas
+    )
+
+
+def types_differ(seen: Seen) -> bool:
+    """Whether every replica has another definition of a service's type than this machine."""
+    replicas = seen.status.replicas
+    return bool(replicas) and all(replica.differs for replica in replicas)
