@@ -161,3 +161,28 @@ def is_locked(path: Path) -> bool:
         return True
     lock.release()
     return False
+
+
+def version(path: Path) -> tuple[int, int, int] | None:
+    """Return what differs once a file was replaced or written; None where there is none."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return stat.st_mtime_ns, stat.st_ino, stat.st_size
+
+
+class Watched:
+    """A file that is replaced whole: tells when it became another one."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._seen: tuple[int, int, int] | None = None
+
+    def changed(self) -> bool:
+        """Return whether the file is there and is not the one seen at the last call."""
+        found = version(self.path)
+        if found is None or found == self._seen:
+            return False
+        self._seen = found
+        return True

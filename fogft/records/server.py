@@ -14,7 +14,6 @@ import asyncio
 import contextlib
 import hashlib
 import logging
-import os
 import secrets
 import socket
 import ssl
@@ -22,6 +21,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+from fogft import disk
 from fogft.errors import CredentialError, WireError
 from fogft.log_limits import worth_logging
 from fogft.model.credentials import CredentialPaths
@@ -57,7 +57,7 @@ class RendezvousServer:
         self._exchange = exchange
         self.counts: Counter[str] = Counter()
         self._context: ssl.SSLContext | None = None
-        self._mark: tuple[int, int] | None = None
+        self._version: tuple[int, int, int] | None = None
         self._binding = b""
         self._socket: socket.socket | None = None
         self._endpoint = listen
@@ -181,8 +181,8 @@ class RendezvousServer:
         """Load certificate and key, again when they were replaced."""
         ours = self._credentials
         try:
-            stat = os.stat(ours.certificate)
-            if (stat.st_mtime_ns, stat.st_ino) == self._mark:
+            version = disk.version(ours.certificate)
+            if version is not None and version == self._version:
                 return
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.minimum_version = ssl.TLSVersion.TLSv1_3
@@ -196,7 +196,7 @@ class RendezvousServer:
                 f"`{ours.certificate}` or its key cannot be used",
                 "issue the rendezvous a certificate of the pool's CA",
             ) from error
-        self._mark, self._context = (stat.st_mtime_ns, stat.st_ino), context
+        self._version, self._context = version, context
         self._binding = binding_of(der)
 
     def _count(self, event: str, detail: str) -> None:

@@ -11,11 +11,11 @@ Not here: what may be signed by whom (`fogft.records.record`), making keys (`fog
 from __future__ import annotations
 
 import datetime
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fogft import disk
 from fogft.errors import CredentialError
 from fogft.records.record import RecordError, Writer
 
@@ -40,7 +40,7 @@ class Signer:
     def __init__(self, certificate: Path, key: Path) -> None:
         self._certificate_path = certificate
         self._key_path = key
-        self._mark: tuple[int, int] | None = None
+        self._version: tuple[int, int, int] | None = None
         self._der = b""
         self._key: ec.EllipticCurvePrivateKey | None = None
         self._load()
@@ -74,9 +74,8 @@ class Signer:
         from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
         try:
-            stat = os.stat(self._certificate_path)
-            mark = (stat.st_mtime_ns, stat.st_ino)
-            if mark == self._mark:
+            version = disk.version(self._certificate_path)
+            if version is not None and version == self._version:
                 return
             certificate = x509.load_pem_x509_certificate(self._certificate_path.read_bytes())
             key = load_pem_private_key(self._key_path.read_bytes(), password=None)
@@ -94,7 +93,7 @@ class Signer:
             if self._key is not None:
                 return
             raise CredentialError(f"`{self._key_path}` does not belong to its certificate")
-        self._mark, self._der, self._key = mark, certificate.public_bytes(Encoding.DER), key
+        self._version, self._der, self._key = version, certificate.public_bytes(Encoding.DER), key
 
 
 class Verifier:

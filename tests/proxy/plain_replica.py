@@ -19,9 +19,9 @@ from typing import Any
 
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.listener import ZenohListener
+from fogft.process import stop_on_signal
 from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
-from fogft.proxy.process import stop_on_signal
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.supervisor import Supervisor
 

@@ -28,8 +28,9 @@ from fogft.cloud.local.relay import Relay
 from fogft.cloud.local.reservations import Reservation, reserve_domain, reserve_port
 from fogft.errors import FogftError, StateError
 from fogft.model.replica import MachinePhase
+from fogft.process import ENDING_SIGNALS, start_log
 
-log = logging.getLogger("machine")
+log = logging.getLogger("fogft.machine")
 
 TICK_S = 0.05
 FOLDER_PATIENCE_S = 5.0  # somebody removed it: nobody can list or end this machine any more
@@ -52,11 +53,7 @@ def main(arguments: list[str]) -> int:
         return 2
     if not folder.exists:
         return 0  # it was ended before it began
-    logging.basicConfig(
-        level=logging.INFO,
-        format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
-        datefmt="%Y-%m-%dT%H:%M:%S",
-    )
+    start_log()
     lock = disk.Lock(folder.path / LOCK)
     if not _acquire(lock):
         return 0  # it runs already
@@ -91,7 +88,7 @@ class Machine:
         self._next_tick = 0.0
         self._log_checked = 0.0
         self._seen_at = time.monotonic()
-        self._link_seen: tuple[int, int] | None = None
+        self._link_seen: tuple[int, int, int] | None = None
         self._faults = faults.LinkFaults()
         self._relay: Relay | None = None
 
@@ -99,7 +96,7 @@ class Machine:
         """Live and die. Leaves a FAILED state behind if the machine could never run."""
         self._say(State(MachinePhase.PROVISIONING, progress="booting"))
         self._guard = guard.start(lambda: _end_the_rest(self._record))
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in ENDING_SIGNALS:
             signal.signal(number, self._on_signal)
         try:
             self._live()
@@ -265,13 +262,9 @@ class Machine:
         if self._relay is None:
             return
         path = self._folder.path / LINK
-        try:
-            stat = path.stat()
-            mark = (stat.st_mtime_ns, stat.st_ino)
-        except OSError:
-            mark = None
-        if mark != self._link_seen:
-            self._link_seen = mark
+        found = disk.version(path)
+        if found != self._link_seen:
+            self._link_seen = found
             try:
                 self._faults = faults.read_link(path)
                 log.info("link_changed faults=%s", self._faults)

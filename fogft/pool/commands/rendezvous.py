@@ -10,8 +10,6 @@ import asyncio
 import contextlib
 import logging
 import os
-import signal
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +22,7 @@ from fogft.metrics.scrape import Scrape
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import POOL_UID_PATTERN
 from fogft.pool.manager.metrics import of_rendezvous
+from fogft.process import ENDING_SIGNALS, start_log
 from fogft.records import cache
 from fogft.records.exchange import Exchange
 from fogft.records.record_set import RecordSet
@@ -94,13 +93,7 @@ def run(config: RendezvousConfig) -> None:
         WireError: The port cannot be had.
         CredentialError: The certificate, its key or the CA cannot be used.
     """
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=logging.INFO,
-        format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
-        datefmt="%Y-%m-%dT%H:%M:%S",
-        force=True,
-    )
+    start_log()
     asyncio.run(_Rendezvous(config).live())
 
 
@@ -123,7 +116,7 @@ class _Rendezvous:
         """Serve until a signal comes."""
         loop = asyncio.get_running_loop()
         stop = asyncio.Event()
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in ENDING_SIGNALS:
             loop.add_signal_handler(number, stop.set)
         self._server.bind()
         log.info("rendezvous_listening endpoint=%s pid=%d", self._server.endpoint, os.getpid())

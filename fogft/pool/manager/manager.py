@@ -12,8 +12,6 @@ from __future__ import annotations
 import datetime
 import logging
 import os
-import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -37,6 +35,7 @@ from fogft.pool.manager.distances import Distances, Latencies
 from fogft.pool.manager.metrics import of_pool
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 from fogft.pool.manager.reconciler import Reconciler, Tick
+from fogft.process import start_log, stop_on_signal
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +85,7 @@ class Manager:
         self._revoked: frozenset[str] = frozenset()
         self._records = ManagerRecords(self._paths, self._identity.uid, self._lease.epoch)
         self._discovery = Discovery(self._paths.discovered)
-        self._seen: dict[Path, tuple[int, int, int] | None] = {}
+        self._versions: dict[Path, tuple[int, int, int] | None] = {}
         self._digest: object = None
         self._trouble: list[str] = []
         self._told: status.PoolStatus | None = None
@@ -252,25 +251,17 @@ class Manager:
 
     def _something_changed(self) -> bool:
         paths = self._paths
-        watched = (paths.spec, paths.intent, self._ledger.path)
-        changed = [p for p in watched if self._is_new(p)]
-        if self._is_new(paths.proxy_status):
-            report = proxy_report.read(paths.proxy_status, self._identity.uid)
+        before, report_path = self._versions, paths.proxy_status
+        watched = (paths.spec, paths.intent, self._ledger.path, report_path)
+        self._versions = {path: disk.version(path) for path in watched}
+        changed = {path for path in before if self._versions[path] != before[path]}
+        if report_path in changed:
+            report = proxy_report.read(report_path, self._identity.uid)
             digest = report.digest() if report is not None else None
             if digest != self._digest:
                 self._digest = digest
                 return True
-        return bool(changed)
-
-    def _is_new(self, path: Path) -> bool:
-        try:
-            stat = path.stat()
-            mark = (stat.st_mtime_ns, stat.st_ino, stat.st_size)
-        except OSError:
-            mark = None
-        known = path in self._seen
-        old, self._seen[path] = self._seen.get(path), mark
-        return known and mark != old
+        return bool(changed - {report_path})
 
 
 def run(
@@ -292,16 +283,7 @@ def run(
         PoolBusy: The pool has a manager, or a later one has taken over.
         PoolNotFound: There is no such pool.
     """
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=logging.WARNING,  # of what others log
-        format="%(asctime)s.%(msecs)03d %(levelname)s %(message)s",
-        datefmt="%Y-%m-%dT%H:%M:%S",
-        force=True,
-    )
-    logging.getLogger("fogft").setLevel(logging.INFO)
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda *_: stop.set())
+    start_log()
+    stop = stop_on_signal()
     cloud = cloud_of(store.identity())
     Manager(store, cloud, proxy_command=proxy_command, metrics=metrics).run(stop)

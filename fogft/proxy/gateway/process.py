@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
+from fogft.disk import Watched
 from fogft.errors import CredentialError, FogftError, PoolBusy
 from fogft.link.port import Listener, Probe, ProbeAnswer
 from fogft.metrics import proxies
@@ -25,9 +26,9 @@ from fogft.model import names
 from fogft.model.certificate_holder import Holder, Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
+from fogft.process import start_log, stop_on_signal
 from fogft.proxy.config import GatewayConfig, read_gateway
 from fogft.proxy.gateway.gateway import Forwarder, NoRos, numbers
-from fogft.proxy.process import Watched, start_log, stop_on_signal
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following

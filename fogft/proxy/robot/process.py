@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from fogft import disk
+from fogft.disk import Watched
 from fogft.errors import FogftError, PoolBusy, StateError
 from fogft.link.uplinks import UplinkDialer
 from fogft.metrics import proxies
@@ -24,10 +25,10 @@ from fogft.metrics.scrape import Scrape
 from fogft.model import names
 from fogft.model.middleware import Speaks
 from fogft.model.spec import Part, ServiceSpec
+from fogft.process import start_log, stop_on_signal
 from fogft.proxy import middleware, start
 from fogft.proxy.config import ClientProxyConfig, read_client
 from fogft.proxy.order_mark import MarkFile
-from fogft.proxy.process import Watched, start_log, stop_on_signal
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.diagnostics_node import SeenFromRos

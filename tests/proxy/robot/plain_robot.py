@@ -17,9 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from fogft.disk import Watched
 from fogft.errors import RosError
 from fogft.proxy.config import read_client
-from fogft.proxy.process import Watched
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
