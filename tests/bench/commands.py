@@ -15,7 +15,7 @@ from fogft.pool.folder.store import Identity, write_identity
 from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
 from tests.bench.caller import milliseconds
 from tests.bench.rig import ROOT
-from tests.bench.statistics import median
+from tests.estimates import median
 
 _REPLICAS = 3
 

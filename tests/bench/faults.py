@@ -13,7 +13,7 @@ from typing import Any
 from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.rig import Replica, Rig
 from tests.bench.service import FLAG, MAP
-from tests.bench.statistics import estimate, longest_gap, percentile
+from tests.estimates import estimate_of_rounds, longest_gap, percentile
 
 SLEEP_S = 0.02
 _PAUSE_S = 0.01
@@ -73,7 +73,7 @@ def _block(caller: Caller, payload: bytes, seconds: float) -> list[float]:
 
 def _row(name: str, alone: list[float], three: list[float]) -> dict[str, Any]:
     rounds = min(len(alone), len(three))
-    ratio = estimate(
+    ratio = estimate_of_rounds(
         {"alone": alone[:rounds], "three": three[:rounds]},
         lambda s: percentile(s["three"], 99) / percentile(s["alone"], 99),
         random.Random(0),

@@ -16,7 +16,7 @@ from tests.bench.caller import CALL_LIMIT_S, Caller, milliseconds, payloads
 from tests.bench.floor import Floor
 from tests.bench.rig import Rig
 from tests.bench.service import ACTION_SERVICES, FLAG, TOPICS
-from tests.bench.statistics import estimate, median, overhead_ratio, percentile
+from tests.estimates import estimate_of_rounds, median, overhead_ratio, percentile
 
 _WARM_UP = 30
 _LARGE = 640 * 480 * 3
@@ -122,7 +122,7 @@ def graph(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
 
 def _row(kind: str, sides: dict[str, list[float]]) -> dict[str, Any]:
     in_ms = {side: milliseconds(sample) for side, sample in sides.items()}
-    found = estimate(
+    found = estimate_of_rounds(
         in_ms,
         lambda s: overhead_ratio(median(s["direct"]), median(s["proxied"]), median(s["get"])),
         random.Random(0),

@@ -12,7 +12,7 @@ from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.floor import Floor
 from tests.bench.rig import Rig
 from tests.bench.service import FLAG, MAP
-from tests.bench.statistics import estimate, median, overhead_ratio, percentile
+from tests.estimates import estimate_of_rounds, median, overhead_ratio, percentile
 
 _WARM_UP = 30
 _REPLICAS = 2
@@ -72,7 +72,7 @@ def _row(service: str, size_bytes: int, sides: Mapping[str, Sequence[float]]) ->
         ("ordered_ratio", lambda s: _ratio(s, "ordered")),
         ("added", lambda s: _ratio(s, "ordered") / _ratio(s, "plain") - 1),
     ):
-        found = estimate(in_ms, statistic, random.Random(0), resamples=500)
+        found = estimate_of_rounds(in_ms, statistic, random.Random(0), resamples=500)
         row[name] = {"value": found.value, "low": found.low, "high": found.high}
     return row
 

@@ -16,7 +16,7 @@ from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.planning.observed.history import History
 from fogft.planning.planner import plan
 from tests.bench.caller import milliseconds
-from tests.bench.statistics import median
+from tests.estimates import median
 
 UID = "0" * 16
 CLOUDS, REGIONS, ZONES, INSTANCES = 5, 50, 4, 5

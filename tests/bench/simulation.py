@@ -16,7 +16,7 @@ from fogft.simulation.market import remembered
 from fogft.simulation.meter import DAY_S
 from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.world import World
-from tests.bench.statistics import estimate, median
+from tests.estimates import estimate_of_rounds, median
 
 MARKETS = {
     "as the paper's (15 h)": MarketModel(mttf_s=54_000.0, mttr_s=1_200.0),
@@ -59,7 +59,9 @@ def simulation(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
                     "pool_days": len(scenario.seeds) * scenario.length_s / DAY_S,
                     "planned_per_day": asked / (len(scenario.seeds) * scenario.length_s / DAY_S),
                     "pool_days_per_cpu_minute": asdict(
-                        estimate({"it": speeds}, lambda s: median(s["it"]), random.Random(1))
+                        estimate_of_rounds(
+                            {"it": speeds}, lambda s: median(s["it"]), random.Random(1)
+                        )
                     ),
                     "goal": 1000,
                 }

@@ -17,7 +17,7 @@ from tests.bench.caller import Caller, Flood, milliseconds, payloads
 from tests.bench.floor import Floor
 from tests.bench.rig import Rig
 from tests.bench.service import FLAG, MAP
-from tests.bench.statistics import Estimate, estimate, median, overhead_ratio, percentile
+from tests.estimates import Estimate, estimate_of_rounds, median, overhead_ratio, percentile
 from tests.rmw_zenoh import rmw_router
 
 _WARM_UP = 30
@@ -95,13 +95,15 @@ def _row(
     }
     for side, sample in in_ms.items():
         row[f"{side}_ms"] = _interval(
-            estimate({side: sample}, lambda s, side=side: median(s[side]), source, resamples=500)
+            estimate_of_rounds(
+                {side: sample}, lambda s, side=side: median(s[side]), source, resamples=500
+            )
         )
         row[f"{side}_p99_ms"] = percentile(sample, 99)
     for way, name in (("proxied", "overhead_ratio"), ("bare", "bare_ratio")):
         if way in in_ms:
             row[name] = _interval(
-                estimate(
+                estimate_of_rounds(
                     in_ms,
                     lambda s, way=way: overhead_ratio(
                         median(s["direct"]), median(s[way]), median(s["get"])

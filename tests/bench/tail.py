@@ -10,7 +10,7 @@ from typing import Any
 from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.rig import Rig
 from tests.bench.service import CANCEL, FLAG
-from tests.bench.statistics import percentile
+from tests.estimates import percentile
 
 # Service times of facts that robots meet: lognormal, and one request in a hundred stalls.
 _MEDIAN_S, _SIGMA, _STALLED, _STALL_S = 0.1, 0.35, 0.01, 2.0

@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.estimates import Estimate, mean, p99, ratio
 from tests.evaluation import plotting
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Finding, Table
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
-from tests.evaluation.statistics import Estimate, mean, p99, ratio
 
 CONDITIONS = ("single", "two", "single-fault", "two-fault")
 REGIONS = ("us-west-1", "us-west-2")  # the paper's California and Oregon
@@ -136,6 +136,6 @@ def figure(samples: Samples, title: str) -> Any:
 
 def medians(samples: Samples, field: str, conditions: Sequence[str]) -> dict[str, float]:
     """Return the median of a column for some conditions."""
-    from tests.evaluation.statistics import p50
+    from tests.estimates import median
 
-    return {c: p50(samples.column(c, field)) for c in conditions}
+    return {c: median(samples.column(c, field)) for c in conditions}

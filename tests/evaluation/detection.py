@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from tests.estimates import median
 from tests.evaluation import comparing, workspaces
 from tests.evaluation.caller import Caller
 from tests.evaluation.comparing import CONDITIONS, REGIONS, faulted, replicas
@@ -25,7 +26,6 @@ from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
-from tests.evaluation.statistics import p50
 
 TYPE = "detect_interfaces/srv/Detect"
 HEALTHY_S = 0.09  # what a request shall take without the fault
@@ -126,8 +126,8 @@ def _whys(samples: Samples) -> Mapping[str, str]:
 
 def _reached(samples: Samples) -> Iterator[Finding]:
     for condition in ("single-fault", "two-fault"):
-        middle = p50(samples.column(condition, "rtt_west_1_s"))
-        other = p50(samples.column("single", "rtt_west_1_s"))
+        middle = median(samples.column(condition, "rtt_west_1_s"))
+        other = median(samples.column("single", "rtt_west_1_s"))
         yield Finding(
             f"{comparing.LABELS[condition]}: round trip to us-west-1 over that without the fault",
             "100",
@@ -192,7 +192,7 @@ class _Trial:
         for condition in CONDITIONS:
             self._caller.wait(_service(condition), self._type)
             self._ask(condition, 0)  # the first one takes longer
-        quick = p50([self._ask("two", number)[1] for number in range(15)])
+        quick = median([self._ask("two", number)[1] for number in range(15)])
         self._delay_s = max(LEAST_DELAY_S, (HEALTHY_S - quick) / 2)
         paths = [(c, r) for c in CONDITIONS for r in REGIONS[: replicas(c)]]
         with ThreadPoolExecutor(2) as threads:

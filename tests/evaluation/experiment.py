@@ -16,8 +16,8 @@ from tests.evaluation.pools import Pools
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from tests.estimates import Estimate
     from tests.evaluation.samples import Samples
-    from tests.evaluation.statistics import Estimate
 
 Value = float | int | str | bool
 Row = dict[str, Value]

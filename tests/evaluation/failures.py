@@ -15,12 +15,12 @@ from typing import Any
 
 from fogft.planning.reliability import replicas_needed, system_unavailability, unavailability
 from fogft.simulation.model import MarketModel, Timing
+from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
 from tests.evaluation.simulated import unavailable
-from tests.evaluation.statistics import Estimate, estimate, mean
 
 UPTIME_S, RECOVERY_S = 15 * 3600.0, 20 * 60.0  # the paper's
 TARGETS = (0.999, 0.9995, 0.9999, 0.99999)

@@ -11,11 +11,11 @@ from typing import Any
 
 from fogft.simulation import arithmetic
 from fogft.simulation.model import MarketModel, Timing
+from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
 from tests.evaluation.samples import Samples
 from tests.evaluation.simulated import unavailable
-from tests.evaluation.statistics import Estimate, estimate, mean
 
 REPLICAS = (1, 2, 3, 4)
 _MODEL, _TIMING = MarketModel(), Timing()

@@ -13,13 +13,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.estimates import median, p99, ratio
 from tests.evaluation import plotting
 from tests.evaluation.caller import Caller
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
-from tests.evaluation.statistics import p50, p99, ratio
 
 REPLICAS = (1, 2, 3)
 REGIONS = ("us-west-1", "us-west-2", "us-east-1")
@@ -82,7 +82,7 @@ class Overhead(Defaults):
                 ratio(samples.column(f"replicas-{n}", "latency_s"), direct, statistic),
                 why=_why(samples),
             )
-            for word, statistic in (("median", p50), ("P99", p99))
+            for word, statistic in (("median", median), ("P99", p99))
             for n in REPLICAS
         ]  # fmt: skip
 
@@ -101,7 +101,7 @@ class Overhead(Defaults):
 
 
 def _why(samples: Samples) -> str:
-    load = p50([float(row["load"]) for condition in samples for row in samples[condition]])
+    load = median([float(row["load"]) for condition in samples for row in samples[condition]])
     why = "A call that takes no time itself: the worst case for a proxy."
     if load > _BUSY:
         why += (

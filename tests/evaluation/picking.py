@@ -24,12 +24,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.estimates import mean, median, p99
 from tests.evaluation import comparing, picking_figures, workspaces
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
-from tests.evaluation.statistics import mean, p50, p99
 
 TYPE = "pick_interfaces/srv/LocateTag"
 SERVICE = "/locate_tag"
@@ -138,7 +138,7 @@ class Picking(Defaults):
             took = [float(row["latency_s"]) for row in rows]
             won = [sum(str(row["winner"]) == str(slot) for row in rows) for slot in (0, 1)]
             spent = float(rows[-1]["at_s"]) - float(rows[0]["at_s"])
-            numbers = [mean(took), p50(took), p99(took), max(took)]
+            numbers = [mean(took), median(took), p99(took), max(took)]
             lines.append(
                 [f"{phase}: {word}", f"{spent:.0f}", str(len(rows)), *map(str, won)]
                 + [f"{1000 * number:.1f}" for number in numbers]

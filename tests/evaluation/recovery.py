@@ -16,13 +16,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from tests.estimates import estimate, median
 from tests.evaluation import plotting
 from tests.evaluation.caller import Caller
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
-from tests.evaluation.statistics import estimate, p50
 
 POOL, SERVICE = "echo", "/echo"
 PERIOD_S = 0.05  # from request to request
@@ -86,7 +86,7 @@ class Recovery(Defaults):
                     Finding(
                         f"{condition}: {word} after, median",
                         paper,
-                        estimate(samples.column(condition, field), p50),
+                        estimate(samples.column(condition, field), median),
                         "s",
                         why,
                     )

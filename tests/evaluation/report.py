@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from tests.evaluation import statistics
+from tests import estimates
 from tests.evaluation.experiment import Experiment, Finding, Table
 from tests.evaluation.samples import Samples
 
@@ -97,7 +97,7 @@ def circumstances(samples: Samples) -> str:
     loads = [float(row["load"]) for row in rows]
     return (
         f"{len(rows)} trials, begun between {_moment(first)} and {_moment(last)}; load average "
-        f"{min(loads):.1f} to {max(loads):.1f}, median {statistics.p50(loads):.1f}."
+        f"{min(loads):.1f} to {max(loads):.1f}, median {estimates.median(loads):.1f}."
     )
 
 
@@ -129,9 +129,9 @@ def measured(experiment: Experiment, samples: Samples) -> Table:
             values = samples.column(condition, measure)
             if values:
                 numbers = (
-                    statistics.mean(values),
-                    statistics.p50(values),
-                    statistics.p99(values),
+                    estimates.mean(values),
+                    estimates.median(values),
+                    estimates.p99(values),
                     max(values),
                 )
                 rows.append([condition, measure, str(len(values)), *(f"{n:.4g}" for n in numbers)])

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
+from tests.estimates import mean, median
 from tests.evaluation import comparing, workspaces
 from tests.evaluation.caller import Caller
 from tests.evaluation.comparing import CONDITIONS, faulted, replicas
@@ -24,7 +25,6 @@ from tests.evaluation.contending import Contender
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
-from tests.evaluation.statistics import mean, p50
 
 TYPE = "segment_interfaces/srv/Segment"
 SERVICE = "/segment"
@@ -110,7 +110,7 @@ class Segmentation(Defaults):
 
 
 def _whys(samples: Samples) -> Mapping[str, str]:
-    alone = p50(samples.column("single", "latency_s"))
+    alone = median(samples.column("single", "latency_s"))
     shared = (
         "The two replicas and the second client's work share this machine's two cores, and slow "
         "one another down, which VMs with GPUs of their own do not"
@@ -191,7 +191,7 @@ class _Trial:
                 self._first, took_s = self._ask(name)
                 self._settle(name)
                 took.append(took_s)
-        self._alone_s = p50(took)
+        self._alone_s = median(took)
 
     def run(self, condition: str, number: int) -> Row:
         """Ask once, with the second client about or not."""

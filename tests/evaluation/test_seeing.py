@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from tests.bench.rig import ROOT
+from tests.estimates import mean, median
 from tests.evaluation import (
     comparing,
     contending,
@@ -22,7 +23,6 @@ from tests.evaluation import (
 )
 from tests.evaluation.comparing import CONDITIONS
 from tests.evaluation.samples import Samples, Store
-from tests.evaluation.statistics import mean, p50
 from tests.needs import needs
 
 RESULTS = ROOT / "docs" / "results"
@@ -238,10 +238,10 @@ class TestCommitted:
 
     def test_the_path_to_one_region_was_100_ms_longer_and_no_other_one(self):
         samples = committed(detection.EXPERIMENT, CONDITIONS)
-        west = {c: p50(samples.column(c, "rtt_west_1_s")) for c in CONDITIONS}
+        west = {c: median(samples.column(c, "rtt_west_1_s")) for c in CONDITIONS}
         for kind in ("single", "two"):
             assert west[f"{kind}-fault"] - west[kind] == pytest.approx(0.1, abs=0.02)
-        other = [p50(samples.column(c, "rtt_west_2_s")) for c in ("two", "two-fault")]
+        other = [median(samples.column(c, "rtt_west_2_s")) for c in ("two", "two-fault")]
         assert other[0] == pytest.approx(other[1], abs=0.02)
         assert mean(samples.column("single-fault", "latency_s")) > 0.1
 

@@ -9,11 +9,11 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from tests.estimates import estimate, mean
 from tests.evaluation import plotting
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Defaults, Finding, Run, Scale, Stage
 from tests.evaluation.samples import Samples
-from tests.evaluation.statistics import estimate, mean
 
 REPLICAS = (1, 2, 4)
 WAYS = ("directly", "gateway")

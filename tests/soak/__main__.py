@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import statistics
 import sys
 import tempfile
 import time
@@ -17,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.estimates import median, p99
 from tests.link.namespaces import can_make_namespaces
 from tests.link.wire_pool import wait_for
 from tests.proxy.gateway_pool import ran
@@ -124,8 +124,7 @@ def show(outcome: Outcome, loads: Mapping[str, Load], seed: int) -> None:
     for kind in (CALM, *done):
         took = sorted(t for load in loads.values() for t in load.took.get(kind, ()))
         if took:
-            p99 = took[min(len(took) - 1, int(0.99 * len(took)))]
-            cells = (statistics.median(took), p99, took[-1])
+            cells = (median(took), p99(took), took[-1])
             times = "".join(f"{1e3 * s:>7.0f} ms" for s in cells)
             print(f"{kind:<22}{done.get(kind, ''):>6}{len(took):>10}{times}")
     print(

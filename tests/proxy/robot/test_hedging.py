@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.model.spec import HedgingMode
 from fogft.requests.adaptive import BUDGET_CAPACITY
-from tests.bench.statistics import percentile
+from tests.estimates import percentile
 from tests.nightly import by_day
 from tests.proxy.robot.simulated import World, lognormal
 
