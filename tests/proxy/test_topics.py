@@ -117,8 +117,8 @@ class World:
     def publish_all(self, slot: int) -> None:
         """Do what the replica's thread does, here."""
         replica = self.replicas[slot]
-        while not replica._queue.empty():
-            replica._publish_one(replica._queue.get())
+        while not replica.queue.empty():
+            replica.publish_one(replica.queue.get())
 
 
 @pytest.fixture(autouse=True)

@@ -89,7 +89,7 @@ class Forwarder:
         self._open: dict[bytes, Passage] = {}
         self._by_robot: Counter[str] = Counter()
         self._kept: OrderedDict[bytes, tuple[float, bytes]] = OrderedDict()
-        self._kept_bytes = 0
+        self.kept_bytes = 0
         self._queue: SimpleQueue[Passage | None] = SimpleQueue()
         self.passed = 0
         self.joined = 0
@@ -218,10 +218,10 @@ class Forwarder:
 
     def _keep(self, passage: Passage, payload: bytes) -> None:
         self._kept[passage.id] = (passage.deadline, payload)
-        self._kept_bytes += len(payload)
-        while self._kept_bytes > self._kept_limit or len(self._kept) > 4 * self._held:
+        self.kept_bytes += len(payload)
+        while self.kept_bytes > self._kept_limit or len(self._kept) > 4 * self._held:
             _, (_, oldest) = self._kept.popitem(last=False)
-            self._kept_bytes -= len(oldest)
+            self.kept_bytes -= len(oldest)
 
     # -- time -----------------------------------------------------------------------------
 
@@ -242,7 +242,7 @@ class Forwarder:
             passages = list(self._open.values())
             while self._kept and next(iter(self._kept.values()))[0] <= now:
                 _, (_, payload) = self._kept.popitem(last=False)
-                self._kept_bytes -= len(payload)
+                self.kept_bytes -= len(payload)
         for passage in passages:
             if passage.deadline <= now:
                 self._stop(passage.id, Refusal.EXPIRED)

@@ -22,6 +22,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
+from typing import NamedTuple
 
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
@@ -36,6 +37,15 @@ log = logging.getLogger(__name__)
 # tests/proxy/test_processes.py, which sends a burst to an ordinary service.
 OUTSTANDING = 10
 _DEADLINES_KEPT = 1024  # of a service, of work that was forgotten
+
+
+class Remembered(NamedTuple):
+    """How much a `Responder` remembers."""
+
+    requests: int
+    deadlines: int
+    answers: int  # that copies of their requests would get
+    answer_bytes: int
 
 
 class Responder:
@@ -287,6 +297,13 @@ class Responder:
             self.ran += 1
             return True
         return False
+
+    @property
+    def remembered(self) -> Remembered:
+        """How much of requests is remembered, answered ones included."""
+        with self._lock:
+            deadlines = sum(map(len, self._deadlines.values()))
+            return Remembered(len(self._work), deadlines, len(self._kept), self._kept_bytes)
 
     def _finished(self, work: Work, payload: bytes) -> None:
         now = self._clock()

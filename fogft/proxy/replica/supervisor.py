@@ -54,7 +54,7 @@ class Supervisor:
         self._clock = clock
         self._backoff_s = backoff_s
         self._wait_s = backoff_s[0]
-        self._start_at = 0.0
+        self.start_at = 0.0
         self._started_at = 0.0
         self._child: subprocess.Popen[bytes] | None = None
         self.restarts = -1  # the first start is no restart
@@ -78,7 +78,7 @@ class Supervisor:
                 return False
             died = True
             self._note_death(status)
-        if self._clock() >= self._start_at:
+        if self._clock() >= self.start_at:
             self._start()
         return died
 
@@ -93,7 +93,7 @@ class Supervisor:
         )
         log.warning("run_ended status=%d ran_s=%.1f again_in_s=%.1f", status, ran_s, self._wait_s)
         self._child = None
-        self._start_at = self._clock() + self._wait_s
+        self.start_at = self._clock() + self._wait_s
         self._wait_s = min(self._wait_s * 2, self._backoff_s[1])
 
     def _start(self) -> None:
@@ -110,7 +110,7 @@ class Supervisor:
             )
         except OSError as error:
             self.last_exit = f"cannot be started: {error}"
-            self._start_at = self._clock() + self._wait_s
+            self.start_at = self._clock() + self._wait_s
             self._wait_s = min(self._wait_s * 2, self._backoff_s[1])
             log.error("run_not_started reason=%r", str(error))
             return
@@ -124,7 +124,7 @@ class Supervisor:
     def stop(self, grace_s: float = 3.0) -> None:
         """End the command: SIGINT as ROS nodes expect, then SIGKILL. Repeatable."""
         child, self._child = self._child, None
-        self._start_at = float("inf")
+        self.start_at = float("inf")
         if child is None:
             return
         with contextlib.suppress(ProcessLookupError):

@@ -116,7 +116,7 @@ class TopicsOnReplica:
         self._seen = {name: Seen() for name in self._topics}
         self._trouble: dict[str, str] = {}
         # Publishing may block for a moment, and the wire's threads must not.
-        self._queue: SimpleQueue[Incoming | None] = SimpleQueue()
+        self.queue: SimpleQueue[Incoming | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
 
     def __bool__(self) -> bool:
@@ -174,7 +174,7 @@ class TopicsOnReplica:
         """Take a message or a pull from the wire. Never blocks."""
         outgoing = self._outgoing.get(incoming.service)
         if outgoing is None:
-            self._queue.put(incoming)
+            self.queue.put(incoming)
             return
         try:
             outgoing.pulled(incoming)
@@ -192,9 +192,9 @@ class TopicsOnReplica:
                 self._note(name, subscription.mismatch())
 
     def _publish(self) -> None:
-        while (incoming := self._queue.get()) is not None:
+        while (incoming := self.queue.get()) is not None:
             try:
-                self._publish_one(incoming)
+                self.publish_one(incoming)
             except (FrameError, Unreadable) as error:
                 log.warning("message_refused topic=%s reason=%r", incoming.service, str(error))
                 incoming.refuse(Refusal.MALFORMED)
@@ -202,7 +202,8 @@ class TopicsOnReplica:
                 log.exception("message_not_published topic=%s", incoming.service)
                 incoming.refuse(Refusal.NOT_READY)
 
-    def _publish_one(self, incoming: Incoming) -> None:
+    def publish_one(self, incoming: Incoming) -> None:
+        """Publish one message that waited, and tell the robot. On the publishing thread."""
         session, number, message = frames.decode_message(incoming.payload)
         publisher = self._publishers.get(incoming.service)
         if publisher is None:
@@ -214,4 +215,4 @@ class TopicsOnReplica:
 
     def close(self) -> None:
         """Publish no more."""
-        self._queue.put(None)
+        self.queue.put(None)

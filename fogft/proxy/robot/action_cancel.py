@@ -38,7 +38,7 @@ class CancelDispatcher(ReachingAll):
         return super().forward(request, payload, handle, timeout_s)
 
     def _note(self, id: bytes, goal: bytes, until: float) -> None:
-        with self._shared.lock:
+        with self.shared.lock:
             self._sent[id] = goal, until
             while len(self._sent) > CANCELS_KEPT:
                 self._sent.popitem(last=False)
@@ -52,28 +52,28 @@ class CancelDispatcher(ReachingAll):
         if answer.payload is None:
             self._not_heard(answer.request_id, key_of(link))
         elif goals.is_success(Part.CANCEL, answer.payload):
-            with self._shared.lock:
+            with self.shared.lock:
                 for goal in goals.cancelled(answer.payload):
-                    self._shared.goals.cancelled(goal)
+                    self.shared.goals.cancelled(goal)
         super().answered(link, answer)
 
     def _not_heard(self, id: bytes, replica: int) -> None:
         now = self._clock()
-        with self._shared.lock:
+        with self.shared.lock:
             goal, until = self._sent.get(id, (b"", 0.0))
             if now < until:
                 again = ToCancel(goal, replica, now + _AGAIN_S, until)
-                self._shared.to_cancel.append(again)
+                self.shared.to_cancel.append(again)
 
     def tick(self) -> float:
         """Also tell who works in vain, or was not there."""
         now = self._clock()
-        with self._shared.lock:
-            due = list(self._shared.to_cancel)
-            self._shared.to_cancel.clear()
+        with self.shared.lock:
+            due = list(self.shared.to_cancel)
+            self.shared.to_cancel.clear()
         later = [one for one in due if not self._tell(one, now) and now < one.until]
-        with self._shared.lock:
-            self._shared.to_cancel += later
+        with self.shared.lock:
+            self.shared.to_cancel += later
         return super().tick()
 
     def _tell(self, one: ToCancel, now: float) -> bool:

@@ -71,7 +71,7 @@ class PartDispatcher(Dispatcher):
         shared: Shared,
         **others: Any,
     ) -> None:
-        self._shared = shared
+        self.shared = shared
         self._part = spec.part
         super().__init__(spec, respond, **others)
 
@@ -91,8 +91,8 @@ class PartDispatcher(Dispatcher):
 
     def close(self) -> None:
         """End the action's goals: what comes in its place may be another action."""
-        with self._shared.lock:
-            self._shared.goals.clear()
+        with self.shared.lock:
+            self.shared.goals.clear()
 
 
 class ReachingAll(PartDispatcher):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -40,16 +41,16 @@ class GoalDispatcher(ReachingAll):
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Take a client's goal, and note who is given it."""
         goal, until = goals.goal_of(payload), self._clock() + timeout_s
-        with self._shared.lock:
-            self._shared.goals.made(payload, request, tuple(self._links), until)
+        with self.shared.lock:
+            self.shared.goals.made(payload, request, tuple(self._links), until)
         taken = super().forward(request, payload, handle, timeout_s)
         if not taken:
             self._is_over(goal)
         return taken
 
     def _declined(self, request: bytes, replica: int) -> None:
-        with self._shared.lock:
-            self._shared.goals.failed(request, replica, self._clock())
+        with self.shared.lock:
+            self.shared.goals.failed(request, replica, self._clock())
         super()._declined(request, replica)
 
     def answered(self, link: Link, answer: Answer) -> None:
@@ -58,37 +59,37 @@ class GoalDispatcher(ReachingAll):
         took = self._took(answer, replica)  # before its client can know, and ask for the result
         if took is not None and took.goal is not None:
             if not took.in_vain:
-                self._shared.began(took.goal, replica)
+                self.shared.began(took.goal, replica)
             else:
-                with self._shared.lock:
-                    self._shared.cancel(took.goal, (replica,), self._clock())
+                with self.shared.lock:
+                    self.shared.cancel(took.goal, (replica,), self._clock())
                 self._wake()
         super().answered(link, answer)
 
     def _took(self, answer: Answer, replica: int) -> Took | None:
         id, payload, now = answer.request_id, answer.payload, self._clock()
-        with self._shared.lock:
+        with self.shared.lock:
             if payload is None and answer.refusal != Refusal.MALFORMED:
-                self._shared.goals.failed(id, replica, now)
+                self.shared.goals.failed(id, replica, now)
                 return None
             accepts = payload is not None and goals.is_success(Part.GOAL, payload)
-            return self._shared.goals.took(id, replica, now, accepts=accepts)
+            return self.shared.goals.took(id, replica, now, accepts=accepts)
 
     def _is_over(self, goal: bytes) -> None:
         """Nobody was asked, or has answered: unless it was accepted, the goal is over, too."""
-        with self._shared.lock:
-            if goal not in self._shared.goals:
-                self._shared.goals.ended(goal)
+        with self.shared.lock:
+            if goal not in self.shared.goals:
+                self.shared.goals.ended(goal)
 
     def route(self, links: Sequence[Link]) -> None:
         """Give replicas that have come the goals that are under way."""
         before, after = dict(self._links), {key_of(link): link for link in links}
         come = [replica for replica, link in after.items() if before.get(replica) is not link]
-        with self._shared.lock:
+        with self.shared.lock:
             for replica in before.keys() - after.keys():
-                self._shared.goals.left(replica)
-            for goal in self._shared.goals.unwanted():  # it may have missed that
-                self._shared.cancel(goal, come, self._clock())
+                self.shared.goals.left(replica)
+            for goal in self.shared.goals.unwanted():  # it may have missed that
+                self.shared.cancel(goal, come, self._clock())
         super().route(links)
         self._catch_up()
 
@@ -100,22 +101,22 @@ class GoalDispatcher(ReachingAll):
     def _catch_up(self) -> None:
         now = self._clock()
         for replica, link in tuple(self._links.items()):
-            with self._shared.lock:
-                lacking = self._shared.goals.lacking(replica, now)
+            with self.shared.lock:
+                lacking = self.shared.goals.lacking(replica, now)
             for payload in lacking:
                 self._give(replica, link, payload)
 
     def _give(self, replica: int, link: Link, payload: bytes) -> None:
         id, timeout_s = os.urandom(REQUEST_ID_BYTES), self.spec.timeout_s
         goal, now = goals.goal_of(payload), self._clock()
-        with self._shared.lock:
-            self._shared.goals.gave(goal, id, replica, now + timeout_s)
+        with self.shared.lock:
+            self.shared.goals.gave(goal, id, replica, now + timeout_s)
         if link.offer(self.spec.name, id, payload, timeout_s):
             log.info("goal_sent_again service=%s replica=%s goal=%s", self.spec.name,
                      link.peer.id.short, goal.hex())  # fmt: skip
             return
-        with self._shared.lock:
-            self._shared.goals.failed(id, replica, now)
+        with self.shared.lock:
+            self.shared.goals.failed(id, replica, now)
 
 
 class ResultDispatcher(PartDispatcher):
@@ -123,7 +124,7 @@ class ResultDispatcher(PartDispatcher):
 
     def __init__(self, *args: Any, **others: Any) -> None:
         super().__init__(*args, **others)
-        self._shared.began = self._began
+        self.shared.began = self._began
 
     def _began(self, goal: bytes, replica: int) -> None:
         """A replica has taken a goal, perhaps anew: it may be asked for the result."""
@@ -135,8 +136,8 @@ class ResultDispatcher(PartDispatcher):
         """Take a request for a result; its goal is under way until that comes."""
         taken = super().forward(request, payload, handle, timeout_s)
         if taken:
-            with self._shared.lock:
-                self._shared.goals.awaited(goals.goal_of(payload))
+            with self.shared.lock:
+                self.shared.goals.awaited(goals.goal_of(payload))
         return taken
 
     def answered(self, link: Link, answer: Answer) -> None:
@@ -152,25 +153,25 @@ class ResultDispatcher(PartDispatcher):
         replica, goal = key_of(link), goals.goal_of(pending.item.payload)
         if payload is None:
             if answer.refusal in _MAY_HAVE_LOST_ITS_GOALS:
-                with self._shared.lock:
-                    self._shared.goals.lost(goal, replica)
+                with self.shared.lock:
+                    self.shared.goals.lost(goal, replica)
             super().answered(link, answer)
             return
         asked_at = pending.open.get(replica, -math.inf)
-        with self._shared.lock:
-            under_way = goal in self._shared.goals
-            had = self._shared.goals.had(goal, replica, asked_at)
+        with self.shared.lock:
+            under_way = goal in self.shared.goals
+            had = self.shared.goals.had(goal, replica, asked_at)
         if under_way and goals.is_unknown(payload) and had is not Had.TAKEN:
             reason = Refusal.FORGOTTEN if had is Had.REFUSED else Refusal.NOT_READY
             super().answered(link, answer._replace(payload=None, refusal=reason))
             return
-        with self._shared.lock:
-            losers = (self._shared.goals.takers(goal) | set(self._links)) - {replica}
+        with self.shared.lock:
+            losers = (self.shared.goals.takers(goal) | set(self._links)) - {replica}
         super().answered(link, answer)
         won = goals.is_success(Part.RESULT, payload) and answer.request_id not in self._requests
         if under_way and won:
-            with self._shared.lock:
-                self._shared.cancel(goal, losers, self._clock())
+            with self.shared.lock:
+                self.shared.cancel(goal, losers, self._clock())
             self._wake()
 
     def _rejected(self, id: ReplicaId, replica: int, request: bytes, payload: bytes) -> None:
@@ -181,14 +182,15 @@ class ResultDispatcher(PartDispatcher):
         super()._rejected(id, replica, request, payload)
 
     def _is_over(self, goal: bytes) -> None:
-        with self._shared.lock:
-            self._shared.goals.ended(goal)
+        with self.shared.lock:
+            self.shared.goals.ended(goal)
 
 
 class Actions:
     """Makes the dispatchers of actions, and has those of one action share what they must."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self._shared: dict[str, Shared] = {}
 
     def make(
@@ -198,10 +200,10 @@ class Actions:
         action = spec.name.rpartition("/")[0]
         shared = self._shared.setdefault(action, Shared())
         if spec.part is Part.GOAL:
-            return GoalDispatcher(spec, respond, shared, wake=wake)
+            return GoalDispatcher(spec, respond, shared, wake=wake, clock=self._clock)
         if spec.part is Part.RESULT:
-            return ResultDispatcher(spec, respond, shared, wake=wake)
-        return CancelDispatcher(spec, respond, shared, wake=wake)
+            return ResultDispatcher(spec, respond, shared, wake=wake, clock=self._clock)
+        return CancelDispatcher(spec, respond, shared, wake=wake, clock=self._clock)
 
 
 def _is_about(goal: bytes, request: Request) -> bool:

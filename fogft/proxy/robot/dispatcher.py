@@ -96,8 +96,8 @@ class Dispatcher:
         self._empty_response = empty_response
         self._wake = wake
         self._clock = clock
-        self._max_pending_bytes = max_pending_bytes
-        self._max_pending = max_pending
+        self.max_pending_bytes = max_pending_bytes
+        self.max_pending = max_pending
         self._pending_bytes = 0
         self._lock = threading.Lock()
         self._requests: FirstResponse[Request] = FirstResponse()
@@ -131,8 +131,8 @@ class Dispatcher:
         count = self._outcomes.count
         with self._lock:
             self._outcomes.received(len(payload))
-            bytes_over = self._pending_bytes + len(payload) > self._max_pending_bytes
-            if bytes_over or len(self._requests) >= self._max_pending:
+            bytes_over = self._pending_bytes + len(payload) > self.max_pending_bytes
+            if bytes_over or len(self._requests) >= self.max_pending:
                 count["turned_away"] += 1
                 turned_away = count["turned_away"]
                 self._outcomes.note(request, "turned_away", took_s=0.0)

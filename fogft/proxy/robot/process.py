@@ -268,14 +268,14 @@ def _loop(
         memory.look()
         sign.look()
         if watched_config.changed():
-            _apply(functools.partial(_reconfigure, config_path, config, parts), config_path)
-        _apply(functools.partial(_follow_parameters, parts), config_path)
-        _apply(functools.partial(_follow, following, proxy), config.membership)
+            try_step(functools.partial(_reconfigure, config_path, config, parts), config_path)
+        try_step(functools.partial(_follow_parameters, parts), config_path)
+        try_step(functools.partial(_follow, following, proxy), config.membership)
         if watched_certificate.changed():
             proxy.renew()
             following.renew()
         if revocations is not None and revocations.changed():
-            _apply(functools.partial(_tell, revocations.path, proxy), revocations.path)
+            try_step(functools.partial(_tell, revocations.path, proxy), revocations.path)
         seen.diagnose(proxy.report, now)
         if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
             reported, changed = now, False
@@ -283,15 +283,15 @@ def _loop(
                 log.warning("folder_gone path=%s", config_path.parent)
                 return
             report = {**proxy.report(), **following.report()}
-            _apply(functools.partial(_report, config, report, now - started), config.status)
+            try_step(functools.partial(_report, config, report, now - started), config.status)
             trace = config.status.with_name(TRACE_NAME)
-            _apply(functools.partial(_write_trace, trace, proxy), trace)
+            try_step(functools.partial(_write_trace, trace, proxy), trace)
 
 
 _troubles: dict[Path, str] = {}
 
 
-def _apply(step: Callable[[], None], path: Path) -> None:
+def try_step(step: Callable[[], None], path: Path) -> None:
     """Do one step; a bad file, or a full disk, is logged once and changes nothing."""
     try:
         step()

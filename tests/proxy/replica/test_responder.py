@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.interruption import EMPTY_REQUEST
-from fogft.proxy.replica.responder import Responder
+from fogft.proxy.replica.responder import Remembered, Responder
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
 
 A = b"a" * 16
+NOTHING = Remembered(0, 0, 0, 0)
 B = b"b" * 16
 
 
@@ -112,11 +113,10 @@ def test_deadlines_of_what_was_forgotten_do_not_pile_up():
     for n in range(5000):
         scene.ask(n.to_bytes(16, "big"), remaining_s=3600.0)
         scene.answer(5000 + n)
-    assert len(scene.responder._deadlines["/s"]) < 1200
+    assert scene.responder.remembered.deadlines < 1200
     scene.clock.now += 3601.0
     scene.responder.tick()
-    assert not scene.responder._deadlines["/s"]
-    assert not scene.responder._work
+    assert scene.responder.remembered == NOTHING
 
 
 def test_a_copy_of_finished_work_gets_the_kept_answer():
@@ -322,8 +322,7 @@ def test_finished_ids_are_forgotten_at_their_deadline():
         scene.answer(n)
     scene.clock.now += 1.0
     scene.responder.tick()
-    assert len(scene.responder._work) == len(scene.responder._kept) == 0
-    assert scene.responder._kept_bytes == 0
+    assert scene.responder.remembered == NOTHING
 
 
 def test_the_number_of_ids_is_bounded():
@@ -331,7 +330,7 @@ def test_the_number_of_ids_is_bounded():
     for n in range(100):
         scene.ask(n.to_bytes(16, "big"))
         scene.answer(n)
-    assert len(scene.responder._work) <= 10
+    assert scene.responder.remembered.requests <= 10
 
 
 def test_what_waits_and_is_no_longer_wanted_is_dropped_and_counted():
@@ -506,4 +505,4 @@ def test_every_copy_gets_exactly_one_outcome_and_runs_never_overlap(steps):
             assert incoming.outcome == [b"to " + incoming.payload]
     waiting = sum(1 for incoming in asked if not incoming.outcome)
     assert (waiting == 0) == (scene.responder.in_flight == 0)
-    assert scene.responder._kept_bytes >= 0
+    assert scene.responder.remembered.answer_bytes >= 0

@@ -24,7 +24,7 @@ class Scene:
             ReplicaId(UID, 2, 3),
             services or (ServiceSpec("/s", "std_srvs/srv/SetBool"),),
             self.listener,
-            self.make_node,
+            lambda: self.make_node(),
             self.supervisor,  # type: ignore[arg-type]
             orphan_after_s=60.0,
             clock=self.clock,
@@ -81,7 +81,7 @@ def test_requests_after_a_death_are_refused_until_the_service_is_back():
     scene.proxy.run_once()
     scene.supervisor.dies = True
     original = scene.make_node
-    scene.proxy._make_node = lambda: absent(original())
+    scene.make_node = lambda: absent(original())
     scene.proxy.run_once()
     incoming = FakeIncoming(b"a" * 16)
     scene.listener.on_request(incoming)

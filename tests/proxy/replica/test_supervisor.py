@@ -34,8 +34,8 @@ def alive(pid: int) -> bool:
 def supervise(tmp_path):
     made: list[Supervisor] = []
 
-    def make(command: str, **options) -> Supervisor:
-        made.append(Supervisor(command, tmp_path, os.environ, **options))
+    def make(command: str, folder: Path = tmp_path, **options) -> Supervisor:
+        made.append(Supervisor(command, folder, os.environ, **options))
         return made[-1]
 
     yield make
@@ -43,9 +43,9 @@ def supervise(tmp_path):
         supervisor.stop(0.1)
 
 
-def test_the_command_runs_in_its_folder_with_its_environment(supervise, tmp_path):
+def test_the_command_runs_in_its_folder_with_its_environment(supervise, tmp_path, monkeypatch):
+    monkeypatch.setenv("FOGFT_TEST", "42")
     supervisor = supervise("pwd > where; echo $FOGFT_TEST > what; exec sleep 60")
-    supervisor._environ["FOGFT_TEST"] = "42"
     supervisor.poll()
     wait_until(lambda: (tmp_path / "what").exists() and (tmp_path / "what").read_text())
     assert (tmp_path / "where").read_text().strip() == str(tmp_path)
@@ -73,8 +73,8 @@ def test_the_wait_doubles_and_is_bounded(supervise):
     for _ in range(5):
         supervisor.poll()
         wait_until(lambda: supervisor.poll())
-        waits.append(supervisor._start_at - clock.now)
-        clock.now = supervisor._start_at
+        waits.append(supervisor.start_at - clock.now)
+        clock.now = supervisor.start_at
     assert waits == [1.0, 2.0, 4.0, 4.0, 4.0]
 
 
@@ -97,8 +97,7 @@ def test_stop_ends_what_ignores_signals_and_what_it_started(supervise, tmp_path)
 
 
 def test_a_command_that_cannot_be_started_is_tried_again(supervise, tmp_path):
-    supervisor = supervise("true")
-    supervisor._workdir = tmp_path / "missing"
+    supervisor = supervise("true", tmp_path / "missing")
     assert not supervisor.poll()
     assert "cannot be started" in supervisor.last_exit
 

@@ -8,7 +8,7 @@ import pytest
 
 from fogft.poolfile.topics import action_services
 from fogft.proxy.robot.actions import Actions
-from fogft.topics.goals import Goals, cancel_request, goal_of
+from fogft.topics.goals import cancel_request, goal_of
 from tests.proxy.fakes import Clock, FakeLink
 
 GOAL, CANCEL, RESULT = action_services("/count", "p/action/T", 5.0, 60.0)
@@ -24,13 +24,11 @@ class Scene:
     def __init__(self, replicas: int = 2) -> None:
         self.clock = Clock()
         self.answers: list[tuple[Any, bytes]] = []
-        actions = Actions()
+        actions = Actions(self.clock)
         self.parts = {
             spec.part.value: actions.make(spec, self._answered, lambda: None)
             for spec in (GOAL, CANCEL, RESULT)
         }
-        for part in self.parts.values():
-            part._clock = self.clock
         self.links = [FakeLink(slot) for slot in range(replicas)]
         self.route(*self.links)
 
@@ -171,11 +169,6 @@ def test_a_result_of_a_goal_that_nobody_knows_is_told_as_such():
     assert scene.answers == [("result", UNKNOWN)]
 
 
-def left_of(known: Goals) -> dict[str, Any]:
-    """Return what it keeps, without the ids of requests whose answers may still come."""
-    return {name: kept for name, kept in vars(known).items() if name != "_over"}
-
-
 def latest(link: FakeLink, name: str) -> int:
     return max(i for i, offered in enumerate(link.offered) if offered[0] == name)
 
@@ -271,7 +264,7 @@ def test_a_goal_that_nobody_took_in_time_leaves_nothing_behind():
     scene.tick(6.0)
     scene.ask("goal", HEADER + b"j" * 16)
     scene.say(0, REFUSED, "goal")
-    assert left_of(scene.parts["goal"]._shared.goals) == left_of(Goals())
+    assert scene.parts["goal"].shared.goals.nothing_kept
 
 
 def test_a_replica_whose_command_crashed_often_is_asked_once_it_has_begun_anew():
@@ -365,7 +358,7 @@ def test_a_result_that_is_turned_away_is_awaited_by_nobody():
     scene = Scene(1)
     scene.ask("goal", HEADER + ID)
     scene.say(0, ACCEPTED, "goal")
-    scene.parts["result"]._max_pending = 0
+    scene.parts["result"].max_pending = 0
     scene.ask("result", HEADER + ID)
     late = FakeLink(7)
     scene.route(late)
@@ -457,7 +450,7 @@ def test_who_never_comes_back_is_not_told_for_ever():
     scene.say(0, SUCCEEDED, "result")
     for _ in range(70):
         scene.tick(1.0)
-    assert not scene.parts["cancel"]._shared.to_cancel
+    assert not scene.parts["cancel"].shared.to_cancel
     scene.route(first, second)
     scene.tick(1.0)
     assert scene.given(second, "cancel") == []

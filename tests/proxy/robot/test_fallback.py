@@ -210,7 +210,7 @@ def test_a_trace_leaves_out_who_had_no_room():
 
 def test_what_is_turned_away_is_in_the_trace():
     scene = Scene(trace=True)
-    scene.dispatcher._max_pending_bytes = 0
+    scene.dispatcher.max_pending_bytes = 0
     scene.ask()
     [line] = scene.dispatcher.trace()
     assert (line["outcome"], line["asked"], line["refused"]) == ("turned_away", {}, {})

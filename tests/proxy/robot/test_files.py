@@ -153,10 +153,10 @@ def test_a_file_that_stays_bad_is_logged_once(tmp_path, caplog):
         raise FogftError("no space left")
 
     for _ in range(5):
-        process._apply(fail, tmp_path / "x")
+        process.try_step(fail, tmp_path / "x")
     assert caplog.text.count("no space left") == 1
-    process._apply(lambda: None, tmp_path / "x")
-    process._apply(fail, tmp_path / "x")
+    process.try_step(lambda: None, tmp_path / "x")
+    process.try_step(fail, tmp_path / "x")
     assert caplog.text.count("no space left") == 2
 
 

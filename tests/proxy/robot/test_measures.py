@@ -11,18 +11,18 @@ from fogft.proxy.robot.dispatcher import Dispatcher
 from tests.proxy.fakes import UID, Clock, FakeDialer, FakeLink
 
 
-def dispatcher(clock: Clock) -> Dispatcher:
+def dispatcher(clock: Clock) -> tuple[Dispatcher, FakeLink]:
     made = Dispatcher(ServiceSpec("/s", "t", timeout_s=5.0), lambda handle, payload: None,
                       clock=clock)  # fmt: skip
-    made.route([FakeLink(0)])
-    return made
+    link = FakeLink(0)
+    made.route([link])
+    return made, link
 
 
 def test_every_outcome_of_a_service_is_told():
     """One answered, one silent after a crash, each with its copies, its time and its reason."""
     clock = Clock()
-    one = dispatcher(clock)
-    [link] = one._links.values()
+    one, link = dispatcher(clock)
     one.submit(b"q", 1)
     clock.now += 0.2
     one.answered(link, link.reply(b"r"))
@@ -45,7 +45,7 @@ def test_every_outcome_of_a_service_is_told():
 
 def test_a_gateway_tells_of_its_robots_too():
     clock = Clock()
-    proxy = ClientProxy(UID, NoRos(), FakeDialer(), lambda *_: dispatcher(clock), clock=clock)
+    proxy = ClientProxy(UID, NoRos(), FakeDialer(), lambda *_: dispatcher(clock)[0], clock=clock)
     proxy.serve([ServiceSpec("/s", "t")])
     told = {**proxy.report(), "forwarded": Forwarder().report(), "listener": {"requests": 3}}
     said = text(proxies.of_gateway(told)).splitlines()

@@ -97,11 +97,11 @@ class ZenohListener:
         self._work_queue = WorkQueue(self._counters)
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
-        self._streams = Streams(slow=self._slow)
+        self.streams = Streams(slow=self._slow)
         self._control = ControlQueries(
             sessions=self._sessions,
             records=RecordSet(id.pool_uid, LazyVerifier(credentials.ca)),
-            streams=self._streams,
+            streams=self.streams,
             queues=self._queues,
             work=self._work_queue,
             counters=self._counters,
@@ -229,7 +229,7 @@ class ZenohListener:
         requests: Sequence[tuple[frame.RequestHeader, bytes]],
     ) -> None:
         token = requests[0][0].token
-        stream = self._streams.of(token)
+        stream = self.streams.of(token)
         if stream is None or not self._sessions.admits(token):
             self._counters.warn(
                 log, "not_admitted", "robot_not_admitted reason=%r", "it did not greet"
@@ -308,7 +308,7 @@ class ZenohListener:
         if session is None:
             return
         self._declared.clear()
-        self._streams.clear()
+        self.streams.clear()
         if self._reaper is not None:
             self._reaper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)

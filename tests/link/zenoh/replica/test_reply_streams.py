@@ -97,7 +97,7 @@ def test_a_connection_whose_answers_have_ended_is_replaced(
         assert link.offer(SERVICE, request_id(1), b"first", 60.0)
         wait_for(lambda: len(held) == 1)
         held.clear()
-        listener._streams.clear()
+        listener.streams.clear()
         wait_for(lambda: owner.of(1))
         wait_for(lambda: link.usable and link.status().reopened == 1)
         assert link.offer(SERVICE, request_id(2), b"second", 60.0)

@@ -7,10 +7,17 @@ import signal
 import sys
 from collections.abc import Callable
 
-from fogft.link.zenoh.replica.listener import ZenohListener
+from fogft.link.counters import Counters
+from fogft.link.zenoh.replica.control_queries import ControlQueries
+from fogft.link.zenoh.replica.query_ends import QueryTurns
+from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from fogft.link.zenoh.replica.reply_streams import Streams
+from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
-from fogft.model.replica import ReplicaId
+from fogft.link.zenoh.work_queue import WorkQueue
+from fogft.records.record_set import RecordSet
+from fogft.records.signing import LazyVerifier
 from tests.link.wire_pool import POOL_UID, SERVICE, Authority, ReplicaProcess, request_id, wait_for
 
 # A send to the frozen replica blocks for longer than any test waits.
@@ -81,10 +88,19 @@ class Query:
 
 def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authority) -> None:
     """A robot that probes without end has its probes dropped and counted, and each query ended."""
-    listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
+    counters, turns, verifier = Counters(), QueryTurns(), LazyVerifier(authority.replica().ca)
+    work = WorkQueue(counters)  # not begun: nothing leaves it
+    control = ControlQueries(
+        sessions=AuthenticatedSessions(POOL_UID, "replica", verifier),
+        records=RecordSet(POOL_UID, verifier),
+        streams=Streams(),
+        queues=ReplyQueues(counters, turns),
+        work=work,
+        counters=counters,
+    )
     for turn in range(3000):
-        listener._turns.came()
-        listener._control.later(lambda: None, Query(), turn)
-    dropped = listener.counters()["chores_dropped"]
-    assert 0 < len(listener._work_queue) == 3000 - dropped <= 1024
+        turns.came()
+        control.later(lambda: None, Query(), turn)
+    dropped = counters.snapshot()["chores_dropped"]
+    assert 0 < len(work) == 3000 - dropped <= 1024
     wait_for(lambda: Query.ended == dropped)
