@@ -1,7 +1,7 @@
-"""``fogft scale | drain | exclude | include``: ask a running pool for something else.
+"""``fogft scale | drain | exclude | include``: change what a running pool aims for.
 
-Each records the wish on disk and returns; the manager acts on it within a tick, and
-still does after it was killed.
+Each writes the pool's intent and returns; the manager acts on it in its next tick, even if
+it is killed and started again in between.
 """
 
 from __future__ import annotations
@@ -22,51 +22,39 @@ if TYPE_CHECKING:
 Count = Annotated[int, typer.Argument(min=1, max=16, metavar="N", help="How many.")]
 
 
-scale = group("Ask for more or fewer replicas.")
+scale = group("Add or remove replicas.")
 
 
-@scale.command("up", cls=Command)
+@scale.command("up", cls=Command, epilog="fogft scale up 1")
 def scale_up(count: Count, pool: PoolOption = None) -> None:
-    """Ask for N more replicas.
+    """Add N replicas.
 
-    This stays until the pool file's own `replicas` changes.
-
-    \b
-    Example:
-      fogft scale up 1
+    This holds until `replicas` changes in the pool file.
     """
     _scale(pool, count)
 
 
-@scale.command("down", cls=Command)
+@scale.command("down", cls=Command, epilog="fogft scale down 1")
 def scale_down(count: Count, pool: PoolOption = None) -> None:
-    """Ask for N fewer replicas; at least one stays.
+    """Remove N replicas; at least one stays.
 
-    This stays until the pool file's own `replicas` changes. Replicas that go finish
-    what they work on first.
-
-    \b
-    Example:
-      fogft scale down 1
+    This holds until `replicas` changes in the pool file. Replicas that are removed finish
+    their requests first.
     """
     _scale(pool, -count)
 
 
 def drain(slot: Slot, pool: PoolOption = None) -> None:
-    """Replace one replica, the new one first.
+    """Replace one replica, starting the new one first.
 
-    The old one finishes what it works on, and goes.
-
-    \b
-    Example:
-      fogft drain 2
+    The old one finishes its requests and is then ended.
     """
     from fogft.pool.commands import composition, wishes
 
     store = composition.store_of(pool)
     replica = wishes.drain(store, slot, time.time())
-    output.done(f"replica `{replica}` of `{store.name}` is to be replaced")
-    _remark_on_manager(store)
+    output.done(f"replica `{replica}` of `{store.name}` will be replaced")
+    _warn_without_manager(store)
 
 
 def exclude(
@@ -80,19 +68,14 @@ def exclude(
     ],
     pool: PoolOption = None,
 ) -> None:
-    """Launch nothing in a location, and move away what runs there.
-
-    \b
-    Example:
-      fogft exclude local/us-west-2
-    """
+    """Launch nothing in a location, and move replicas out of it."""
     from fogft.pool.commands import composition, wishes
 
     store = composition.store_of(pool)
     is_new = wishes.exclude(store, location, composition.cloud_of(store.identity()))
     since = "is now" if is_new else "was already"
     output.done(f"`{location}` {since} excluded from `{store.name}`")
-    _remark_on_manager(store)
+    _warn_without_manager(store)
 
 
 def include(
@@ -101,23 +84,18 @@ def include(
         typer.Argument(
             metavar="LOCATION",
             autocompletion=options.excluded,
-            help="As it was given to `exclude`.",
+            help="As given to `exclude`.",
         ),
     ],
     pool: PoolOption = None,
 ) -> None:
-    """Allow a location again that was excluded.
-
-    \b
-    Example:
-      fogft include local/us-west-2
-    """
+    """Allow an excluded location again."""
     from fogft.pool.commands import composition, wishes
 
     store = composition.store_of(pool)
     wishes.include(store, location)
     output.done(f"`{location}` may be used by `{store.name}` again")
-    _remark_on_manager(store)
+    _warn_without_manager(store)
 
 
 def _scale(pool: str | None, by: int) -> None:
@@ -125,11 +103,11 @@ def _scale(pool: str | None, by: int) -> None:
 
     store = composition.store_of(pool)
     before, after = wishes.scale(store, by)
-    output.done(f"`{store.name}` shall have {after} replicas (was {before})")
-    _remark_on_manager(store)
+    output.done(f"`{store.name}` will have {after} replicas (was {before})")
+    _warn_without_manager(store)
 
 
-def _remark_on_manager(store: PoolStore) -> None:
+def _warn_without_manager(store: PoolStore) -> None:
     if not disk.is_locked(store.paths.manager_lock):
-        output.warn(f"no manager of `{store.name}` runs: this happens once one does")
+        output.warn(f"`{store.name}` has no manager: this takes effect once it has one")
         output.hint(f"start it with `fogft up {store.identity().file}`")

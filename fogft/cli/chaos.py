@@ -26,7 +26,7 @@ Location = Annotated[
 Duration = Annotated[
     float | None,
     typer.Option(
-        "--for", min=0, metavar="S", help="Seconds; until `clear` unless told.", show_default=False
+        "--for", min=0, metavar="S", help="Seconds; by default until `clear`.", show_default=False
     ),
 ]
 
@@ -34,7 +34,7 @@ Duration = Annotated[
 chaos = group("Make things go wrong in a pool on the local cloud.")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos preempt 0")
 def preempt(
     slot: Slot,
     notice: Annotated[
@@ -44,62 +44,42 @@ def preempt(
             min=0,
             metavar="S",
             show_default=False,
-            help="Seconds until the end, instead of the zone's own.",
+            help="Seconds until the end; by default the zone's.",
         ),
     ] = None,
     pool: PoolOption = None,
 ) -> None:
-    """Take a replica's machine away as a spot market does: a notice, then the end.
-
-    \b
-    Example:
-      fogft chaos preempt 0
-    """
+    """Preempt a replica's machine as a spot market does: a notice, then the end."""
     machine = _machine(pool, slot)
     left_s = _chaos().preempt(machine, notice)
-    output.done(f"replica `{machine.short}` has notice and ends in {left_s:.0f} s")
+    output.done(f"replica `{machine.short}` got notice and ends in {left_s:.0f} s")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos kill 0")
 def kill(slot: Slot, pool: PoolOption = None) -> None:
-    """End a replica's machine at once, with SIGKILL.
-
-    \b
-    Example:
-      fogft chaos kill 0
-    """
+    """Kill a replica's machine at once, with SIGKILL."""
     machine = _machine(pool, slot)
     _chaos().kill(machine)
     output.done(f"replica `{machine.short}` was killed")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos freeze 1")
 def freeze(slot: Slot, pool: PoolOption = None) -> None:
-    """Stop a replica's machine without ending it, with SIGSTOP.
-
-    \b
-    Example:
-      fogft chaos freeze 1
-    """
+    """Freeze a replica's machine, with SIGSTOP."""
     machine = _machine(pool, slot)
     count = _chaos().freeze(machine)
     output.done(f"replica `{machine.short}` is frozen ({count} processes)")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos thaw 1")
 def thaw(slot: Slot, pool: PoolOption = None) -> None:
-    """Let a frozen machine go on.
-
-    \b
-    Example:
-      fogft chaos thaw 1
-    """
+    """Let a frozen machine continue."""
     machine = _machine(pool, slot)
     count = _chaos().thaw(machine)
-    output.done(f"replica `{machine.short}` goes on ({count} processes)")
+    output.done(f"replica `{machine.short}` continues ({count} processes)")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos slow 1 80")
 def slow(
     slot: Slot,
     delay_ms: Annotated[
@@ -114,70 +94,45 @@ def slow(
     lasting: Duration = None,
     pool: PoolOption = None,
 ) -> None:
-    """Delay all that passes over the link to a replica.
-
-    \b
-    Example:
-      fogft chaos slow 1 80
-    """
+    """Delay everything on the link to a replica."""
     machine = _machine(pool, slot)
     bytes_per_s = None if rate is None else rate * 1e6 / 8
     _chaos().slow(machine, delay_ms / 1000, bytes_per_s, lasting)
     limit = "" if rate is None else f" and passes {rate:g} Mbit/s"
-    output.done(f"the link to `{machine.short}` takes {delay_ms:g} ms more each way{limit}")
+    output.done(f"the link to `{machine.short}` takes {delay_ms:g} ms longer each way{limit}")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos blackhole 1")
 def blackhole(slot: Slot, lasting: Duration = None, pool: PoolOption = None) -> None:
-    """Let nothing pass over the link to a replica, without closing it.
-
-    \b
-    Example:
-      fogft chaos blackhole 1
-    """
+    """Drop everything on the link to a replica, without closing it."""
     machine = _machine(pool, slot)
     _chaos().blackhole(machine, lasting)
-    output.done(f"nothing passes over the link to `{machine.short}` any more")
+    output.done(f"the link to `{machine.short}` drops everything")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos outage local/us-west-2")
 def outage(location: Location, lasting: Duration = None) -> None:
-    """End all machines in a location, and launch none there, until `clear`.
-
-    \b
-    Example:
-      fogft chaos outage local/us-west-2
-    """
+    """End all machines in a location, and launch none there."""
     hit = _chaos().outage(location, lasting)
     names = ", ".join(f"`{machine.short}`" for machine in hit) or "no machine"
-    output.done(f"`{location}` is out; it hits {names}")
+    output.done(f"`{location}` is out; this ends {names}")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos capacity local/us-west-2 0")
 def capacity(
     location: Location,
-    machines: Annotated[int, typer.Argument(min=0, metavar="N", help="How many fit in.")],
+    machines: Annotated[int, typer.Argument(min=0, metavar="N", help="How many machines fit.")],
 ) -> None:
-    """Say how many machines fit into a location.
-
-    \b
-    Example:
-      fogft chaos capacity local/us-west-2 0
-    """
+    """Limit how many machines fit into a location."""
     _chaos().capacity(location, machines)
     output.done(f"`{location}` has room for {machines} machines; those that run stay")
 
 
-@chaos.command(cls=Command)
+@chaos.command(cls=Command, epilog="fogft chaos clear")
 def clear() -> None:
-    """Undo what lasts: slow and dead links, frozen machines, outages, capacities.
-
-    \b
-    Example:
-      fogft chaos clear
-    """
+    """Undo slow and dead links, frozen machines, outages and capacity limits."""
     _chaos().clear()
-    output.done("nothing is slow, dead, frozen, out or full on purpose any more")
+    output.done("all faults made on purpose are undone")
 
 
 def _chaos() -> Chaos:

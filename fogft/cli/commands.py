@@ -15,51 +15,63 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-# Section -> command -> its module in this package.
-SECTIONS: Mapping[str, Mapping[str, str]] = {
+# Section -> command -> its module in this package, and the arguments of an example.
+SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Begin and end": {
-        "init": "lifecycle",
-        "up": "lifecycle",
-        "join": "credentials",
-        "down": "lifecycle",
-        "sweep": "sweep",
+        "init": ("lifecycle", "planner --into my_pool"),
+        "up": ("lifecycle", "pool.yaml"),
+        "join": ("credentials", "ada.join"),
+        "down": ("lifecycle", ""),
+        "sweep": ("sweep", ""),
     },
-    "Look": {"plan": "plan", "status": "status", "logs": "status", "doctor": "doctor"},
+    "Look": {
+        "plan": ("plan", "pool.yaml"),
+        "status": ("status", "--watch"),
+        "logs": ("status", "2 -f"),
+        "doctor": ("doctor", "pool.yaml"),
+    },
     "Change what runs": {
-        "scale": "change",
-        "drain": "change",
-        "exclude": "change",
-        "include": "change",
-        "credentials": "credentials",
+        "scale": ("change", ""),
+        "drain": ("change", "2"),
+        "exclude": ("change", "local/us-west-2"),
+        "include": ("change", "local/us-west-2"),
+        "credentials": ("credentials", ""),
     },
-    "Try what happens when": {"simulate": "simulate", "chaos": "chaos"},
-    "Run one part by hand": dict.fromkeys(
-        ("proxy", "serve", "manager", "rendezvous", "gateway"), "parts"
-    ),
+    "Try what happens when": {
+        "simulate": ("simulate", "pool.yaml --traces recorded/ --plot report.png"),
+        "chaos": ("chaos", ""),
+    },
+    "Run one part by hand": {
+        "proxy": ("parts", "--config ~/.local/state/fogft/pools/planner/proxy.yaml"),
+        "serve": ("parts", "--config replica.yaml --listen 0.0.0.0:7447"),
+        "manager": ("parts", "planner"),
+        "rendezvous": ("parts", "--config rendezvous.yaml --listen 0.0.0.0:7450"),
+        "gateway": ("parts", "--config gateway.yaml --listen 0.0.0.0:7470"),
+    },
 }
-_MODULES = {name: module for names in SECTIONS.values() for name, module in names.items()}
+_COMMANDS = {name: row for names in SECTIONS.values() for name, row in names.items()}
 
 
 class _Loaded(Mapping[str, Any]):
     """The commands by name, each imported when it is looked up."""
 
     def __getitem__(self, name: str) -> Any:
-        return _load(_MODULES[name], name)
+        return _load(name, *_COMMANDS[name])
 
     def __iter__(self) -> Iterator[str]:
-        return iter(_MODULES)
+        return iter(_COMMANDS)
 
     def __len__(self) -> int:
-        return len(_MODULES)
+        return len(_COMMANDS)
 
 
 @cache
-def _load(module: str, name: str) -> Any:
+def _load(name: str, module: str, example: str) -> Any:
     found = getattr(import_module(f"fogft.cli.{module}"), name)
     if isinstance(found, typer.Typer):
         return typer.main.get_command(found)
     alone = typer.Typer(add_completion=False)
-    alone.command(name, cls=Command)(found)
+    alone.command(name, cls=Command, epilog=f"fogft {name} {example}")(found)
     return typer.main.get_command(alone)
 
 
@@ -85,7 +97,10 @@ class Commands(TyperGroup):
 
 
 class Command(TyperCommand):
-    """A command whose arguments stand as ``SLOT`` or ``[FILE]``, without types and ranges."""
+    """A command whose arguments stand as ``SLOT`` or ``[FILE]``, without types and ranges.
+
+    Its epilog is an example of its use.
+    """
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **{**options, "rich_markup_mode": None})
@@ -103,6 +118,11 @@ class Command(TyperCommand):
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the example."""
+        with formatter.section("Example"):
+            formatter.write_text(self.epilog or "")
 
     def _arguments(self, ctx: Any) -> list[Any]:
         return [one for one in self.get_params(ctx) if one.param_type_name == "argument"]

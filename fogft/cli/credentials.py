@@ -1,7 +1,7 @@
-"""``fogft credentials issue | list | revoke | rotate`` and ``fogft join``: who is let in.
+"""``fogft credentials | join``: issue, list, revoke, rotate and use a pool's certificates.
 
-A passphrase is typed, read from a file, or made here; it is never an argument. Keys are
-shown nowhere.
+A passphrase is typed, read from a file or generated; it is never an argument. Keys are never
+shown.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ PassphraseFile = Annotated[
 ]
 
 
-credentials = group("Say who is let in, and who no longer is.")
+credentials = group("Issue, list, revoke and rotate certificates.")
 
 
-@credentials.command(cls=Command)
+@credentials.command(cls=Command, epilog="fogft credentials issue robot ada")
 def issue(
     role: RoleName,
     name: Annotated[str, typer.Argument(metavar="NAME", help="Its name; a replica's slot.")],
@@ -52,19 +52,15 @@ def issue(
     ] = None,
     hours: Annotated[
         float,
-        typer.Option("--hours", min=0.1, max=720, metavar="H", help="Good to join for so long."),
+        typer.Option("--hours", min=0.1, max=720, metavar="H", help="How long it can be used."),
     ] = DAY_H,
     passphrase_file: PassphraseFile = None,
     pool: PoolOption = None,
 ) -> None:
-    """Write a join bundle: one file that lets another machine into the pool, one time.
+    """Write a join bundle: one file that admits another machine to the pool, once.
 
-    Without a passphrase of yours a good one is made and shown. Tell it on another way than
-    the file goes.
-
-    \b
-    Example:
-      fogft credentials issue robot ada
+    Without a passphrase of your own, one is generated and shown. Send it by another way than
+    the file.
     """
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import issue_credentials
@@ -86,17 +82,12 @@ def issue(
     output.hint(f"copy `{file}` to the other machine, and run `fogft join {file.name}` there")
 
 
-@credentials.command("list", cls=Command)
+@credentials.command("list", cls=Command, epilog="fogft credentials list")
 def list_(
     as_json: AsJson = False,
     pool: PoolOption = None,
 ) -> None:
-    """Show the certificates that the pool's CA has issued. Keys are never shown.
-
-    \b
-    Example:
-      fogft credentials list
-    """
+    """List the certificates that the pool's CA has issued, without their keys."""
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import certificates
 
@@ -112,7 +103,7 @@ def list_(
     output.show(output.table(("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL"), rows))
 
 
-@credentials.command(cls=Command)
+@credentials.command(cls=Command, epilog="fogft credentials revoke robot ada")
 def revoke(
     role: RoleName,
     name: Annotated[
@@ -120,13 +111,9 @@ def revoke(
     ],
     pool: PoolOption = None,
 ) -> None:
-    """Take certificates back: both ends of every link to their holder close it, for good.
+    """Revoke certificates: every link to their holder is closed for good.
 
-    A replica whose certificate is taken back is replaced.
-
-    \b
-    Example:
-      fogft credentials revoke robot ada
+    A replica whose certificate is revoked is replaced.
     """
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import revoke_credentials
@@ -134,32 +121,28 @@ def revoke(
     holders, told = revoke_credentials(composition.store_of(pool), _role(role), name)
     listed = ", ".join(f"`{holder.short}`" for holder in holders)
     if told:
-        output.done(f"{role} {listed} is let in no more")
+        output.done(f"{role} {listed} is no longer admitted")
     else:
-        output.warn(f"{role} {listed} is revoked, but no manager runs that could tell the others")
+        output.warn(f"{role} {listed} is revoked, but without a manager the others do not know")
         output.hint("`fogft up` starts one")
 
 
-@credentials.command(cls=Command)
+@credentials.command(cls=Command, epilog="fogft credentials rotate robot")
 def rotate(
     role: RoleName,
     name: Annotated[
         str,
         typer.Argument(
-            metavar="NAME", help="A replica's slot; all of them unless told.", show_default=False
+            metavar="NAME", help="A replica's slot; by default all.", show_default=False
         ),
     ] = "",
     pool: PoolOption = None,
 ) -> None:
-    """Give this machine's robot, or the replicas, new keys and certificates. No request is lost.
+    """Give the robot or the replicas new keys and certificates, without losing a request.
 
     The robot's links go over to the new ones while requests flow; then the old ones are
     taken back. Replicas are replaced, the new one first. For a robot or a gateway on another
     machine issue a new bundle, join there with it, and revoke the old generation.
-
-    \b
-    Example:
-      fogft credentials rotate robot
     """
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import rotate_replicas, rotate_robot
@@ -167,7 +150,7 @@ def rotate(
     store, which = composition.store_of(pool), _role(role)
     if which is Role.REPLICA:
         if name and not name.isdecimal():
-            raise FogftError(f"`{name}` is no slot", "see `fogft status`")
+            raise FogftError(f"`{name}` is not a slot", "see `fogft status`")
         replaced = rotate_replicas(store, int(name) if name else None)
         listed = ", ".join(f"`{one}`" for one in replaced)
         output.done(f"{listed} will be replaced, each with a new key; see `fogft status`")
@@ -184,9 +167,9 @@ def rotate(
             f"robot `{holder.short}` is certified, but its client proxy does not use it yet"
         )
         listed = " ".join(h.short for h in old)
-        output.hint(f"the old one stays good; later: `fogft credentials revoke robot {listed}`")
+        output.hint(f"the old one stays valid; later run `fogft credentials revoke robot {listed}`")
         return
-    taken = f"; `{'`, `'.join(h.short for h in old)}` is taken back" if old else ""
+    taken = f"; `{'`, `'.join(h.short for h in old)}` is revoked" if old else ""
     output.done(f"all links use the keys of robot `{holder.short}`{taken}")
 
 
@@ -196,15 +179,11 @@ def join(
     ],
     passphrase_file: PassphraseFile = None,
 ) -> None:
-    """Set this machine up as a robot, gateway or replica of a pool, from one file.
+    """Set this machine up as a robot, gateway or replica, from a join bundle.
 
     The file is good for one time, on one machine: where the pool has a rendezvous, that is asked,
     so one has to run. Then the file is destroyed. To give a robot new keys, join again with a
     new bundle: a proxy that runs takes them into use without losing a request.
-
-    \b
-    Example:
-      fogft join ada.join
     """
     from fogft.pool.commands import joining
     from fogft.pool.commands.credentials import join_here

@@ -24,13 +24,9 @@ def doctor(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check this machine, ROS 2 and the pools on it; say what to do.
+    """Check this machine, ROS 2 and the pools on it, and how to fix what is wrong.
 
     Each finding comes with its remedy. Changes nothing. Exit status 1 when something does not work.
-
-    \b
-    Example:
-      fogft doctor pool.yaml
     """
     from fogft.doctor import checks
     from fogft.doctor.finding import Verdict

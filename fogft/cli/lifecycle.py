@@ -32,17 +32,12 @@ def init(
             "--into",
             metavar="DIR",
             show_default=False,
-            help="Where to; a folder with the example's name unless told.",
+            help="Target folder; by default one with the example's name.",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
 ) -> None:
-    """Write an example to start from: a pool file with its nodes.
-
-    \b
-    Example:
-      fogft init planner --into my_pool
-    """
+    """Write an example pool: its pool file and its nodes."""
     from fogft.pool.commands.init import DEFAULT_EXAMPLE, copy_example
 
     name = name or DEFAULT_EXAMPLE
@@ -60,11 +55,11 @@ def up(
             "--cloud",
             metavar="NAME",
             show_default=False,
-            help="Where to run; what the file's resources name, else `local`.",
+            help="Where to run; by default what the file's resources name, else `local`.",
         ),
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask. Nothing is asked on the local cloud.")
+        bool, typer.Option("--yes", "-y", help="Do not ask. The local cloud never asks.")
     ] = False,
     timeout: Annotated[
         float | None,
@@ -73,19 +68,15 @@ def up(
             min=1,
             metavar="S",
             show_default=False,
-            help="Wait so long for the services; 300, on real clouds 1800 unless told.",
+            help="How long to wait for the services; 300, on real clouds 1800.",
         ),
     ] = None,
 ) -> None:
-    """Start a pool, or make a running one as its file says now.
+    """Start a pool, or apply a changed pool file to a running one.
 
     Returns once every service answers. Replicas that still start do so in the background. A
     changed file whose replicas have to be replaced is waited for: `up` fails where the update
     is stopped and rolled back.
-
-    \b
-    Example:
-      fogft up pool.yaml
     """
     from fogft.cli import progress
     from fogft.pool.commands import preview, startup
@@ -100,7 +91,7 @@ def up(
     limit_s = timeout or (REAL_LIMIT_S if order.preview.costs_money else LIMIT_S)
     applied_at = time.time()
     if startup.start(order) and not order.preview.is_new:
-        output.say("it had no manager: one was started, and takes over what runs")
+        output.say("it had no manager: a new one takes over what runs")
     name = order.spec.name
     replaces = order.preview.replaces_replicas or order.preview.rolled_back
     awaited = Awaited(
@@ -111,7 +102,7 @@ def up(
     try:
         seen, outcome = progress.wait(PoolPaths.of(name), awaited, limit_s)
     except KeyboardInterrupt:
-        output.say(f"interrupted: `{name}` goes on starting; `fogft down {name}` ends it")
+        output.say(f"interrupted: `{name}` continues to start; `fogft down {name}` ends it")
         raise typer.Exit(130) from None
     if outcome is Outcome.WITHDRAWN and seen.status.update is not None:
         raise FogftError(
@@ -120,30 +111,30 @@ def up(
         )
     if outcome is not Outcome.ANSWERING:
         what = {
-            Outcome.RUN_KEEPS_ENDING: "does not answer: `run` ends again and again",
-            Outcome.TYPES_DIFFER: "cannot answer: the types are not the same on both sides",
+            Outcome.RUN_KEEPS_ENDING: "does not answer: `run` keeps ending",
+            Outcome.TYPES_DIFFER: "cannot answer: robot and replicas define its type differently",
         }
         raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
     status = seen.status
     if not status.target:
-        output.done(f"`{name}` is set up; its schedule wants no replica now")
+        output.done(f"`{name}` is set up; its schedule asks for no replica now")
         return
     missing = max(0, status.target - status.ready)
-    rest = f"; {missing} more in preparation, see `fogft status`" if missing else ""
+    rest = f"; {missing} more starting, see `fogft status`" if missing else ""
     if awaited.is_updating(seen):
-        rest = "; the update goes on, see `fogft status`"
+        rest = "; the update continues, see `fogft status`"
     for service in () if awaited.services else status.services:
         output.say(f"offers {service.name} ({service.type})")
     output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
 
 
 def must_ask(preview: Preview) -> bool:
-    """Whether applying a pool file can cost more than what was agreed to before."""
+    """Whether applying a pool file can cost more than was agreed to before."""
     return preview.costs_money and (preview.is_new or bool(preview.changes))
 
 
 def question(preview: Preview) -> str:
-    """Return what is asked before money is spent."""
+    """Return the question that is asked before money is spent."""
     count = len(preview.launches)
     if not preview.is_new or not count:
         return "go on?"
@@ -151,7 +142,7 @@ def question(preview: Preview) -> str:
 
 
 def not_answering(seen: Seen, what: str) -> FogftError:
-    """Return the error of a start that came to nothing, with all that is known of the reason."""
+    """Return the error of an `up` that failed, with all that is known of the reason."""
     from fogft import logfile
     from fogft.pool.commands import composition, logs
 
@@ -170,7 +161,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     lines += [f"  {line}" for line in logfile.tail(path, lines=8).splitlines()]
     return FogftError(
         "\n".join(lines),
-        "the manager goes on trying: see `fogft status` and `fogft logs`; "
+        "the manager keeps trying: see `fogft status` and `fogft logs`; "
         f"`fogft down {status.pool}` ends it",
     )
 
@@ -179,16 +170,12 @@ def down(
     pool: PoolArgument = None,
     yes: Annotated[
         bool,
-        typer.Option("--yes", "-y", help="Do not ask; only a person at a terminal is asked."),
+        typer.Option("--yes", "-y", help="Do not ask. Without a terminal, nothing is asked."),
     ] = False,
 ) -> None:
     """End a pool: its replicas, its client proxy and its manager.
 
     Works when the manager is dead, and is safe to repeat.
-
-    \b
-    Example:
-      fogft down
     """
     from fogft.pool.commands import composition
     from fogft.pool.manager import shutdown

@@ -53,9 +53,9 @@ def root(
     """Keep ROS 2 services answering while the machines that run them come and go.
 
     \b
-    fogft init          write an example to start from
-    fogft up            start the pool that its file describes
-    fogft status        see how it is
+    fogft init          write an example pool
+    fogft up            start the pool that a file describes
+    fogft status        show its state
     fogft down          end everything
     """
     if version:

@@ -80,7 +80,7 @@ PoolOption = Annotated[
     typer.Option(
         "--pool",
         "-p",
-        help="Which pool; needed when there are several.",
+        help="Pool name; required if there are several.",
         autocompletion=pools,
         show_default=False,
         metavar="NAME",
@@ -89,7 +89,7 @@ PoolOption = Annotated[
 PoolArgument = Annotated[
     str | None,
     typer.Argument(
-        help="Which pool; needed when there are several.", autocompletion=pools, show_default=False
+        help="Pool name; required if there are several.", autocompletion=pools, show_default=False
     ),
 ]
 Slot = Annotated[

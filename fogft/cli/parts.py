@@ -1,7 +1,6 @@
-"""One part of a pool, by hand, in the foreground: proxy, serve, manager, rendezvous, gateway.
+"""Run one part of a pool in the foreground: proxy, serve, manager, rendezvous or gateway.
 
-`fogft up` starts what a pool on its own needs. These are for a service manager, a container, a
-debugger.
+`fogft up` starts what a pool needs. These are for a service manager, a container or a debugger.
 """
 
 from __future__ import annotations
@@ -25,7 +24,9 @@ def _endpoint(value: str | None) -> str | None:
 Listen = Annotated[
     str | None,
     typer.Option(
-        metavar="HOST:PORT", help="Where to listen, instead of the file's.", show_default=False
+        metavar="HOST:PORT",
+        help="Where to listen; by default as the file says.",
+        show_default=False,
     ),
 ]
 
@@ -37,7 +38,7 @@ Metrics = Annotated[
     str | None,
     typer.Option(
         metavar="HOST:PORT",
-        help="Where to answer Prometheus (GET /metrics).",
+        help="Where to serve metrics for Prometheus (GET /metrics).",
         show_default=False,
         callback=_endpoint,
     ),
@@ -48,10 +49,6 @@ def proxy(config: Config, metrics: Metrics = None) -> None:
     """Run a client proxy: the robot's side of a pool.
 
     The manager writes its configuration to the pool's state folder as `proxy.yaml`.
-
-    \b
-    Example:
-      fogft proxy --config ~/.local/state/fogft/pools/planner/proxy.yaml
     """
     from fogft.proxy.robot import process
 
@@ -76,7 +73,7 @@ def serve(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A file that appears before this machine is taken away.",
+            help="A file that appears before this machine is preempted.",
             show_default=False,
         ),
     ] = None,
@@ -84,7 +81,7 @@ def serve(
         str | None,
         typer.Option(
             metavar="HOST:PORT",
-            help="Where others reach it, if it cannot know that: behind NAT.",
+            help="Where others reach it, when it is behind NAT.",
             show_default=False,
         ),
     ] = None,
@@ -93,10 +90,6 @@ def serve(
     """Run a server proxy: a replica's side of a pool.
 
     It starts the pool file's `run` command and restarts it when it dies.
-
-    \b
-    Example:
-      fogft serve --config replica.yaml --listen 0.0.0.0:7447
     """
     from fogft.proxy.replica import process
 
@@ -117,12 +110,7 @@ def manager(
     ],
     metrics: Metrics = None,
 ) -> None:
-    """Run a pool's manager: it observes, plans and applies.
-
-    \b
-    Example:
-      fogft manager planner
-    """
+    """Run a pool's manager: it observes, plans and applies."""
     from fogft.pool.commands import composition
     from fogft.pool.manager.manager import run
 
@@ -130,13 +118,9 @@ def manager(
 
 
 def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
-    """Run a rendezvous: it tells robots and replicas where others are.
+    """Run a rendezvous: it tells robots and replicas each other's addresses.
 
     It needs a port that all can reach and carries no requests. Run two, on two machines.
-
-    \b
-    Example:
-      fogft rendezvous --config rendezvous.yaml --listen 0.0.0.0:7450
     """
     from fogft.pool.commands.rendezvous import read_config, run
 
@@ -147,10 +131,6 @@ def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> N
     """Run a gateway: robots ask it once, and it asks all replicas.
 
     Run it where the uplink is wide: on a machine of its own, or on a replica's.
-
-    \b
-    Example:
-      fogft gateway --config gateway.yaml --listen 0.0.0.0:7470
     """
     from fogft.proxy.gateway import process
 

@@ -19,7 +19,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
             "--cloud",
             metavar="NAME",
             show_default=False,
-            help="Whose prices; what the file's resources name, else `local`.",
+            help="Whose prices; by default what the file's resources name, else `local`.",
         ),
     ] = None,
     prices: Annotated[
@@ -28,14 +28,14 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
             "--prices",
             metavar="CSV",
             show_default=False,
-            help="A table of prices in SkyPilot's columns, in place of a cloud.",
+            help="Prices from a table with SkyPilot's columns, not from a cloud.",
         ),
     ] = None,
     offline: Annotated[
-        bool, typer.Option("--offline", help="Measure no distances; use what is known.")
+        bool, typer.Option("--offline", help="Measure no distances; use those known.")
     ] = False,
     everything: Annotated[
-        bool, typer.Option("--all", help="Show every offer, not the best of each region.")
+        bool, typer.Option("--all", help="Show every offer, not only the best of each region.")
     ] = False,
     as_json: AsJson = False,
     plot: Annotated[
@@ -48,12 +48,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         ),
     ] = None,
 ) -> None:
-    """Show what a pool file would launch, why there, and what it costs. Launches nothing.
-
-    \b
-    Example:
-      fogft plan pool.yaml
-    """
+    """Show what a pool file would launch, why there, and what it costs. Launches nothing."""
     from fogft.cli import plan_plot, plan_text
     from fogft.pool.commands.plan import plan_file
 
@@ -66,4 +61,4 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         output.warn(note)
     if plot is not None:
         plan_plot.write(plot, shown)
-        output.done(f"drawn into {plot}")
+        output.done(f"`{plot}` is drawn")

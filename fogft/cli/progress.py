@@ -1,6 +1,6 @@
-"""What ``fogft up`` shows: what it will do, then each replica as it comes.
+"""Show what ``fogft up`` will do, then each replica as it starts.
 
-On a terminal a table that is redrawn; elsewhere one line for each change. All of it goes
+On a terminal, a table that is redrawn; elsewhere one line for each change. All of it goes
 to stderr.
 
 Owns: the words and the waiting.
@@ -48,26 +48,26 @@ def announce(preview: Preview) -> None:
             if not preview.new_before_old:
                 output.say(f"  {_no_room(spec)}")
         if preview.costs_money and preview.launches:
-            output.say(f"  at the prices of now all of it costs ${preview.usd_per_hour:.3f}/h")
+            output.say(f"  at today's prices the pool costs ${preview.usd_per_hour:.3f}/h")
     elif not preview.rolled_back:
-        output.say(f"pool `{spec.name}` is as its file says; nothing changes")
+        output.say(f"pool `{spec.name}` already matches its file; nothing changes")
     for note in preview.notes:
         output.warn(note)
 
 
 def _no_room(spec: PoolSpec) -> str:
-    """Say why a replica ends before its successor exists, and what that means."""
+    """Return why a replica ends before its successor exists, and what that means."""
     if spec.max_surge == 0:
         why = "`max_surge` is 0"
     else:
         why = f"${spec.max_usd_per_hour:g}/h (`max_usd_per_hour`) has no room for both"
     if spec.replicas == 1:
-        return f"{why}, and a single replica is not ended before: it stays as it is"
+        return f"{why}, and a lone replica is not ended first: it stays as it is"
     return f"{why}: meanwhile one fewer answers"
 
 
 def _show_launches(preview: Preview) -> None:
-    """Say where each replica will go, at what price, and how sure that is."""
+    """Show where each replica will go, at what price, and where the price is from."""
     from fogft.cli.plan_text import price_source
 
     rows = [
@@ -86,7 +86,7 @@ def _show_launches(preview: Preview) -> None:
 
 
 def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Outcome]:
-    """Show a pool's progress until an `up` has led to something; return what was last seen.
+    """Show a pool's progress until an `up` has an outcome; return the last status and the outcome.
 
     Args:
         paths: The pool.
@@ -94,7 +94,7 @@ def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Ou
         timeout_s: The longest to wait.
 
     Raises:
-        FogftError: Nobody manages the pool any more.
+        FogftError: The pool has no manager any more.
     """
     from fogft.pool.commands import status
     from fogft.pool.commands.outcome import Outcome
@@ -120,7 +120,7 @@ def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Ou
 
 @contextmanager
 def _shown() -> Iterator[Callable[[Seen], None]]:
-    """Yield a function that shows a status, in the way that stderr is fit for."""
+    """Yield a function that shows a status: redrawn on a terminal, else line by line."""
     if not output.is_terminal(sys.stderr):
         yield PhaseLines(output.say)
         return

@@ -57,7 +57,7 @@ class Verb:
 
 
 class Up(Verb):
-    """Start a pool, or make a running one as its file says now."""
+    """Start a pool, or apply a changed pool file to a running one."""
 
     NAME = "up"
 

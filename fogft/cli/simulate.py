@@ -1,4 +1,4 @@
-"""``fogft simulate``: what a pool would be worth, beside fixed policies, before it is started."""
+"""``fogft simulate``: cost and availability of a pool in simulated spot markets."""
 
 from __future__ import annotations
 
@@ -25,39 +25,35 @@ def simulate(
         typer.Option(metavar="DIR", help="Replay the spot traces recorded in this folder."),
     ] = None,
     fit: Annotated[
-        bool, typer.Option("--fit", help="Make up markets that are like the traces.")
+        bool, typer.Option("--fit", help="Generate markets that resemble the traces.")
     ] = False,
     model: Annotated[
         str,
         typer.Option(
             metavar="KEY=VALUE,...",
-            help="Make up markets: mttf_s, mttr_s, correlation, boot_s, notice_s and more.",
+            help="Generate markets: mttf_s, mttr_s, correlation, boot_s, notice_s and more.",
         ),
     ] = "",
     days: Annotated[
-        float, typer.Option(min=0.01, max=3650, metavar="N", help="Days measured by each seed.")
+        float, typer.Option(min=0.01, max=3650, metavar="N", help="Simulated days of each seed.")
     ] = 7.0,
     seeds: Annotated[
-        int, typer.Option(min=1, max=10_000, metavar="N", help="How many markets.")
+        int, typer.Option(min=1, max=10_000, metavar="N", help="Number of markets.")
     ] = 20,
     first_seed: Annotated[
-        int, typer.Option("--first-seed", min=0, metavar="N", help="Of the first market.")
+        int, typer.Option("--first-seed", min=0, metavar="N", help="Seed of the first market.")
     ] = 0,
     cloud: Annotated[
         str | None, typer.Option(metavar="NAME", help="Whose prices; else the pool file's cloud.")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw a PNG, SVG or PDF file as well.")
+        Path | None, typer.Option(metavar="FILE", help="Also draw a PNG, SVG or PDF file.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Run a pool in spot markets under simulated time, beside fixed policies.
+    """Simulate a pool in spot markets, beside fixed policies.
 
     The planner is the real one. Launches nothing; the same seeds give the same figures.
-
-    \b
-    Example:
-      fogft simulate pool.yaml --traces recorded/ --plot report.png
     """
     from fogft.simulation import run
     from fogft.simulation.plot import check, draw
@@ -91,7 +87,7 @@ HEADER = (
 
 
 def _show(report: Report) -> None:
-    """Print the table, with what independent replicas would reach below it."""
+    """Print the table, and below it what independent replicas would reach."""
     output.show(output.table(HEADER, map(_cells, report.rows), right=HEADER[1:]))
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "made up"

@@ -1,4 +1,4 @@
-"""``fogft status | logs``: look at a pool."""
+"""``fogft status | logs``: show a pool and its logs."""
 
 from __future__ import annotations
 
@@ -26,20 +26,16 @@ FOLLOW_EVERY_S = 0.2
 def status(
     pool: PoolArgument = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON; with --watch one object a line.")
+        bool, typer.Option("--json", help="Print JSON; with --watch, one object per line.")
     ] = False,
-    watch: Annotated[bool, typer.Option("--watch", "-w", help="Show it anew each second.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Update every second.")] = False,
     refresh: Annotated[
-        bool, typer.Option("--refresh", "-r", help="Have the manager look again first.")
+        bool, typer.Option("--refresh", "-r", help="Have the manager observe the pool first.")
     ] = False,
 ) -> None:
-    """Show a pool: its replicas, their links, and what became of the requests.
+    """Show a pool: its replicas, their links, and the outcome of requests.
 
-    Tells what the manager last saw, and how long ago that was.
-
-    \b
-    Example:
-      fogft status --watch
+    This is what the manager last saw, and how long ago.
     """
     from fogft.cli import status_text
     from fogft.pool.commands import composition
@@ -79,14 +75,14 @@ def _watch(paths: PoolPaths, *, as_json: bool) -> None:
 
 
 def _remark(seen: Seen) -> None:
-    """Say on stderr what a reader of the table might overlook."""
+    """Warn on stderr of what a reader of the table might overlook."""
     if seen.status.ended and not seen.manager_alive:
         output.hint(f"start it again with `fogft up {seen.status.file}`; `fogft down` removes it")
     elif not seen.manager_alive:
-        output.warn("no manager runs: requests go on, but nothing that is lost is replaced")
+        output.warn("no manager runs: requests continue, but lost replicas are not replaced")
         output.hint(f"start it with `fogft up {seen.status.file}`, or end it with `fogft down`")
     elif seen.age_s is not None and seen.age_s > STALE_AFTER_S:
-        output.warn(f"the manager has not looked for {seen.age_s:.0f} s")
+        output.warn(f"the manager has not observed the pool for {seen.age_s:.0f} s")
         output.hint("see `fogft logs`")
 
 
@@ -96,26 +92,21 @@ def logs(
         typer.Argument(
             min=0,
             metavar="SLOT",
-            help="Only this replica's; everything unless given.",
+            help="Only this replica's log; by default all logs.",
             autocompletion=options.slots,
             show_default=False,
         ),
     ] = None,
-    follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Go on showing what is written.")
-    ] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Keep showing new lines.")] = False,
     lines: Annotated[
-        int, typer.Option("--lines", "-n", min=0, metavar="N", help="Lines of each log to begin.")
+        int,
+        typer.Option("--lines", "-n", min=0, metavar="N", help="Lines of each log to begin with."),
     ] = 50,
     pool: PoolOption = None,
 ) -> None:
     """Show what the manager, the client proxy and the replicas log.
 
     Each line begins with the name of its log: `manager`, `proxy` or `slot.generation`.
-
-    \b
-    Example:
-      fogft logs 2 -f
     """
     from fogft.cli.tail import Tail, in_order
     from fogft.pool.commands import composition

@@ -1,4 +1,4 @@
-"""``fogft sweep``: machines that cost money and that no manager owns."""
+"""``fogft sweep``: find and end machines that no manager owns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def sweep(
     end: Annotated[
-        bool, typer.Option("--end", help="End what is found, once you said yes.")
+        bool, typer.Option("--end", help="End the machines found, after asking.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="With --end: do not ask.")] = False,
     cloud: Annotated[
@@ -25,18 +25,14 @@ def sweep(
             "--cloud",
             metavar="NAME",
             show_default=False,
-            help="Look in `local` or `sky` only; everywhere that was used from here unless told.",
+            help="Only `local` or `sky`; by default every cloud used from here.",
         ),
     ] = None,
 ) -> None:
-    """Find machines of your pools that no manager owns, and end them if you wish.
+    """Find machines of your pools that no manager owns, and end them on request.
 
     Asks the clouds themselves where that can be, so it finds what everybody else forgot. A
     machine whose pool is managed from another state folder looks like nobody's.
-
-    \b
-    Example:
-      fogft sweep
     """
     from fogft.pool.commands.sweep import clouds_used, end_found, sweep_cloud
 
@@ -45,7 +41,7 @@ def sweep(
         _show(one)
     unowned = [machine for one in found for machine in one.unowned]
     if not unowned:
-        output.done("no machine is without a manager")
+        output.done("every machine has a manager")
         if cloud is None and not any(one.cloud == "sky" for one in found):
             output.hint("real clouds were never used from here: `--cloud sky` asks them too")
         return
@@ -62,7 +58,7 @@ def sweep(
     if problems:
         hints = dict.fromkeys(problem.hint for problem in problems if problem.hint)
         raise FogftError("\n".join(problem.message for problem in problems), "; ".join(hints))
-    output.done("they are gone")
+    output.done("all of them are ended")
 
 
 def _show(found: Swept) -> None:

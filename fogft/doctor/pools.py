@@ -105,7 +105,7 @@ def processes(situation: Situation) -> Iterator[Finding]:
         else:
             yield warn(
                 "manager",
-                f"pool `{pool}` has none: requests go on, but nothing lost is replaced",
+                f"pool `{pool}` has none: requests continue, but lost replicas are not replaced",
                 "start it with `fogft up FILE`, or end the pool with `fogft down`",
             )
         if disk.is_locked(paths.proxy_lock):

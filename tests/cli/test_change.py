@@ -20,10 +20,10 @@ def test_scale_counts_from_what_is_wanted_now(home, capsys):
     paths = lay_down(home)
     with disk.locked(paths.manager_lock):
         assert main.run(["scale", "up", "2"]) == 0
-        assert capsys.readouterr().err == "done: `planner` shall have 5 replicas (was 3)\n"
+        assert capsys.readouterr().err == "done: `planner` will have 5 replicas (was 3)\n"
         assert main.run(["scale", "down", "1", "--pool", "planner"]) == 0
     said = capsys.readouterr()
-    assert (said.out, said.err) == ("", "done: `planner` shall have 4 replicas (was 5)\n")
+    assert (said.out, said.err) == ("", "done: `planner` will have 4 replicas (was 5)\n")
     assert wish(paths)["target"] == 4
 
 
@@ -42,8 +42,8 @@ def test_without_a_manager_the_wish_is_kept_and_that_is_said(home, capsys):
     paths = lay_down(home)
     assert main.run(["drain", "1"]) == 0
     assert capsys.readouterr().err == (
-        "done: replica `1.12` of `planner` is to be replaced\n"
-        "warning: no manager of `planner` runs: this happens once one does\n\n"
+        "done: replica `1.12` of `planner` will be replaced\n"
+        "warning: `planner` has no manager: this takes effect once it has one\n\n"
         f"hint: start it with `fogft up {FILE}`\n"
     )
     assert wish(paths)["drained"] == {"1": 12}

@@ -79,7 +79,7 @@ def test_a_dead_manager_is_told_twice(home, capsys):
     said = capsys.readouterr()
     assert "NO MANAGER" in said.out
     assert said.err == (
-        "warning: no manager runs: requests go on, but nothing that is lost is replaced\n\n"
+        "warning: no manager runs: requests continue, but lost replicas are not replaced\n\n"
         f"hint: start it with `fogft up {FILE}`, or end it with `fogft down`\n"
     )
 
@@ -88,7 +88,9 @@ def test_a_manager_that_hangs_is_told(home, capsys):
     paths = lay_down(home, age_s=40)
     with disk.locked(paths.manager_lock):
         main.run(["status"])
-    assert re.search(r"the manager has not looked for [4-9]\d s", capsys.readouterr().err)
+    assert re.search(
+        r"the manager has not observed the pool for [4-9]\d s", capsys.readouterr().err
+    )
 
 
 def test_what_sounds_alarm_stands_in_the_first_line(home, capsys):

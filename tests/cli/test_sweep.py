@@ -53,7 +53,7 @@ def test_what_a_living_manager_owns_is_left_alone(home, machines, capsys):
     assert lock.acquire(wait=False)
     assert run(capsys, "--end", "--yes") == (
         [],
-        "done: no machine is without a manager\n"
+        "done: every machine has a manager\n"
         "\nhint: real clouds were never used from here: `--cloud sky` asks them too\n",
     )
     assert machines.machine(id)
@@ -71,7 +71,7 @@ def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys
     [line], _ = run(capsys)
     assert line.endswith(f"no pool of this uid in `{home}`")
     _, err = run(capsys, "--end", "--yes")
-    assert f"ended `{id}` (local/us-west-1/a)\ndone: they are gone\n" in err
+    assert f"ended `{id}` (local/us-west-1/a)\ndone: all of them are ended\n" in err
     assert processes.find(machine=str(id)) == []
     assert run(capsys)[0] == []
 

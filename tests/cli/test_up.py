@@ -71,8 +71,7 @@ def test_it_says_what_it_will_do_each_change_and_how_it_ended(file, looks, capsy
         "0.1  starting",
         "0.1  `/plan` is not up yet",
         "0.1  ready",
-        "done: `planner` answers, with 1 of 3 replicas ready; "
-        "2 more in preparation, see `fogft status`",
+        "done: `planner` answers, with 1 of 3 replicas ready; 2 more starting, see `fogft status`",
     ]
 
 
@@ -107,7 +106,7 @@ def test_it_gives_up_with_the_reason_and_says_what_still_runs(home, file, looks,
         "  first\n"
         "  last words\n"
         "\n"
-        "hint: the manager goes on trying: see `fogft status` and `fogft logs`; "
+        "hint: the manager keeps trying: see `fogft status` and `fogft logs`; "
         "`fogft down planner` ends it\n"
     )
 
@@ -120,7 +119,7 @@ def test_it_gives_up_at_once_when_run_keeps_ending(home, file, looks, capsys):
     looks(updated(file, services=(silent,), replicas=(hopeless,)))
     assert main.run(["up", str(file), "--timeout", "1000"]) == 1
     said = capsys.readouterr().err
-    assert "error: `/plan` of `planner` does not answer: `run` ends again and again\n" in said
+    assert "error: `/plan` of `planner` does not answer: `run` keeps ending\n" in said
     assert f"  replica 0.1: {detail}\n" in said
 
 
@@ -148,7 +147,7 @@ def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
     monkeypatch.setattr("fogft.pool.commands.status.read", interrupt)
     assert main.run(["up", str(file)]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "interrupted: `planner` goes on starting; `fogft down planner` ends it"
+    assert last == "interrupted: `planner` continues to start; `fogft down planner` ends it"
 
 
 @pytest.mark.parametrize(
@@ -286,7 +285,7 @@ def test_the_same_file_changes_nothing(home, file, looks, capsys):
     looks(UP, started=False)
     assert main.run(["up", str(file)]) == 0
     first, _, last = capsys.readouterr().err.splitlines()
-    assert first == "pool `planner` is as its file says; nothing changes"
+    assert first == "pool `planner` already matches its file; nothing changes"
     assert last == "done: `planner` answers, with 1 of 1 replicas ready"
 
 
@@ -296,7 +295,7 @@ def test_up_again_gives_a_pool_its_manager_back(home, file, looks, capsys):
     looks(UP)
     assert main.run(["up", str(file)]) == 0
     second = capsys.readouterr().err.splitlines()[1]
-    assert second == "it had no manager: one was started, and takes over what runs"
+    assert second == "it had no manager: a new one takes over what runs"
 
 
 # --- init and down

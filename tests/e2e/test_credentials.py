@@ -46,7 +46,7 @@ def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
     assert result["requests"] > 80
     assert flawless(result), result
     freeze(ada.process.pid)  # a frozen robot holds nobody up
-    assert "is taken back" in pool_said(pool, "credentials", "rotate", "robot")
+    assert "is revoked" in pool_said(pool, "credentials", "rotate", "robot")
     os.kill(ada.process.pid, signal.SIGCONT)
     pool.wait(lambda: [link["state"] for link in links(ada)] == ["up", "up"])
     pool.fogft("credentials", "revoke", "robot", "ada")
