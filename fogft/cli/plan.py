@@ -42,16 +42,19 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         Path | None,
         typer.Option(
             "--plot",
-            metavar="SVG",
+            metavar="FILE",
             show_default=False,
-            help="Draw price against distance into a file.",
+            help="Draw price against distance to a PNG, SVG or PDF file.",
         ),
     ] = None,
 ) -> None:
     """Show what a pool file would launch, why there, and what it costs. Launches nothing."""
     from fogft.cli import plan_plot, plan_text
     from fogft.pool.commands.plan import plan_file
+    from fogft.simulation.plot import check
 
+    if plot is not None:
+        check(plot)
     shown = plan_file(file, cloud, prices=prices, offline=offline, told=output.say)
     if as_json:
         output.json_data(plan_text.to_json(shown))
@@ -60,5 +63,5 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     for note in (*shown.notes, *shown.explanation.notes):
         output.warn(note)
     if plot is not None:
-        plan_plot.write(plot, shown)
+        plan_plot.draw(shown, plot)
         output.done(f"`{plot}` is drawn")

@@ -35,10 +35,9 @@ class FogCommand(CommandExtension):  # type: ignore[misc]
 
 
 class Verb:
-    """A verb that is a command of ``fogft``, its options and help included."""
+    """A verb that is the command of ``fogft`` with its class's name, help and options included."""
 
     EXTENSION_POINT_VERSION = "0.1"
-    NAME = ""
 
     def __init__(self) -> None:
         satisfies_version(PLUGIN_SYSTEM_VERSION, "^0.1")
@@ -53,46 +52,32 @@ class Verb:
         """Run the command; return its exit status."""
         from fogft.cli import main
 
-        return main.run([self.NAME, *args.words])
+        return main.run([type(self).__name__.lower(), *args.words])
 
 
 class Up(Verb):
     """Start a pool, or apply a changed pool file to a running one."""
 
-    NAME = "up"
-
 
 class Down(Verb):
     """End a pool and everything it started."""
-
-    NAME = "down"
 
 
 class Status(Verb):
     """Show a pool's replicas and services."""
 
-    NAME = "status"
-
 
 class Scale(Verb):
     """Ask for more or fewer replicas."""
-
-    NAME = "scale"
 
 
 class Plan(Verb):
     """Explain where replicas would go, and at what price."""
 
-    NAME = "plan"
-
 
 class Logs(Verb):
     """Show what the manager, the client proxy and the replicas log."""
 
-    NAME = "logs"
-
 
 class Doctor(Verb):
     """Check this machine, ROS 2 and the pools here."""
-
-    NAME = "doctor"

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from fogft.errors import FogftError
 from fogft.simulation.comparison import Row
 from fogft.simulation.meter import DAY_S, HOURS_A_MONTH
 from fogft.simulation.report import Report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ENDINGS = (".png", ".svg", ".pdf")
 _COLOURS = ("#0072b2", "#666666", "#e69f00", "#009e73", "#cc79a7")  # told apart by all eyes
@@ -20,7 +23,6 @@ _MARKS = ("o", "s", "^", "D", "v")
 _SHOWN_DAYS = 3.0
 _STYLE: Any = {
     "font.size": 9,
-    "svg.hashsalt": "fogft",  # the same report gives the same file
     "axes.spines.right": False,
     "axes.spines.top": False,
 }
@@ -68,11 +70,23 @@ def draw(report: Report, path: Path) -> None:
             f"{scenario.spec.name}: {report.replicas} replicas, {market}, "
             f"{len(scenario.seeds)} seeds of {scenario.days:.4g} days"
         )
-        metadata: dict[str, Any] = {".svg": {"Date": None}, ".png": {"Software": None}}
-        try:
+        save(figure, path)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure to a file, whose bytes depend on nothing but the figure.
+
+    Raises:
+        FogftError: It cannot be written.
+    """
+    import matplotlib
+
+    metadata: dict[str, Any] = {".svg": {"Date": None}, ".png": {"Software": None}}
+    try:
+        with matplotlib.rc_context({"svg.hashsalt": "fogft"}):
             figure.savefig(path, dpi=150, metadata=metadata.get(path.suffix))
-        except OSError as error:
-            raise FogftError(f"{path}: cannot be written: {error.strerror}") from None
+    except OSError as error:
+        raise FogftError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _costs(axes: Any, rows: tuple[Row, ...]) -> None:

@@ -44,8 +44,8 @@ def test_every_verb_is_a_command_of_fogft() -> None:
     assert set(verbs) <= set(commands)
     source = (ROOT / "fogft" / "cli" / "ros2.py").read_text()
     for verb, target in verbs.items():
-        assert f"class {target.partition(':')[2]}(Verb):" in source
-        assert f'NAME = "{verb}"' in source
+        assert f"class {verb.capitalize()}(Verb):" in source
+        assert target.endswith(f":{verb.capitalize()}")
 
 
 def test_both_packages_have_one_version() -> None:
