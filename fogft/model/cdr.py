@@ -8,7 +8,7 @@ Serialised messages are plain CDR, as ROS 2 writes them: four bytes of header th
 order, then each field at a multiple of its own size, counted from behind the header.
 
 Owns: that walk. Not here: a type's definition (`fogft.model.type_definition`) and how it is read
-(`fogft.ros.definition`); what is done with bytes that are refused (`fogft.proxy`).
+(`fogft.ros.types`); what is done with bytes that are refused (`fogft.proxy`).
 """
 
 from __future__ import annotations

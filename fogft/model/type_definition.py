@@ -8,7 +8,7 @@ A distribution that has type hashes (Iron and later) tells sameness by them. Whe
 has none (Humble), or to say what differs, fields are compared one by one.
 
 Owns: definitions as values, their plain form for the wire, the comparison.
-Not here: reading a type's definition (`fogft.ros.definition`), who compares
+Not here: reading a type's definition (`fogft.ros.types`), who compares
 (`fogft.proxy.robot.client`).
 """
 

@@ -71,7 +71,7 @@ def join(
     Raises:
         RosError: ROS, or Zenoh, is not usable here.
     """
-    from fogft.ros.definition import definition
+    from fogft.ros.types import definition
 
     if speaks is Speaks.RCLPY:
         from fogft.ros.node import SerialisedNode

@@ -24,8 +24,7 @@ from zenoh import handlers
 from fogft.errors import RosError
 from fogft.rmw_zenoh import naming, session
 from fogft.rmw_zenoh.entities import Client, Server
-from fogft.rmw_zenoh.graph import Graph
-from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Token
+from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
 
 log = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
 """How the bytes of a message get out of and into ROS: the seam below the node.
 
-Two implementations: `serialised` (fast, over rcl) and `converted` (over rclpy's own
-messages). `choose` picks, once a type.
+Two implementations: `serialised` (fast, over rcl), and `ConvertedTransfer` where that fails its test
+(over rclpy's own messages: same bytes, same errors, no ctypes). `choose` picks, once a type.
 
 Owns: the contract of the two and the choice.
 Not here: the thread, the wait set and the pending requests (`node`).
@@ -12,9 +12,99 @@ from __future__ import annotations
 import logging
 from typing import Any, Protocol
 
-from fogft.errors import RosError
+from fogft.errors import RosError, Unreadable
 
 log = logging.getLogger(__name__)
+
+
+def to_bytes(message: Any) -> bytes:
+    """Serialise a message."""
+    from rclpy.serialization import serialize_message
+
+    return bytes(serialize_message(message))
+
+
+def from_bytes(payload: bytes, message_type: Any) -> Any:
+    """Read a serialised message back. Raises Unreadable."""
+    from rclpy.serialization import deserialize_message
+
+    try:
+        return deserialize_message(payload, message_type)
+    except Exception as error:  # rclpy's own error types are private and vary by release
+        raise Unreadable(
+            f"{len(payload)} bytes are not a serialised {message_type.__name__}: {error}"
+        ) from error
+
+
+class ConvertedServiceEnd:
+    """`ServiceEnd` over rclpy's messages."""
+
+    def __init__(self, service: Any, service_type: Any) -> None:
+        self._handle = service.handle
+        self._type = service_type
+
+    def take(self) -> tuple[bytes, Any] | None:
+        """Return the next serialised request and its request id."""
+        try:
+            request, header = self._handle.service_take_request(self._type.Request)
+        except Exception as error:
+            raise RosError(f"a request cannot be taken: {error}") from error
+        return None if header is None else (to_bytes(request), header.request_id)
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        """Send a serialised response."""
+        response = from_bytes(payload, self._type.Response)
+        try:
+            self._handle.service_send_response(response, handle)
+        except Exception as error:
+            raise RosError(f"a response cannot be sent: {error}") from error
+
+    def close(self) -> None:
+        """Hold nothing; nothing to free."""
+
+
+class ConvertedClientEnd:
+    """`ClientEnd` over rclpy's messages."""
+
+    def __init__(self, client: Any, service_type: Any) -> None:
+        self._handle = client.handle
+        self._type = service_type
+
+    def take(self) -> tuple[int, bytes] | None:
+        """Return the next response: sequence number and bytes."""
+        try:
+            header, response = self._handle.take_response(self._type.Response)
+        except Exception as error:
+            raise RosError(f"a response cannot be taken: {error}") from error
+        if header is None:
+            return None
+        return header.request_id.sequence_number, to_bytes(response)
+
+    def send(self, payload: bytes) -> int:
+        """Send a serialised request; return its sequence number."""
+        request = from_bytes(payload, self._type.Request)
+        try:
+            return int(self._handle.send_request(request))
+        except Exception as error:
+            raise RosError(f"a request cannot be sent: {error}") from error
+
+    def close(self) -> None:
+        """Hold nothing; nothing to free."""
+
+
+class ConvertedTransfer:
+    """`Transfer` over rclpy's messages."""
+
+    def __init__(self, service_type: Any) -> None:
+        self._service_type = service_type
+
+    def service_end(self, service: Any) -> ConvertedServiceEnd:
+        """Return the end of an rclpy service."""
+        return ConvertedServiceEnd(service, self._service_type)
+
+    def client_end(self, client: Any) -> ConvertedClientEnd:
+        """Return the end of an rclpy client."""
+        return ConvertedClientEnd(client, self._service_type)
 
 
 class ServiceEnd(Protocol):
@@ -75,7 +165,7 @@ def choose(type_name: str) -> Transfer:
     Raises:
         RosError: The type cannot be loaded.
     """
-    from fogft.ros import converted, serialised, types
+    from fogft.ros import serialised, types
 
     service_type = types.load_service_type(type_name)
     try:
@@ -86,5 +176,5 @@ def choose(type_name: str) -> Transfer:
             type_name,
             error.message,
         )
-        return converted.ConvertedTransfer(service_type)
+        return ConvertedTransfer(service_type)
     return serialised.SerialisedTransfer(service_type)

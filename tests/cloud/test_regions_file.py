@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cloud.local.catalogue import BUILT_IN, Instance, Zone
-from fogft.cloud.local.regions_file import read
+from fogft.cloud.local.catalogue import BUILT_IN, Instance, Zone, read
 from fogft.errors import SpecError
 
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
-from fogft.link.silence import Silence
 from fogft.link.window import LinkWindow
 from fogft.link.zenoh.diagnosis import wrong_name
+from fogft.link.zenoh.robot.probing import Silence
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, doubted_after_s
 

@@ -18,10 +18,8 @@ from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.replica.query_ends import QueryEnd
-from fogft.link.zenoh.replica.replies import Reply
-from fogft.link.zenoh.replica.reply_queue import ReplyQueue
-from fogft.link.zenoh.robot.attempt import OpenAttempt
-from fogft.link.zenoh.robot.batch_buffer import BatchBuffer
+from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueue
+from fogft.link.zenoh.robot.attempt import BatchBuffer, OpenAttempt
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal

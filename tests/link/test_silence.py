@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.silence import Silence
+from fogft.link.zenoh.robot.probing import Silence
 
 times = st.floats(0, 1e6, allow_nan=False)
 

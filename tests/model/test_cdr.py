@@ -176,8 +176,7 @@ def test_what_ros_writes_is_well_formed_and_what_is_cut_is_not(name: str) -> Non
     from rclpy.serialization import serialize_message
 
     from fogft.model.type_definition import REQUEST, RESPONSE
-    from fogft.ros.definition import definition
-    from fogft.ros.types import load_service_type
+    from fogft.ros.types import definition, load_service_type
 
     service_type, known = load_service_type(name), definition(name)
     for part, message_type in (

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fogft.errors import RosError
-from fogft.ros import converted, memory_tuning, rcl, serialised, transfer
+from fogft.ros import memory_tuning, rcl, serialised, transfer
 from fogft.ros.types import load_service_type
 from tests.nightly import by_day
 
@@ -75,7 +75,7 @@ def test_the_self_test_notices_a_changed_message(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(serialised.CMessage, "write", lambda *_: lie)
     with pytest.raises(RosError, match="came back changed"):
         serialised.self_test(service_type)
-    assert isinstance(transfer.choose(SET_BOOL), converted.ConvertedTransfer)
+    assert isinstance(transfer.choose(SET_BOOL), transfer.ConvertedTransfer)
 
 
 numbers = st.integers(-128, 127)
@@ -90,7 +90,7 @@ def test_a_map_survives_as_it_is(cells: list[int], frame: str) -> None:
     request.map.header.frame_id = frame
     request.initial_pose.pose.covariance[7] = 0.5
     assert through_c(request) == request
-    kept = converted.from_bytes(converted.to_bytes(request), type(request))
+    kept = transfer.from_bytes(transfer.to_bytes(request), type(request))
     assert through_c(kept) == kept
 
 
@@ -137,7 +137,7 @@ def test_both_ways_refuse_the_same(payload: bytes) -> None:
         message.read(payload)
     message.close()
     with pytest.raises(RosError, match="not a serialised SetBool_Response"):
-        converted.from_bytes(payload, response_type)
+        transfer.from_bytes(payload, response_type)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -16,7 +16,7 @@ from fogft.errors import RosError
 from fogft.model.type_definition import difference
 from fogft.proxy.replica.interruption import CANCEL_TYPE, EMPTY_REQUEST
 from fogft.ros import types
-from fogft.ros.definition import definition
+from fogft.ros.types import definition
 
 from .conftest import SET_BOOL
 

@@ -18,7 +18,7 @@ from unittest import mock
 
 import pytest
 
-from fogft.cloud.sky import answers, guard, task, template
+from fogft.cloud.sky import answers, guard, task
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
 from fogft.errors import CloudUnreachable
@@ -275,7 +275,7 @@ def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: P
         }
     )
     built = task.build(
-        order, template.read(), files=tmp_path, wheel=tmp_path, owner="ann", base=tmp_path
+        order, task.read(), files=tmp_path, wheel=tmp_path, owner="ann", base=tmp_path
     )
     made = sky.Task.from_yaml_config(built)
     (resources,) = made.resources
@@ -295,7 +295,7 @@ def test_an_image_of_the_users_own_is_one_that_skypilot_takes(home: Path, tmp_pa
     for image in ("docker:ros:jazzy", "docker:registry.example.org/team/robot:1", "ami-1e749f67"):
         asked = {"resources": {"infra": "aws/us-east-1", "image_id": image}}
         built = task.build(
-            Scene(tmp_path).order(task=asked), template.read(), files=tmp_path, wheel=tmp_path,
+            Scene(tmp_path).order(task=asked), task.read(), files=tmp_path, wheel=tmp_path,
             owner="ann", base=tmp_path,
         )  # fmt: skip
         (resources,) = sky.Task.from_yaml_config(built).resources
@@ -311,7 +311,7 @@ def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: P
     import sky
 
     built = task.build(
-        Scene(tmp_path).order(dials_out=True), template.read(), files=tmp_path, wheel=tmp_path,
+        Scene(tmp_path).order(dials_out=True), task.read(), files=tmp_path, wheel=tmp_path,
         owner="ann", base=tmp_path,
     )  # fmt: skip
     (resources,) = sky.Task.from_yaml_config(built).resources

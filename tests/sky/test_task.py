@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from fogft.cloud.port import Launch
-from fogft.cloud.sky import naming, task, template
+from fogft.cloud.sky import naming, task
 from fogft.errors import SpecError
 from fogft.model.replica import Placement
 from tests.sky.scripted_sky import EAST, WEST, replica
@@ -24,7 +24,7 @@ def built(
     order = Launch(replica(3, 7), "perception", place, 0.021, "abcd", asked, dials_out=dials_out)
     return task.build(
         order,
-        template.read(),
+        task.read(),
         files=Path("/state/files"),
         wheel=Path("/state/wheel"),
         owner="Ann Lee@robot",

@@ -77,7 +77,7 @@ def test_pip_installs_it_without_an_index(installed: None, tmp_path: Path):
     subprocess.run([*pip, "--target", str(target), str(path)], check=True, timeout=100)
     done = subprocess.run(
         [sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(target)!r})\n"
-         "from fogft.cloud.sky import template; print(template.read()['resources']['ports'])"],
+         "from fogft.cloud.sky import task; print(task.read()['resources']['ports'])"],
         check=True, capture_output=True, text=True, cwd=tmp_path, timeout=60,
     )  # fmt: skip
     assert done.stdout.strip() == "['@PORT@']"

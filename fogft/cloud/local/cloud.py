@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.child import detached
-from fogft.cloud.local import ending, faults, processes, regions_file
+from fogft.cloud.local import catalogue, ending, faults, processes
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Zone
 from fogft.cloud.local.folder import NOTICE, Life, MachineFolder, Record, State, remove, write_new
 from fogft.cloud.local.resources import offers_for
@@ -63,7 +63,7 @@ class LocalCloud:
         Raises:
             SpecError: ``regions.yaml`` is wrong.
         """
-        return regions_file.read(self.root / regions_file.FILE)
+        return catalogue.read(self.root / catalogue.FILE)
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """Return an offer for each zone that suits. Full zones stay: only a launch tells."""

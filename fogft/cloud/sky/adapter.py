@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.port import Audit, Launch
-from fogft.cloud.sky import listing, task, template, wheel
+from fogft.cloud.sky import listing, task, wheel
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.failures import Cause, classify
@@ -138,7 +138,7 @@ class SkyCloud:
         """
         made = task.build(
             order,
-            template.read(),
+            task.read(),
             files=self.journal.files(order.id),
             wheel=self._make_wheel(self._folder / "wheels"),
             owner=self._owner,

@@ -1,4 +1,4 @@
-"""Make the SkyPilot task of one replica: the pool file's task on `templates/sky_task.yaml`. Pure.
+"""Make the SkyPilot task of one replica: the pool file's task on `templates/sky_task.yaml`.
 
 What the pool file says passes through untouched, but for the few fields that a pool decides
 itself; those are refused, since a field that is ignored is a promise broken in silence.
@@ -15,9 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fogft import template_files
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming
-from fogft.errors import SpecError
+from fogft.errors import CloudError, FogftError, SpecError
 from fogft.model.clouds import NO_VM_CLOUDS
 from fogft.model.replica import Placement
 
@@ -186,4 +187,20 @@ def _filled(value: Any, marks: Mapping[str, str]) -> Any:
         return value
     for mark, meant in marks.items():
         value = value.replace(mark, meant)
+    return value
+
+
+_NAME = "sky_task.yaml"
+
+
+def read() -> dict[str, Any]:
+    """Return the template. Raises CloudError: the installation is incomplete or damaged."""
+    import yaml
+
+    try:
+        value = yaml.safe_load(template_files.read_text(_NAME))
+    except (FogftError, yaml.YAMLError) as error:
+        raise CloudError(f"fogft's own `{_NAME}` cannot be read: {error}") from error
+    if not isinstance(value, dict):
+        raise CloudError(f"fogft's own `{_NAME}` is not a task", "install fogft again")
     return value

@@ -15,9 +15,9 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 
-from fogft.link.dial_out import first_message
+from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
-from fogft.link.dial_out.splice import Tunnel, hang_up, keep_alive
+from fogft.link.dial_out.tunnel import Tunnel, hang_up, keep_alive
 from fogft.records import frames
 from fogft.records.record import RecordError, Sign
 
@@ -78,8 +78,8 @@ class DialOut:
         self.follow(())
         with self._lock:
             tunnels = list(self._tunnels)
-        for tunnel in tunnels:
-            tunnel.close()
+        for joined in tunnels:
+            joined.close()
 
     # -- a thread for each waiting connection -------------------------------------------------
 
@@ -106,9 +106,7 @@ class DialOut:
         link = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_TIMEOUT_S)
         try:
             keep_alive(link)
-            nonce, _ = frames.read_challenge(
-                first_message.receive(link, 4 << 10, _GREETING_TIMEOUT_S)
-            )
+            nonce, _ = frames.read_challenge(tunnel.receive(link, 4 << 10, _GREETING_TIMEOUT_S))
             link.settimeout(_GREETING_TIMEOUT_S)
             proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
             link.sendall(frames.greeting(*self._sign(proof)))

@@ -24,8 +24,8 @@ from collections.abc import Callable, Collection, Mapping
 
 from fogft.errors import WireError
 from fogft.link.counters import Counters
-from fogft.link.dial_out import first_message
-from fogft.link.dial_out.splice import Tunnel, hang_up, keep_alive
+from fogft.link.dial_out import tunnel
+from fogft.link.dial_out.tunnel import Tunnel, hang_up, keep_alive
 from fogft.model.certificate_holder import Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.records import frames
@@ -132,7 +132,7 @@ class DialIn:
         link.settimeout(_GREETING_TIMEOUT_S)
         nonce = secrets.token_bytes(frames.NONCE_BYTES)
         link.sendall(frames.challenge(nonce, host))
-        message = first_message.receive(link, 16 << 10, _GREETING_TIMEOUT_S)
+        message = tunnel.receive(link, 16 << 10, _GREETING_TIMEOUT_S)
         certificate, signature = frames.read_greeting(message)
         proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
         writer = self._verify(certificate, signature, proof)
@@ -295,8 +295,8 @@ class DialIn:
         for one in waiting:
             with contextlib.suppress(OSError):
                 one.link.shutdown(socket.SHUT_RDWR)
-        for tunnel in tunnels:
-            tunnel.close()
+        for joined in tunnels:
+            joined.close()
 
 
 def _drained(link: socket.socket) -> bool:

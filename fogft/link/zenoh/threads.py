@@ -1,14 +1,20 @@
-"""Which threads are Zenoh's own: those that call our callbacks.
+"""Zenoh's own threads, and ours that are inside Zenoh when the process ends.
 
-They must not send what might wait for room, since only they can make room. Zenoh has few of them,
-and they live as long as the process.
+Zenoh's threads, which call our callbacks, must not send what might wait for room: only they can
+make room. They are few, and live as long as the process.
 
-Owns: that set. Not here: what a thread may do instead (`reply_queue`).
+A daemon thread that returns from Zenoh while the interpreter shuts down aborts the process
+(SIGABRT: the interpreter ends the thread by unwinding it, which Rust does not allow). So what
+closes a session is waited for at exit, though not for long: towards a frozen peer it takes ten
+seconds.
 """
 
 from __future__ import annotations
 
+import atexit
 import threading
+import time
+import weakref
 
 _idents: set[int] = set()
 
@@ -21,3 +27,21 @@ def note() -> None:
 def is_this() -> bool:
     """Whether this thread is one of Zenoh's."""
     return threading.get_ident() in _idents
+
+
+WAIT_S = 2.0
+
+_leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
+
+
+def join_at_exit(thread: threading.Thread) -> None:
+    """Have the process wait for this thread when it ends. The thread must be about to end."""
+    _leaving.add(thread)
+
+
+@atexit.register
+def _wait() -> None:
+    end = time.monotonic() + WAIT_S
+    for thread in list(_leaving):
+        if thread is not threading.current_thread():
+            thread.join(max(0.0, end - time.monotonic()))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.dial_out import first_message
+from fogft.link.dial_out import tunnel
 from fogft.records import frames
 from fogft.records.record import RecordError
 
@@ -33,7 +33,7 @@ def test_it_comes_however_it_is_cut_and_whatever_follows(at, more):
             target=lambda: [far.sendall(part) for part in (WHOLE[:at], WHOLE[at:] + more) if part]
         )
         sender.start()
-        found = first_message.receive(near, 4096, 30.0)
+        found = tunnel.receive(near, 4096, 30.0)
         sender.join()
     assert frames.read_challenge(found)[0] == NONCE
 
@@ -53,7 +53,7 @@ def test_who_sends_byte_by_byte_has_no_longer_than_others(ends):
     dripping.start()
     began = time.monotonic()
     with pytest.raises(TimeoutError):
-        first_message.receive(near, 4096, 0.2)
+        tunnel.receive(near, 4096, 0.2)
     assert time.monotonic() - began >= 0.2
     stop.set()
     dripping.join()
@@ -63,9 +63,9 @@ def test_who_leaves_or_babbles_is_told_apart(ends):
     near, far = ends
     far.sendall(b"\xff" * 500)
     with pytest.raises(RecordError):
-        first_message.receive(near, 4096, 5.0)
+        tunnel.receive(near, 4096, 5.0)
     near, far = socket.socketpair()
     with near:
         far.close()
         with pytest.raises(EOFError):
-            first_message.receive(near, 4096, 5.0)
+            tunnel.receive(near, 4096, 5.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 CODE = """
 import sys, threading, time
-from fogft.link.zenoh import join_at_exit as leaving
+from fogft.link.zenoh import threads as leaving
 
 def leave(seconds):
     time.sleep(seconds)

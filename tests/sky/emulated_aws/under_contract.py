@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fogft.cloud.sky import template
+from fogft.cloud.sky import task
 from fogft.cloud.sky.adapter import SkyCloud
 from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.installed import InstalledSky
@@ -25,7 +25,7 @@ RESOURCES: Mapping[str, Any] = {
 
 def stub_server() -> None:
     """Let a web server stand where the server proxy will: it shows what the VM looks like."""
-    read = template.read
+    read = task.read
 
     def with_stub() -> dict[str, Any]:
         made = read()
@@ -37,7 +37,7 @@ def stub_server() -> None:
         )
         return made
 
-    template.read = with_stub
+    task.read = with_stub
 
 
 def adapter(folder: Path) -> SkyCloud:

@@ -9,8 +9,7 @@ from collections.abc import Callable
 from functools import partial
 
 from fogft.link import frame
-from fogft.link.zenoh.replica.replies import Reply
-from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model.refusal import Refusal

@@ -30,17 +30,16 @@ from fogft.link.counters import Counters
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import sockets, threads
 from fogft.link.zenoh.handshakes import HandshakeLog
-from fogft.link.zenoh.join_at_exit import join_at_exit
 from fogft.link.zenoh.replica.connection_reaper import ConnectionReaper
 from fogft.link.zenoh.replica.control_queries import ControlQueries
 from fogft.link.zenoh.replica.incoming import ZenohIncoming
 from fogft.link.zenoh.replica.query_ends import QueryTurns
-from fogft.link.zenoh.replica.replies import Reply
-from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
+from fogft.link.zenoh.threads import join_at_exit
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths

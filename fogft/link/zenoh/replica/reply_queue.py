@@ -2,29 +2,101 @@
 
 A reply to a frozen robot blocks until Zenoh gives that robot's session up. So each
 connection has its own thread; it ends when it has had nothing to do for a while. What cannot
-block (`streams`) leaves at once, from the thread that brings it, where that is none of Zenoh's.
+block (`reply_streams`) leaves at once, from the thread that brings it, unless that is Zenoh's.
 
 Queries that are to be ended take the same way: that sends something, too.
 
-Owns: the order and the bounds of replies. Not here: what is replied (`replies`).
+Owns: how replies become messages, their order and bounds. Not here: what is replied (`incoming`).
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from queue import Empty, SimpleQueue
 
-from fogft.link import batch_frames
+from fogft.link import batch_frames, frame
+from fogft.link.compression import Compression
 from fogft.link.counters import Counters
+from fogft.link.credit import SMALL_BYTES
 from fogft.link.zenoh import threads
+from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
-from fogft.link.zenoh.replica.replies import Reply, send_together
+from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.model.refusal import Refusal
 
 log = logging.getLogger(__name__)
+
+
+class Reply:
+    """One answer: a payload, or a refusal where that is not empty.
+
+    Attributes:
+        stream: Whose query it is a reply to.
+        may_pack: It may be compressed: its robot's link was seen to be thin.
+    """
+
+    __slots__ = ("may_pack", "payload", "refusal", "request_id", "stream")
+
+    def __init__(
+        self,
+        stream: Stream,
+        request_id: bytes,
+        payload: bytes,
+        refusal: str,
+        *,
+        may_pack: bool = False,
+    ) -> None:
+        self.stream = stream
+        self.request_id = request_id
+        self.payload = payload
+        self.refusal = refusal
+        self.may_pack = may_pack
+
+    @property
+    def joins(self) -> bool:
+        """Whether it may leave in one message with others."""
+        return len(self.payload) <= batch_frames.ENTRY_BYTES_LIMIT and not self.may_pack
+
+    @property
+    def small(self) -> bool:
+        """Whether it may leave at once, where the stream lets it."""
+        return len(self.payload) <= SMALL_BYTES and not self.may_pack
+
+    def send(self, stamp: bytes) -> None:
+        """Send it. Blocks for as long as its robot takes nothing and the way there is full.
+
+        Raises:
+            zenoh.ZError: The session is closed.
+        """
+        query = self.stream.query
+        if self.refusal:
+            query.reply_err(frame.encode_refusal(stamp, self.request_id, self.refusal))
+            return
+        packed = Compression().pack(self.payload, THIN_BYTES_PER_S) if self.may_pack else None
+        header = frame.encode_answer(stamp, self.request_id, packed=packed is not None)
+        payload = self.payload if packed is None else packed
+        self.payload = b""
+        query.reply(query.key_expr, payload, attachment=header)
+
+
+def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
+    """Send replies of one stream. May block as `Reply.send` does.
+
+    Raises:
+        zenoh.ZError: The session is closed.
+    """
+    if len(replies) == 1:
+        replies[0].send(stamp)
+        return
+    header, content = batch_frames.encode_answers(
+        stamp, [(reply.request_id, reply.payload, reply.refusal) for reply in replies]
+    )
+    query = replies[0].stream.query
+    query.reply(query.key_expr, content, attachment=header)
+
 
 REPLIES_LIMIT = 1024
 BYTES_LIMIT = 64 << 20

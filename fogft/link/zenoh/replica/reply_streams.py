@@ -1,26 +1,138 @@
-"""Where the answers of each connection leave: a query of its own, which stays open.
+"""What is on the way to one robot, and whether something may be sent to it without any wait.
 
-A connection asks it once, after it has greeted; every answer, and every refusal, is a reply to it.
-Whoever asks again under one token, or whose connection is the oldest of too many, has its former
-query ended, and opens another connection.
+Replying blocks only where the robot takes nothing and all buffers on the way are full. So who must
+not block may reply himself while no more is on the way than those surely hold. What has arrived is
+known by stamps: each reply carries one, and the robot's requests say the last that it has seen.
+Only who has read a reply knows its stamp: no robot can make others wait by saying what is not so.
 
-Owns: which query is whose. Not here: who is let in (`sessions`), what may leave at once (`credit`),
-the threads that may block (`reply_queue`).
+All connections of a robot count together: they may share one socket. What was sent over another one
+counts for a minute after it was sent, since that one may be gone; whoever reads more slowly than
+that is known by the `connection_reaper`, and is sent nothing at once.
+
+A connection asks one query after it has greeted, which stays open: every answer, and every refusal,
+is a reply to it. Whoever asks again under one token, or whose connection is the oldest of too many,
+has its former query ended, and opens another connection.
+
+Owns: stamps, and which query is whose. Not here: who is let in (`sessions`), the threads that may
+block (`reply_queue`).
 """
 
 from __future__ import annotations
 
+import math
+import os
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 from weakref import WeakValueDictionary
 
-from fogft.link.zenoh.replica.reply_credit import ReplyCredit, Send
+from fogft.link.frame import STAMP_BYTES
 
 if TYPE_CHECKING:
     import zenoh
+
+CREDIT_LIMIT = 4  # replies of 16 KiB: 64 KiB, for the same reason
+_OTHERS_COUNT_FOR_S = 60.0
+
+Send = Callable[[bytes], None]  # takes the stamp
+
+
+class _Sent(NamedTuple):
+    connection: object
+    at: float  # when that ended
+    may_block: bool  # it was sent by somebody who may
+
+
+class ReplyCredit:
+    """What one robot has not said that it has seen. Any thread.
+
+    Args:
+        slow: Whether it is known to read slowly.
+    """
+
+    def __init__(
+        self,
+        slow: Callable[[], bool] = lambda: False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._slow = slow
+        self._clock = clock
+        self._gate = threading.Lock()  # held by who sends at once, which does not take long
+        self._lock = threading.Lock()
+        self._blockable = 0  # senders under way who may block
+        self._outstanding: dict[bytes, _Sent] = {}  # by stamp, oldest first
+
+    @property
+    def outstanding(self) -> int:
+        """How many replies may still be on the way."""
+        return len(self._outstanding)
+
+    def seen(self, connection: object, stamp: bytes) -> None:
+        """Note the last stamp that was seen on a connection; one that is not known is fine."""
+        if stamp not in self._outstanding:  # nothing new, as mostly
+            return
+        with self._lock:
+            sent = self._outstanding.get(stamp)
+            if sent is not None and sent.connection is connection:
+                self._forget(connection, stamp)
+
+    def _forget(self, connection: object, last: bytes = b"") -> None:
+        """Forget what was sent on a connection, up to a stamp. Under the lock."""
+        for stamp, sent in list(self._outstanding.items()):
+            if sent.connection is connection:
+                del self._outstanding[stamp]
+            if stamp == last:
+                return
+
+    def send_at_once(self, connection: object, send: Send) -> bool:
+        """Call `send` for something of at most 16 KiB where it cannot block; return whether."""
+        if self._slow() or not self._gate.acquire(blocking=False):
+            return False
+        try:
+            stamp = os.urandom(STAMP_BYTES)
+            with self._lock:
+                if self._blockable or self._full(connection):
+                    return False
+                self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=False)
+            send(stamp)
+            return True
+        finally:
+            self._gate.release()
+
+    def _full(self, connection: object) -> bool:
+        """Whether all that buffers surely hold may be on the way. Under the lock."""
+        if not self._outstanding:
+            return False
+        self._forget_old(connection)
+        full = len(self._outstanding) >= CREDIT_LIMIT
+        return full or any(sent.may_block for sent in self._outstanding.values())
+
+    def _forget_old(self, connection: object) -> None:
+        """Forget what was sent on other connections long ago. Under the lock."""
+        since = self._clock() - _OTHERS_COUNT_FOR_S
+        for stamp, sent in list(self._outstanding.items()):
+            if sent.connection is not connection and sent.at < since:
+                del self._outstanding[stamp]
+
+    def send(self, connection: object, send: Send) -> None:
+        """Call `send`, which may block, for anything. At once nothing leaves until it was seen."""
+        stamp = os.urandom(STAMP_BYTES)
+        with self._gate, self._lock:
+            self._blockable += 1
+            self._forget(connection)  # who has seen this has seen those before it
+            self._forget_old(connection)
+            self._outstanding[stamp] = _Sent(connection, math.inf, may_block=True)  # it goes on
+        try:
+            send(stamp)
+        finally:
+            with self._lock:
+                self._blockable -= 1
+                if stamp in self._outstanding:
+                    self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=True)
+
 
 LIMIT = 1024  # a replica has 128 sessions; the others are those of connections that are gone
 

@@ -1,11 +1,12 @@
-"""One request on its way through one connection, and how its end is read.
+"""One request on its way through one connection, and what keeps several of them.
 
-Owns: what a connection keeps of an attempt, the meaning of a reply. Not here: sending
-(`attempts`).
+Owns: what a connection keeps of an attempt, those that leave together, those still unanswered,
+the meaning of a reply. Not here: sending (`attempts`).
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 
 import zenoh
@@ -64,3 +65,68 @@ def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:
         except ValueError:
             return stamp, (Answer(id, None, Refusal.MALFORMED),)
     return stamp, (Answer(id, payload),)
+
+
+LIMIT = 8192  # the window holds 512; a replica that never answers what was forgotten holds no more
+
+
+class Unanswered:
+    """What one connection has sent, by request id.
+
+    Args:
+        limit: Beyond it the oldest are forgotten.
+    """
+
+    def __init__(self, limit: int = LIMIT) -> None:
+        self._limit = limit
+        self._attempts: dict[bytes, OpenAttempt] = {}
+
+    def __len__(self) -> int:
+        return len(self._attempts)
+
+    def add(self, attempt: OpenAttempt) -> None:
+        """Note an attempt that is about to be sent; it takes the place of one of its request."""
+        self._attempts[attempt.request_id] = attempt
+        if len(self._attempts) > self._limit:
+            for id in list(self._attempts)[: self._limit // 8]:
+                self._attempts.pop(id, None)
+
+    def answered(self, request_id: bytes) -> OpenAttempt | None:
+        """Return whom an answer is for, once; None if nobody awaits it."""
+        return self._attempts.pop(request_id, None)
+
+
+class BatchBuffer:
+    """The attempts of one service at a time. Any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._attempts: list[OpenAttempt] = []
+        self._bytes = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._attempts)
+
+    def add(self, attempt: OpenAttempt) -> list[OpenAttempt]:
+        """Hold a small attempt; return those that leave now because it does not fit to them."""
+        with self._lock:
+            full = (
+                len(self._attempts) >= batch_frames.LIMIT
+                or self._bytes + attempt.size > batch_frames.BYTES_LIMIT
+                or (self._attempts and self._attempts[0].service != attempt.service)
+            )
+            leaving = self._take() if full else []
+            self._attempts.append(attempt)
+            self._bytes += attempt.size
+            return leaving
+
+    def take(self) -> list[OpenAttempt]:
+        """Return all that is held, in order."""
+        if not self._attempts:  # the usual case, without the lock
+            return []
+        with self._lock:
+            return self._take()
+
+    def _take(self) -> list[OpenAttempt]:
+        taken, self._attempts, self._bytes = self._attempts, [], 0
+        return taken

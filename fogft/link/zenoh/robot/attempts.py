@@ -25,11 +25,9 @@ from fogft.link.port import Answer
 from fogft.link.send_options import SendOptions
 from fogft.link.window import ATTEMPTS_LIMIT, LinkWindow
 from fogft.link.zenoh.flow_watch import FlowWatch
-from fogft.link.zenoh.join_at_exit import join_at_exit
-from fogft.link.zenoh.robot.attempt import OpenAttempt
-from fogft.link.zenoh.robot.batch_buffer import BatchBuffer
+from fogft.link.zenoh.robot.attempt import BatchBuffer, OpenAttempt, Unanswered
 from fogft.link.zenoh.robot.send_queue import SendQueue
-from fogft.link.zenoh.robot.unanswered import Unanswered
+from fogft.link.zenoh.threads import join_at_exit
 from fogft.model.refusal import Refusal
 
 # Attempts that wait for the sender, forgotten ones included: those have freed their room in the

@@ -33,10 +33,10 @@ from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.flow_watch import FlowWatch
-from fogft.link.zenoh.join_at_exit import join_at_exit
 from fogft.link.zenoh.robot.attempt import read_reply
 from fogft.link.zenoh.robot.attempts import Attempts
 from fogft.link.zenoh.sockets import address
+from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.refusal import Refusal
 from fogft.records.record import Sign

@@ -22,11 +22,11 @@ from fogft.link.cancellations import Cancellations
 from fogft.link.compression import ZLIB, ZLIB_ANSWERS
 from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.link.zenoh import settings
-from fogft.link.zenoh.join_at_exit import join_at_exit
 from fogft.link.zenoh.robot.connection import Connection
 from fogft.link.zenoh.robot.opening import Opening
 from fogft.link.zenoh.robot.probing import Probing
 from fogft.link.zenoh.robot.shared import Shared
+from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.replica import LinkState
 

@@ -16,12 +16,37 @@ from typing import TYPE_CHECKING
 from fogft.errors import FrameError, WireError
 from fogft.link import probe_frames
 from fogft.link.port import Peer, Probe, ProbeAnswer
-from fogft.link.silence import Silence
 from fogft.model import names
 from fogft.model.replica import doubted_after_s
 
 if TYPE_CHECKING:
     from fogft.link.zenoh.robot.connection import Connection
+
+
+class Silence:
+    """The silence of one replica. Times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def began(self, now: float) -> None:
+        """A probe was sent, or none can be sent. Silence that goes on is not begun anew."""
+        if self._since is None:
+            self._since = now
+
+    def ended(self) -> None:
+        """An answer came."""
+        self._since = None
+
+    def excuse(self, held_up_s: float, now: float) -> None:
+        """Leave out `held_up_s` up to `now`, in which this process did not run."""
+        if self._since is not None and held_up_s > 0:
+            self._since = min(self._since + held_up_s, now)
+
+    def for_s(self, now: float) -> float:
+        """Return for how long it has lasted; 0 while probes are answered."""
+        return 0.0 if self._since is None else max(0.0, now - self._since)
+
 
 _TIMEOUT_S = 60.0  # on a thin uplink a probe waits behind what is large
 

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link import frame
-from fogft.link.zenoh.replica.reply_credit import CREDIT_LIMIT, ReplyCredit
-from fogft.link.zenoh.replica.reply_streams import Streams
+from fogft.link.zenoh.replica.reply_streams import CREDIT_LIMIT, ReplyCredit, Streams
 from tests.proxy.fakes import Clock
 
 ONE, OTHER = object(), object()  # two connections of a robot

@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 from fogft.link import frame
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh.replica.listener import ZenohListener
-from fogft.link.zenoh.replica.reply_credit import CREDIT_LIMIT
-from fogft.link.zenoh.replica.reply_streams import Streams
-from fogft.link.zenoh.robot.attempt import OpenAttempt
+from fogft.link.zenoh.replica.reply_streams import CREDIT_LIMIT, Streams
+from fogft.link.zenoh.robot.attempt import OpenAttempt, Unanswered
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.link.zenoh.robot.unanswered import Unanswered
 from fogft.model.replica import ReplicaId
 from tests.link.wire_pool import (
     POOL_UID,
