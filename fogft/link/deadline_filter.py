@@ -2,7 +2,7 @@
 
 Where more is asked of a thin link than it carries, each request leaves after those before it, with
 too little of its time left: every one arrives too late, and none in time. So the window follows
-from the rate at which the link was seen to carry (`socket_progress`) and from the time that is left;
+from the rate that the link was seen to carry (`socket_progress`) and from the time that is left;
 who is declined at once may be sent on another uplink, or to another replica.
 
 Known for ten seconds only: then a request is let through again, by which the link is measured anew.

@@ -1,7 +1,7 @@
 """How the bytes of a message get out of and into ROS: the seam below the node.
 
-Two implementations: `serialised` (fast, over rcl), and `ConvertedTransfer` where that fails its test
-(over rclpy's own messages: same bytes, same errors, no ctypes). `choose` picks, once a type.
+Two implementations: `serialised` (fast, over rcl), and where that fails its test
+`ConvertedTransfer` (over rclpy's own messages: same bytes, same errors, no ctypes).
 
 Owns: the contract of the two and the choice.
 Not here: the thread, the wait set and the pending requests (`node`).
