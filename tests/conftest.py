@@ -25,7 +25,7 @@ from tests.rmw_zenoh.rmw_router import Router, running
 hypothesis.settings.register_profile(
     "fogft",
     deadline=None,
-    max_examples=by_day(40, at_night=1000),
+    max_examples=by_day(40, at_night=400),
     derandomize=bool(os.environ.get("CI")) and not NIGHTLY,
 )
 hypothesis.settings.load_profile("fogft")
@@ -56,8 +56,10 @@ COMPUTING = {
     "model",
     "ordering",
     "planning",
+    "poolfile",
     "requests",
     "simulation",
+    "topics",
 }
 
 

@@ -70,7 +70,7 @@ def test_a_replica_that_offers_other_names_is_explained(pool: Pool):
     pool.write(replicas=1)
     text = pool.file.read_text().replace("name: /plan", "name: /arm/plan")
     pool.file.write_text(text)
-    said = pool.fogft("up", str(pool.file), "--yes", "--timeout", "15", ok=False)
+    said = pool.fogft("up", str(pool.file), "--yes", "--timeout", "10", ok=False)
     assert "`run` does not offer /arm/plan yet; it offers /plan (nav_msgs/srv/GetPlan)" in re.sub(
         r"\s+", " ", said
     )

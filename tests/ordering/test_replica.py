@@ -121,7 +121,7 @@ class Replica(RuleBasedStateMachine):
 
 TestReplica = Replica.TestCase
 TestReplica.settings = settings(
-    max_examples=by_day(60, at_night=3000), stateful_step_count=40, deadline=None
+    max_examples=by_day(60, at_night=1000), stateful_step_count=40, deadline=None
 )
 
 

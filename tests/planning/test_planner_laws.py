@@ -26,7 +26,7 @@ from tests.planning.pool_worlds import (
 )
 
 many = settings(
-    max_examples=by_day(30, at_night=1000),
+    max_examples=by_day(30, at_night=300),
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
 )

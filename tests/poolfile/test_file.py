@@ -651,7 +651,7 @@ pieces = st.sampled_from([": ", "\n", "\n  ", "- ", "{", "}", "[", "]", ",", "|"
 yaml_like = st.lists(words | pieces | st.text(max_size=3), max_size=40).map("".join)
 
 
-@settings(max_examples=by_day(60, at_night=3000))
+@settings(max_examples=by_day(60, at_night=1000))
 @given(source=yaml_like | st.text(max_size=60))
 @example(source="!!bool x: 1")
 @example(source="a: !!timestamp x")

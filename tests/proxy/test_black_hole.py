@@ -8,7 +8,7 @@ from tests.needs import needs
 from tests.proxy import black_hole
 
 pytestmark = pytest.mark.timeout(240)
-ROUTER = pytest.param("router", marks=needs("namespaces"))
+ROUTER = pytest.param("router", marks=needs("namespaces", "night"))
 
 
 @pytest.mark.parametrize("way", ["relay", ROUTER])

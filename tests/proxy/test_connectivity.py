@@ -20,6 +20,7 @@ from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
 from fogft.ros import environment
+from tests.needs import needs
 from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
@@ -143,7 +144,7 @@ def test_a_second_robot_needs_no_manager_and_replicas_move_under_load(pool, call
     assert [robot.report()["pid"] for robot in robots] == pids
 
 
-@pytest.mark.parametrize("how", ["kill", "freeze"])
+@pytest.mark.parametrize("how", [pytest.param("kill", marks=needs("night")), "freeze"])
 def test_no_request_fails_while_the_rendezvous_is_away(pool, call, how):
     """And what joins meanwhile is used once it is back, with the robot untouched."""
     pool.make_replica(0)

@@ -237,7 +237,5 @@ class Requests(RuleBasedStateMachine):
         assert len(self.table) == len(self.open)
 
 
-Requests.TestCase.settings = settings(
-    max_examples=by_day(30, at_night=1000), stateful_step_count=30
-)
+Requests.TestCase.settings = settings(max_examples=by_day(30, at_night=300), stateful_step_count=30)
 TestRequests = Requests.TestCase

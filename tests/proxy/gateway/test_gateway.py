@@ -10,6 +10,7 @@ import pytest
 
 from tests.bench import uplink
 from tests.link.wire_pool import wait_for
+from tests.needs import needs
 from tests.proxy.gateway_pool import GatewayPool, Process
 
 pytestmark = pytest.mark.timeout(120)
@@ -143,7 +144,7 @@ def test_only_a_gateways_certificate_will_do(pool):
     assert not robot.ready()
 
 
-@pytest.mark.parametrize("replicas", [1, 4])
+@pytest.mark.parametrize("replicas", [pytest.param(1, marks=needs("night")), 4])
 def test_the_uplink_carries_each_request_once(tmp_path, replicas):
     """At most 1.05 times the payload, whatever the number of replicas; probes are counted."""
     found = uplink.of_pool(tmp_path / "pool", replicas, 50, delay_s=0.5)

@@ -107,7 +107,7 @@ steps = st.lists(
 )
 
 
-@settings(max_examples=by_day(40, at_night=1000), deadline=None)
+@settings(max_examples=by_day(40, at_night=400), deadline=None)
 @given(modes, steps, st.integers(0, 1000))
 def test_laws_of_every_policy_and_of_changing_it(mode, steps, seed):
     """One answer a request, its own, never after its deadline; none is lost that can be answered.
