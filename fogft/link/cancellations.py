@@ -1,4 +1,4 @@
-"""Requests whose answer is no longer wanted, until their replica has been told. No clock, no Zenoh.
+"""Cancelled requests, until their replica has been told. No clock, no Zenoh.
 
 Telling costs a message, and is worth it only where there is work to be saved. A request that
 was sent a moment ago is most likely answered before the message is there. So a cancellation is told
@@ -16,7 +16,7 @@ LIMIT = 4096  # what one message carries; further ones are not told, and their w
 
 
 class Cancellations:
-    """The cancellations of one connection."""
+    """Ids of cancelled requests of which a replica is still to be told."""
 
     def __init__(self) -> None:
         self._ids: dict[bytes, None] = {}

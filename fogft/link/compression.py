@@ -31,7 +31,7 @@ _SHARE_OF_NEW = 0.3
 
 
 class Compression:
-    """Of one service on one connection. Used by one thread.
+    """Compresses the payloads of one service on one connection. Used by one thread.
 
     Args:
         clock: Seconds, for how long compressing takes.

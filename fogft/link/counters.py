@@ -1,4 +1,4 @@
-"""Counts of what happened, by name, and a line in the log for what people should know.
+"""Count events by name, and log those that people should know of.
 
 Owns: numbers. Not here: what they are shown as (`fogft.proxy`, `fogft.pool`).
 """
@@ -14,7 +14,7 @@ from fogft.log_limits import worth_logging
 
 
 class Counters:
-    """Counts by event name, from any thread."""
+    """Counters by event name. Any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -1,4 +1,4 @@
-"""How much may be sent without any risk that sending blocks. Pure.
+"""How many bytes may be sent before sending could block. Pure.
 
 Sending blocks only when the peer takes nothing and all buffers on the way are full. So a few
 bytes may be sent from a thread that must never block, as long as all that was sent since the
@@ -18,7 +18,7 @@ _FRAME_BYTES = 256  # what travels with a payload: key, header, encryption
 
 
 class Credit:
-    """Bytes on the way to one peer, queued ones included, after the last of which a sign came.
+    """A credit of bytes for one peer: used by sending, regained by what the peer acknowledges.
 
     Args:
         limit: Bytes that may be on the way.

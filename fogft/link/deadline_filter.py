@@ -1,4 +1,4 @@
-"""What cannot arrive before its deadline is not sent, and what would wait too long is declined.
+"""Decline requests that cannot arrive before their deadline over a slow link.
 
 Where more is asked of a thin link than it carries, each request leaves after those before it, with
 too little of its time left: every one arrives too late, and none in time. So the window follows
@@ -35,7 +35,7 @@ class Sized(Protocol):
 
 
 class DeadlineFilter:
-    """Of one connection. Any thread.
+    """Judges the requests of one connection. Any thread.
 
     Args:
         timed: Services whose requests are of no use after their time.

@@ -1,4 +1,4 @@
-"""What travels besides the serialised messages: headers, refusals, greetings. Pure.
+"""The bytes of headers, refusals, greetings and cancellations. Pure.
 
 Whatever bytes come in, a decoder returns a value or raises `FrameError`, nothing else: the
 peer is another process, perhaps of another version. Each frame begins with its version.
@@ -44,7 +44,7 @@ _ORIGIN_AT = _REQUEST.size
 
 
 class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass costs thrice as much
-    """What precedes a request.
+    """The header of a request.
 
     Attributes:
         request_id: 16 bytes, made by the client proxy.
@@ -69,7 +69,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
 
 @dataclass(frozen=True)
 class Greeting:
-    """What accompanies a probe: whose connection this is.
+    """Sent with a probe to authenticate the connection.
 
     Attributes:
         token: Names the robot's connection; requests under it are the greeter's.

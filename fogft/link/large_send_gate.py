@@ -19,7 +19,7 @@ PATIENCE_S = 0.005
 
 
 class LargeSendGate:
-    """The order of all links of one robot.
+    """Lets one large message of a robot go at a time, whichever its link.
 
     Args:
         patience_s: How long to wait for another's turn to end.

@@ -12,7 +12,7 @@ Implementations: `fogft.link.zenoh.robot.link` and `zenoh_listener`, `tests.fake
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
 from fogft.link.send_options import SendOptions
@@ -60,18 +60,13 @@ class GatewayView:
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> GatewayView:
         """Return one from what a client proxy reports of a link."""
+        known = {field.name: report[field.name] for field in fields(cls) if field.name in report}
         return cls(
-            slot=report["slot"],
-            generation=report["generation"],
-            state=LinkState(report["state"]),
-            ready=frozenset(report["ready"]),
-            draining=report["draining"],
-            at_risk=report["at_risk"],
-            silent_for_s=report["silent_for_s"],
-            rtt_s=report["rtt_s"],
-            restarts=report["restarts"],
-            detail=report["detail"],
-            through=report.get("through", ""),
+            **{
+                **known,
+                "state": LinkState(report["state"]),
+                "ready": frozenset(report["ready"]),
+            }
         )
 
 

@@ -1,4 +1,4 @@
-"""How a robot's payloads are sent: which services want what on the way. Values only."""
+"""How the requests of each service are sent. Values only."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fogft.model.spec import ServiceSpec
 
 @dataclass(frozen=True)
 class SendOptions:
-    """What services want of their links.
+    """Which services want the newest first, no compression, or a deadline on the way.
 
     Attributes:
         latest: Those of which the newest request goes first.

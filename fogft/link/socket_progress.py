@@ -19,7 +19,7 @@ KEPT_S = 10.0  # then a link is measured anew
 
 
 class Throughput:
-    """Of one connection. Times are monotonic seconds.
+    """The throughput of one connection. Times are monotonic seconds.
 
     Attributes:
         steady_bytes_per_s: What two spans in a row carried at best, until more is seen; None
@@ -105,10 +105,10 @@ class Flow:
 
 
 class SocketProgress:
-    """Of one connection. Times are monotonic seconds.
+    """The progress of one connection. Times are monotonic seconds.
 
     Attributes:
-        carried: What it was seen to carry over some time.
+        throughput: What it was seen to carry over some time.
     """
 
     def __init__(self) -> None:

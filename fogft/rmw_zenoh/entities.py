@@ -1,4 +1,4 @@
-"""A service and a client among nodes of `rmw_zenoh`: bytes in, bytes out, no type loaded.
+"""A service server and a client over `rmw_zenoh`: bytes in and out, no type loaded.
 
 Each has one thread that does what may block in Zenoh: asking, answering, declaring. Callbacks
 come from Zenoh's threads.
@@ -32,7 +32,7 @@ _CLOSE_LIMIT_S = 10.0
 
 
 class Worker:
-    """A thread that does what it is given, in order."""
+    """A thread that runs functions in order."""
 
     def __init__(self, name: str) -> None:
         self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()

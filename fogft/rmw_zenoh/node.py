@@ -1,4 +1,4 @@
-"""A node among those of `rmw_zenoh`, with no ROS installed: `fogft.ros.port.RosNode` over Zenoh.
+"""A ROS node that speaks `rmw_zenoh` with no ROS installed (`fogft.ros.port.RosNode`).
 
 Services pass through as bytes. What a type is nobody here knows; that two ends have the same
 one is told by its hash, which is part of every key: a server's stands in its token, a client's

@@ -1,4 +1,4 @@
-"""One status list of an action out of those of its replicas.
+"""Merge the status lists that replicas publish of an action into one.
 
 Owns: reading and writing them. Not here: which status counts (`fogft.topics.goals`).
 """

@@ -1,4 +1,4 @@
-"""Respond in no denser bursts than an ordinary client bears.
+"""Send responses no faster than an ordinary ROS client's queue can take.
 
 An ordinary ROS client keeps the last ten responses that it has not taken yet and silently
 loses more. A service answers one request after another, but a proxy answers in bursts: all

@@ -22,7 +22,7 @@ OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where 
 
 
 class NotFoundYet(RosError):
-    """Discovery does not know yet the way to who asked: sending again may help."""
+    """Discovery has not found the client yet: sending again may help."""
 
 
 class RosServer(Protocol):
@@ -63,7 +63,7 @@ class RosClient(Protocol):
 
 
 class RosPublisher(Protocol):
-    """A publisher of this node's."""
+    """A publisher of serialised messages."""
 
     def publish(self, payload: bytes) -> None:
         """Publish a serialised message. Any thread.
@@ -81,7 +81,7 @@ class RosPublisher(Protocol):
 
 
 class RosSubscription(Protocol):
-    """A subscription of this node's."""
+    """A subscription to serialised messages."""
 
     def mismatch(self) -> str:
         """Say why a publisher that is there is not heard; empty if all are. Cheap."""
@@ -128,7 +128,7 @@ class RosNode(Protocol):
 
 
 class RosTopics(Protocol):
-    """A node that publishes and subscribes, too."""
+    """A node that can also publish and subscribe."""
 
     def publisher(self, name: str, type_name: str, quality: Quality) -> RosPublisher:
         """Make a publisher of a topic. Raises RosError: the type cannot be loaded."""

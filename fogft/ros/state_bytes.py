@@ -22,7 +22,7 @@ _TEXT = re.compile(r"string(?:<\d+>)?")
 
 
 class StateBytes:
-    """How one service's state travels.
+    """Reads and writes the state in a service's snapshot and restore messages.
 
     Raises:
         RosError: A type cannot be loaded, or has no such field.

@@ -28,7 +28,7 @@ _CLOSE_LIMIT_S = 5.0
 
 
 class VisibleNode:
-    """A node for people's tools.
+    """The node that ROS 2 command-line tools and dashboards see.
 
     Args:
         name: The node's name.

@@ -37,7 +37,7 @@ _UNKNOWN = Placement("local", "unknown", "unknown", "unknown")
 
 
 class LocalCloud:
-    """See the module. Implements `fogft.cloud.port.Cloud`; any thread, any number of processes.
+    """Replicas as processes on this machine (`fogft.cloud.port.Cloud`). Any thread, any process.
 
     Args:
         root: Folder of this cloud; made when needed.

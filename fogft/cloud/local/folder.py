@@ -48,7 +48,7 @@ _NAME = re.compile(r"(?P<uid>[0-9a-f]{16})-(?P<slot>\d{1,6})\.(?P<generation>\d{
 
 
 class Life(Enum):
-    """What the files and the lock together say of a machine."""
+    """Whether a machine lives, by its files and its lock."""
 
     ORDERED = "ordered"  # its process has shown no sign of life yet
     ALIVE = "alive"
@@ -58,7 +58,7 @@ class Life(Enum):
 
 @dataclass(frozen=True)
 class Record:
-    """``machine.json``.
+    """What was ordered: ``machine.json``.
 
     Attributes:
         boot_s: How long the machine pretends to boot.
@@ -83,7 +83,7 @@ class Record:
 
 @dataclass(frozen=True)
 class State:
-    """``state.json``. Its mere existence says that the machine's process once ran."""
+    """What became of it: ``state.json``, which is there once the machine's process ran."""
 
     phase: MachinePhase
     endpoint: str | None = None
@@ -95,7 +95,7 @@ class State:
 
 @dataclass(frozen=True)
 class MachineFolder:
-    """See the module. Reading raises `StateError` where a file is damaged."""
+    """The folder of one machine. Reading raises `StateError` where a file is damaged."""
 
     path: Path
     id: ReplicaId

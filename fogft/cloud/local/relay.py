@@ -41,7 +41,7 @@ class _Connection:
 
 
 class Relay:
-    """See the module.
+    """Relays the connections of one machine, as slow or broken as its faults say.
 
     Args:
         upstream: Where the server listens, or will.

@@ -28,7 +28,7 @@ _HOME = "us-east-1"  # any region lists the others
 
 
 class Aws:
-    """See `fogft.cloud.sky.provider.Provider`."""
+    """AWS, asked directly; see `fogft.cloud.sky.provider.Provider`."""
 
     cloud = "aws"
 

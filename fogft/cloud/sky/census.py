@@ -1,4 +1,4 @@
-"""Ask the providers: is what SkyPilot no longer lists really gone, and what else is there?
+"""Ask the providers which machines exist: SkyPilot may have forgotten some.
 
 Owns: when a provider is asked, and what it said last.
 Not here: the providers' interfaces (`provider`, `aws`).
@@ -22,7 +22,7 @@ NOBODY = "0" * 16  # a pool that does not exist: may one ask at all?
 
 
 class Census:
-    """What providers list with our labels.
+    """The machines that providers list with our labels.
 
     Args:
         providers: Clouds that can be asked directly, by name.

@@ -29,7 +29,7 @@ _HEARD_WITHIN_S = 180.0  # as `following.Limits.ask_s`
 
 
 class Ending:
-    """Ends replicas.
+    """Ends replicas, and makes sure that they are gone.
 
     Args:
         sky: SkyPilot.

@@ -37,7 +37,7 @@ UNDER_WAY = frozenset({Stage.ASKING, Stage.LAUNCHING, Stage.SETTING_UP})
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a launch may take. Seconds.
+    """How long each stage of a launch may take, in seconds.
 
     Attributes:
         ask_s: Until SkyPilot has accepted the order; then it is known that it never will.
@@ -54,7 +54,7 @@ DEFAULT_LIMITS = Limits()
 
 
 class Following:
-    """Makes the steps.
+    """Takes the next step of each launch.
 
     Args:
         sky: SkyPilot.

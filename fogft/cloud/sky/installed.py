@@ -37,7 +37,7 @@ _ZONE_ID = re.compile(r"[a-z]{2,5}\d-[a-z]{2,4}\d")  # `use1-az1`: a zone whose 
 
 
 class InstalledSky:
-    """See `fogft.cloud.sky.sdk.Sky`."""
+    """The installed SkyPilot; see `fogft.cloud.sky.sdk.Sky`."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -41,7 +41,7 @@ _ORDER = list(Stage)
 
 @dataclass(frozen=True)
 class Entry:
-    """One launch.
+    """One launch, as the journal remembers it.
 
     Attributes:
         launched_at: Seconds since the epoch.

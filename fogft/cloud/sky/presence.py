@@ -28,7 +28,7 @@ _ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
 
 
 class Presence:
-    """Tells what exists.
+    """Lists the machines of a pool.
 
     Args:
         sky: SkyPilot.

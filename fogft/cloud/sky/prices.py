@@ -37,7 +37,7 @@ class _Kept:
 
 
 class Prices:
-    """Offers, kept for a while.
+    """Offers with prices, cached for a while.
 
     Args:
         sky: SkyPilot's catalogue.

@@ -32,7 +32,7 @@ class Instance:
 
 
 class NotAllowedError(Exception):
-    """This account may not ask: SkyPilot's word has to do."""
+    """This account may not list machines: SkyPilot's list has to do."""
 
 
 class Provider(Protocol):

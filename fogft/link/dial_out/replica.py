@@ -1,4 +1,4 @@
-"""Come to robots and gateways that cannot come to us: the replica's side of dial-out.
+"""The replica's side of dial-out: it opens the connections to robots and gateways.
 
 It keeps two connections waiting at each door. When one is taken into use, it is joined with
 this replica's own listener, and another one takes its place.
@@ -31,7 +31,7 @@ _GREETING_TIMEOUT_S = 5.0
 
 
 class DialOut:
-    """Keeps connections waiting at doors.
+    """Keeps connections open to the dial-in ports of robots, for them to use.
 
     Args:
         local: ``host:port`` of this replica's own listener.

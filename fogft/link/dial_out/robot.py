@@ -1,4 +1,4 @@
-"""A door through which replicas that cannot be reached come in: the robot's side of dial-out.
+"""The robot's side of dial-out: a port (the door) to which replicas connect that it cannot reach.
 
 A replica dials the door, proves who it is, and waits. A link to that replica dials a port on
 this machine's loopback instead of a far address; the door then joins both connections. From
@@ -54,7 +54,7 @@ class _Waiting:
 
 
 class DialIn:
-    """The door of one robot or gateway.
+    """The dial-in port of one robot or gateway.
 
     Args:
         listen: ``host:port``; port 0 for any that is free.

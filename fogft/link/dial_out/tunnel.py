@@ -68,7 +68,7 @@ def hang_up(link: socket.socket) -> None:
 
 
 class Tunnel:
-    """Two connections joined. They are the tunnel's from now on.
+    """Carries bytes between two connections, and closes both.
 
     Args:
         one: A connected socket.

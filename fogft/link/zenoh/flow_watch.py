@@ -19,7 +19,7 @@ _QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
 
 
 class FlowWatch:
-    """Of one connection; used by one thread, but for `end_when_safe`.
+    """Watches one connection's socket. For one thread, but for `end_when_safe`.
 
     Args:
         own: The address of its own end.

@@ -70,7 +70,7 @@ def robot_settings(
         "connect/endpoints": [
             f"tls/{peer.endpoint}" + (f"#iface={peer.interface}" if peer.interface else "")
         ],
-        # One try: the keeper tries again, and knows when and why.
+        # One try: the link tries again, and knows when and why.
         "connect/timeout_ms": 0,
         "connect/exit_on_failure": True,
         "listen/endpoints": [],

@@ -1,4 +1,4 @@
-"""One more thread for what Zenoh's threads must not do, ahead of all replies.
+"""A worker thread for what Zenoh's threads must not do themselves.
 
 Owns: what waits for it, and how much may. Not here: what there is to do (`control_queries`).
 """

@@ -1,4 +1,4 @@
-"""See to the connections at a replica's port that are nobody's, or nobody's any more.
+"""Close connections at a replica's port that belong to no admitted robot, or deliver nothing.
 
 Zenoh owns the port. It lets a connection that never says who it is stand for as long as it
 likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look ourselves,

@@ -1,4 +1,4 @@
-"""What a robot asks a replica beside its requests: to be let in, probed, believed and answered.
+"""Answer a robot's queries other than requests: greetings, probes, records, answer streams.
 
 These are queries. Zenoh's threads only decode them and hand them over; the worker thread
 answers them, and their ends queue behind the replies of their robot.

@@ -1,4 +1,4 @@
-"""Queries that must be ended, or who asked waits for more.
+"""End Zenoh queries, so that their callers do not wait for more replies.
 
 Ending one sends something too, so it may block, and none of Zenoh's threads may do it. And it
 must not be done while Zenoh's own thread still holds that query: then the last to let go would be

@@ -1,4 +1,4 @@
-"""What is on the way to one robot, and whether something may be sent to it without any wait.
+"""The query of each connection that carries its replies, and what is unacknowledged on it.
 
 Replying blocks only where the robot takes nothing and all buffers on the way are full. So who must
 not block may reply himself while no more is on the way than those surely hold. What has arrived is
@@ -47,7 +47,7 @@ class _Sent(NamedTuple):
 
 
 class ReplyCredit:
-    """What one robot has not said that it has seen. Any thread.
+    """The replies that one robot has not acknowledged. Any thread.
 
     Args:
         slow: Whether it is known to read slowly.

@@ -1,4 +1,4 @@
-"""Whose connection a request came through, and whether its holder is still let in.
+"""Which certificate holder a connection belongs to, and whether it is still admitted.
 
 TLS has let the connection in; but Zenoh does not tell a listener whose query it hands over.
 So each connection greets: it sends its certificate, and a signature over its own random
@@ -26,7 +26,7 @@ _MAY_ASK = frozenset({Role.ROBOT, Role.GATEWAY})
 
 
 class NotAdmittedError(Exception):
-    """Somebody is not let in.
+    """A connection is not admitted.
 
     Args:
         refusal: One of `model.refusal`, as it travels.
@@ -39,7 +39,7 @@ class NotAdmittedError(Exception):
 
 
 class AuthenticatedSessions:
-    """The connections that may ask here. Safe to use from several threads.
+    """The connections that were authenticated. Any thread.
 
     Args:
         pool_uid: Holders of other pools are not let in.

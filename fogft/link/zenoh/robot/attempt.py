@@ -71,7 +71,7 @@ LIMIT = 8192  # the window holds 512; a replica that never answers what was forg
 
 
 class Unanswered:
-    """What one connection has sent, by request id.
+    """The requests sent on one connection and not answered yet, by id.
 
     Args:
         limit: Beyond it the oldest are forgotten.
@@ -97,7 +97,7 @@ class Unanswered:
 
 
 class BatchBuffer:
-    """The attempts of one service at a time. Any thread."""
+    """Small attempts of one service that wait to leave in one message. Any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

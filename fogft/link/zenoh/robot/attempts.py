@@ -37,7 +37,7 @@ _QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
 _STUCK_S = 0.1
 # What Zenoh itself may hold of a large request once its sending has returned: two batches.
 _ZENOH_HOLDS_BYTES = 2 * 65535
-# How long the keeper looks often after the last large request began to leave.
+# How long the link's thread looks often after the last large request began to leave.
 _WATCH_S = 5.0
 
 # In the queue, in place of an attempt: tell the replica of what was forgotten.
@@ -84,7 +84,7 @@ class Attempts:
         window: Those that are open.
         packs: Whether the replica reads what is compressed.
         packs_answers: Whether it finds out by itself when to compress answers.
-        watched: Something large was sent lately: the keeper looks often.
+        watched: Something large was sent lately: the link's thread looks often.
     """
 
     def __init__(
@@ -319,7 +319,7 @@ class Attempts:
             self._outlet.lose("it took nothing more, and Zenoh gave the session up")
 
     def _sends_large(self) -> None:
-        """Have the keeper look whether it flows, from now on and for a while."""
+        """Have the link's thread look whether it flows, from now on and for a while."""
         if not self.watched:
             self.watched = True
             self._on_large()
@@ -364,7 +364,7 @@ class Attempts:
         if answer.payload is not None or answer.refusal == Refusal.LATE:
             self._late(attempt.service, answer.request_id)
 
-    # -- the keeper -----------------------------------------------------------------------
+    # -- the link's thread ----------------------------------------------------------------
 
     @property
     def sending(self) -> bool:

@@ -228,7 +228,7 @@ class Connection:
         if event.kind == zenoh.SampleKind.DELETE:
             self.lose("the connection was lost")
 
-    # -- the keeper -----------------------------------------------------------------------
+    # -- the link's thread ----------------------------------------------------------------
 
     def look(self, now: float) -> float:
         """Look what flows; return for how many of the last seconds something large moved."""
@@ -265,7 +265,7 @@ class Connection:
             payload=payload,
             attachment=self._greeting,
             timeout=timeout_s,
-            # The keeper must not wait behind what is stuck: a lost probe is an unanswered one.
+            # This thread must not wait behind what is stuck: a lost probe is an unanswered one.
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
@@ -277,7 +277,7 @@ class Connection:
         try:
             _, _, reason = frame.decode_refusal(content)
         except FrameError:
-            return  # Zenoh's own: it timed out, and the keeper counts the silence
+            return  # Zenoh's own: it timed out, and the link's thread counts the silence
         words = _REFUSED.get(reason, f"the replica refuses our probes: {reason}")
         self.lose(words)
 

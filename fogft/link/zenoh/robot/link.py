@@ -1,6 +1,6 @@
-"""Links over Zenoh: keep a connection to each replica, probe it, and doubt it in time.
+"""Links over Zenoh: keep a connection to a replica, probe it, replace it when it is silent.
 
-A keeper thread for each link opens the connection, sends probes, and replaces the
+A thread of each link (`fogft-keep-...`) opens the connection, sends probes, and replaces the
 connection when it is lost or when probes go unanswered: never because a service is slow.
 `offer` only puts the attempt into the connection's queue.
 
@@ -63,7 +63,7 @@ class ZenohLink:
         self._woke_at = 0.0
         self._closed = False
         self._probing = Probing(peer, self._wake.set)
-        # Written by the keeper only; `_live` is set exactly while the state is UP.
+        # Written by the link's thread only; `_live` is set exactly while the state is UP.
         self._live: Connection | None = None
         self._state = LinkState.CONNECTING
         self._ready: frozenset[str] = frozenset()
@@ -168,7 +168,7 @@ class ZenohLink:
         )
 
     def close(self) -> None:
-        """End the link; its keeper lets go of the rest within moments."""
+        """End the link; its thread lets go of the rest within moments."""
         self._closed = True
         join_at_exit(self._thread)
         self._wake.set()
@@ -187,10 +187,10 @@ class ZenohLink:
         self._wake.set()
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the keeper thread of a closed link."""
+        """Wait for the link's thread of a closed link."""
         self._thread.join(timeout_s)
 
-    # -- the keeper thread ----------------------------------------------------------------
+    # -- the link's thread ----------------------------------------------------------------
 
     def _keep(self) -> None:
         failures = 0

@@ -19,7 +19,7 @@ _NEARLY = 0.9  # of a time-out, as it is measured
 
 
 class Opening:
-    """Of one link; used by one thread.
+    """The tries to open one link's connection. Used by one thread.
 
     Args:
         settings: How long a try may take.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Silence:
-    """The silence of one replica. Times are monotonic seconds."""
+    """How long a replica has not answered probes. Times are monotonic seconds."""
 
     def __init__(self) -> None:
         self._since: float | None = None
@@ -62,7 +62,7 @@ class Heard:
 
 
 class Probing:
-    """Probes to one replica. For one thread, the link's keeper; any may read the attributes.
+    """Probes to one replica. For the link's thread; any may read the attributes.
 
     Args:
         peer: Who must answer.

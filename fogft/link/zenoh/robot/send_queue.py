@@ -1,4 +1,4 @@
-"""What waits for a connection's sender: in order, but the newest first where that is wanted.
+"""The queue of a connection's sender thread: in order, or the newest first.
 
 On a thin uplink requests wait here for seconds. Of a service that wants the latest, the newest
 takes the turn of the oldest; the others keep waiting, and are sent while their time lasts.
@@ -21,7 +21,7 @@ Waiting = list[tuple[float, int, OpenAttempt]]
 
 
 class SendQueue:
-    """Attempts, and None for the end. Safe to use from several threads.
+    """A queue of attempts; None ends the sender thread. Any thread.
 
     Args:
         latest: Services of which the newest is preferred.
