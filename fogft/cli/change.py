@@ -49,10 +49,10 @@ def drain(slot: Slot, pool: PoolOption = None) -> None:
 
     The old one finishes its requests and is then ended.
     """
-    from fogft.pool.commands import composition, wishes
+    from fogft.pool.commands import change, composition
 
     store = composition.store_of(pool)
-    replica = wishes.drain(store, slot, time.time())
+    replica = change.drain(store, slot, time.time())
     output.done(f"replica `{replica}` of `{store.name}` will be replaced")
     _warn_without_manager(store)
 
@@ -69,10 +69,10 @@ def exclude(
     pool: PoolOption = None,
 ) -> None:
     """Launch nothing in a location, and move replicas out of it."""
-    from fogft.pool.commands import composition, wishes
+    from fogft.pool.commands import change, composition
 
     store = composition.store_of(pool)
-    is_new = wishes.exclude(store, location, composition.cloud_of(store.identity()))
+    is_new = change.exclude(store, location, composition.cloud_of(store.identity()))
     since = "is now" if is_new else "was already"
     output.done(f"`{location}` {since} excluded from `{store.name}`")
     _warn_without_manager(store)
@@ -90,19 +90,19 @@ def include(
     pool: PoolOption = None,
 ) -> None:
     """Allow an excluded location again."""
-    from fogft.pool.commands import composition, wishes
+    from fogft.pool.commands import change, composition
 
     store = composition.store_of(pool)
-    wishes.include(store, location)
+    change.include(store, location)
     output.done(f"`{location}` may be used by `{store.name}` again")
     _warn_without_manager(store)
 
 
 def _scale(pool: str | None, by: int) -> None:
-    from fogft.pool.commands import composition, wishes
+    from fogft.pool.commands import change, composition
 
     store = composition.store_of(pool)
-    before, after = wishes.scale(store, by)
+    before, after = change.scale(store, by)
     output.done(f"`{store.name}` will have {after} replicas (was {before})")
     _warn_without_manager(store)
 

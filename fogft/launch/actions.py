@@ -5,7 +5,7 @@ Needs `launch` and `launch_ros`: import `fogft.launch` instead, which loads this
 picks a cloud.
 
 Owns: evaluating what a launch file says, and when its local nodes start.
-Not here: the pool file's text (`words`), the pool (`hold`).
+Not here: the pool file's text (`pool_file`), the pool (`run_pool`).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from launch_ros.actions import Node
 
 from fogft.disk import make_folder, write_whole
 from fogft.errors import FogftError
-from fogft.launch.hold import READY
-from fogft.launch.words import NodeWords, pool_tree, run_text
+from fogft.launch.pool_file import NodeCommand, pool_tree, run_text
+from fogft.launch.run_pool import READY
 from fogft.pool.folder.paths import home
 
 _END_LIMIT_S = 900  # how long launch waits for `fogft down` before it kills
@@ -41,15 +41,19 @@ _NOT_CARRIED = {
     "shell": "write the pool file's `run` instead",
     "log_cmd": "`fogft logs` shows the commands of replicas",
 }
+_POOL_KEYS = (
+    *("name", "file", "replicas", "resources", "services", "setup"),
+    *("workdir", "fogft", "cloud", "on_exit", "timeout"),
+)
 
 
 @expose_action("cloud_node")
 class CloudNode(Node):  # type: ignore[misc]
-    """A node that runs on every replica of the fog pool that it stands in.
+    """A node that runs on every replica of the fog pool that contains it.
 
     Takes what `launch_ros.actions.Node` takes. Name, namespace, parameters, remappings,
-    environment and arguments travel; `output` and `respawn` mean nothing there, as the
-    replicas' logs are always shown and their nodes always started again.
+    environment and arguments are kept; `output` and `respawn` have no effect: replicas'
+    logs are always shown, and their nodes always restarted.
 
     Raises:
         FogftError: An argument cannot be carried to another machine.
@@ -63,8 +67,8 @@ class CloudNode(Node):  # type: ignore[misc]
         self._is_path = not arguments.get("package")
         super().__init__(**arguments)
 
-    def words(self, context: LaunchContext) -> NodeWords:
-        """Return the node as it is asked for in this context.
+    def command(self, context: LaunchContext) -> NodeCommand:
+        """Return how the node is started, all substitutions made.
 
         Raises:
             FogftError: A parameter file cannot be read.
@@ -75,10 +79,9 @@ class CloudNode(Node):  # type: ignore[misc]
         if namespace and "unspecified" not in namespace:
             specific["ns"] = f"__ns:={namespace}"
         context.extend_locals({"ros_specific_arguments": specific})
-        words = [perform_substitutions(context, _listed(word)) for word in self.cmd[1:]]
+        words = [_text(context, word) for word in self.cmd[1:]]
         environ = {
-            perform_substitutions(context, key): perform_substitutions(context, value)
-            for key, value in self.additional_env or ()
+            _text(context, key): _text(context, value) for key, value in self.additional_env or ()
         }
         files = {
             path: _text_of(path)
@@ -86,7 +89,7 @@ class CloudNode(Node):  # type: ignore[misc]
             if option == "--params-file"
         }
         first = self.cmd[0] if self._is_path else self.node_executable
-        return NodeWords(
+        return NodeCommand(
             "" if self._is_path else _text(context, self.node_package),
             _text(context, first),
             tuple(words),
@@ -99,14 +102,14 @@ class CloudNode(Node):  # type: ignore[misc]
         return "" if "unspecified" in name else name
 
     def execute(self, context: LaunchContext) -> list[Action] | None:
-        """Run it here; only a fog pool that stays here lets it come to that.
+        """Run it on this machine, in a fog pool that stays here.
 
         Raises:
-            FogftError: It stands in no fog pool.
+            FogftError: It is in no fog pool.
         """
         if not _stays_here(context):
             raise FogftError(
-                "a cloud node stands in no fog pool", "put it into a `FogPool` (`fog_pool`)"
+                "a cloud node is in no fog pool", "put it into a `FogPool` (`fog_pool`)"
             )
         result: list[Action] | None = super().execute(context)
         return result
@@ -114,58 +117,35 @@ class CloudNode(Node):  # type: ignore[misc]
 
 @expose_action("fog_pool")
 class FogPool(Action):  # type: ignore[misc]
-    """A pool of replicas that run the cloud nodes in it; its other actions start when it answers.
+    """A pool whose replicas run its cloud nodes; its other actions start when they answer.
 
     Texts may be substitutions; what is a list or a mapping may be given as YAML text.
 
     Args:
-        actions: Cloud nodes, and whatever shall start here once their services answer.
+        actions: Cloud nodes, and whatever starts here once their services answer.
         name: The pool's name.
         file: A pool file without `run` that supplies the rest.
         replicas: How many.
         resources: SkyPilot's `resources`.
         services: As in a pool file; without them, those that the nodes offer.
         setup: Shell text that prepares a replica.
-        workdir: A folder that travels to the replicas.
+        workdir: A folder that is copied to the replicas.
         fogft: More keys of the pool file's `fogft` section.
-        cloud: Where; what `resources` name, else this machine.
+        cloud: Where; by default what `resources` name, else this machine.
         on_exit: ``leave`` the pool running when the launch ends, or take it ``down``.
         timeout: Seconds to wait for the services.
     """
 
-    def __init__(
-        self,
-        actions: Iterable[Action] = (),
-        *,
-        name: Any = "",
-        file: Any = "",
-        replicas: Any = "",
-        resources: Any = "",
-        services: Any = "",
-        setup: Any = "",
-        workdir: Any = "",
-        fogft: Any = "",
-        cloud: Any = "",
-        on_exit: Any = "leave",
-        timeout: Any = "",
-        **rest: Any,
-    ) -> None:
-        super().__init__(**rest)
+    def __init__(self, actions: Iterable[Action] = (), **arguments: Any) -> None:
         self._actions = list(actions)
-        self._given = {
-            "name": name, "file": file, "replicas": replicas, "resources": resources,
-            "services": services, "setup": setup, "workdir": workdir, "fogft": fogft,
-            "cloud": cloud, "on_exit": on_exit, "timeout": timeout,
-        }  # fmt: skip
+        self._given = {key: arguments.pop(key, "") for key in _POOL_KEYS}
+        super().__init__(**arguments)
 
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> tuple[type[FogPool], dict[str, Any]]:
         """Read it from an XML or YAML launch file."""
         _, arguments = super().parse(entity, parser)
-        for key in (
-            *("name", "file", "replicas", "resources", "services", "setup"),
-            *("workdir", "fogft", "cloud", "on_exit", "timeout"),
-        ):
+        for key in _POOL_KEYS:
             value = entity.get_attr(key, optional=True)
             if value is not None:
                 arguments[key] = parser.parse_substitution(value)
@@ -173,26 +153,28 @@ class FogPool(Action):  # type: ignore[misc]
         return cls, arguments
 
     def execute(self, context: LaunchContext) -> list[Action]:
-        """Write the pool file, hold the pool, and start the local actions when it answers.
+        """Write the pool file, run the pool, and start the local actions when it answers.
 
         Raises:
-            FogftError: What is asked for makes no pool file.
+            FogftError: The arguments do not make a pool file.
         """
         if _stays_here(context):
             return self._actions
         asked = {key: _evaluated(context, value) for key, value in self._given.items()}
-        if asked["on_exit"] not in ("leave", "down"):
+        if asked["on_exit"] not in ("", "leave", "down"):
             raise FogftError(
                 f"fog pool: `on_exit` is `{asked['on_exit']}`", "write `leave` or `down`"
             )
         nodes = [action for action in self._actions if isinstance(action, CloudNode)]
         local = [action for action in self._actions if not isinstance(action, CloudNode)]
         chosen = [n for n in nodes if n.condition is None or n.condition.evaluate(context)]
-        tree = _tree(asked, [node.words(context) for node in chosen])
-        return _held(_written(tree), tree["name"], asked, _cloud(context) or asked["cloud"], local)
+        tree = _tree(asked, [node.command(context) for node in chosen])
+        return _running(
+            _written(tree), tree["name"], asked, _cloud(context) or asked["cloud"], local
+        )
 
 
-def _tree(asked: Mapping[str, Any], nodes: Sequence[NodeWords]) -> dict[str, Any]:
+def _tree(asked: Mapping[str, Any], nodes: Sequence[NodeCommand]) -> dict[str, Any]:
     base: Any = {}
     if asked["file"]:
         file = Path(asked["file"]).absolute()
@@ -219,22 +201,22 @@ def _written(tree: Mapping[str, Any]) -> Path:
 
 
 def _as_block(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    """Write texts of several lines as a person would."""
+    """Write texts of several lines as blocks."""
     style = "|" if "\n" in text else None
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 
 class _Blocks(yaml.SafeDumper):
-    """A dumper of our own: other actions of the launch share PyYAML's."""
+    """A dumper of our own: PyYAML's is shared with the rest of the launch."""
 
 
 _Blocks.add_representer(str, _as_block)
 
 
-def _held(
+def _running(
     file: Path, name: str, asked: Mapping[str, Any], cloud: str, local: Sequence[Action]
 ) -> list[Action]:
-    words = [sys.executable, "-m", "fogft.launch.hold", str(file), "--pool", name]
+    words = [sys.executable, "-m", "fogft.launch.run_pool", str(file), "--pool", name]
     words += ["--cloud", cloud] if cloud else []
     words += ["--timeout", str(asked["timeout"])] if asked["timeout"] else []
     words += ["--down"] if asked["on_exit"] == "down" else []
@@ -276,12 +258,12 @@ def _stays_here(context: LaunchContext) -> bool:
 
 
 def _evaluated(context: LaunchContext, value: Any) -> Any:
-    """Return a value with its substitutions made; YAML text becomes what it says."""
+    """Return a value with its substitutions made, and YAML text parsed."""
     if isinstance(value, (int, float, Mapping)):
         return value
     if isinstance(value, (list, tuple)) and any(isinstance(item, Mapping) for item in value):
         return list(value)
-    text = perform_substitutions(context, normalize_to_list_of_substitutions(value))
+    text = _text(context, value)
     if "\n" not in text and text[:1] not in ("{", "["):
         return int(text) if text.isdigit() else text
     try:
@@ -293,10 +275,6 @@ def _evaluated(context: LaunchContext, value: Any) -> Any:
 
 def _text(context: LaunchContext, value: Any) -> str:
     return str(perform_substitutions(context, normalize_to_list_of_substitutions(value)))
-
-
-def _listed(word: Any) -> Any:
-    return normalize_to_list_of_substitutions(word)
 
 
 def _text_of(path: str) -> str:

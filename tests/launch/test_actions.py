@@ -21,6 +21,7 @@ from launch.launch_description_sources import (  # noqa: E402
 )
 
 from fogft.launch.actions import CloudNode, FogPool  # noqa: E402
+from fogft.launch.run_pool import READY  # noqa: E402
 
 PYTHON = """
 from launch import LaunchDescription
@@ -247,7 +248,7 @@ def test_the_real_launch_runs_a_pool_from_begin_to_end(tmp_path: Path) -> None:
     said = shown.stdout + shown.stderr
     assert "ANSWER ahoy 7 sour /arm/setta" in said
     assert "done: nothing of `lt` is left" in said
-    assert said.index("fogft: the services answer") < said.index("ANSWER")
+    assert said.index(READY) < said.index("ANSWER")
     assert not (tmp_path / "home" / "pools" / "lt").exists()
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.errors import FogftError
 from fogft.model.certificate_holder import Holder, Role
-from fogft.pool.commands import joining, wishes
+from fogft.pool.commands import change, joining
 from fogft.pool.commands.joining import Issued, Joined
 from fogft.pool.commands.status import slots
 from fogft.pool.credentials.ledger import Entry, Ledger
@@ -77,13 +77,13 @@ def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Ho
     for holder in holders if role is Role.REPLICA else ():
         now = time.time()
         if holder.generation == _generation_in(store.paths, int(holder.name), now):
-            wishes.drain(store, int(holder.name), now)
+            change.drain(store, int(holder.name), now)
     return holders, _published(store, holders)
 
 
 def _generation_in(paths: PoolPaths, slot: int, now: float) -> int | None:
     try:
-        return wishes.generation_in(paths, slot, now)
+        return change.generation_in(paths, slot, now)
     except FogftError:
         return None  # it is gone already, or was started by hand
 
@@ -115,7 +115,7 @@ def _in_use(paths: PoolPaths, holder: Holder) -> bool:
 def rotate_replicas(store: PoolStore, slot: int | None = None) -> list[str]:
     """Have replicas replaced, the new one first, each with a key of its own; return which."""
     chosen = slots(store.paths) if slot is None else [slot]
-    return [wishes.drain(store, one, time.time()) for one in chosen]
+    return [change.drain(store, one, time.time()) for one in chosen]
 
 
 def _published(store: PoolStore, holders: Sequence[Holder]) -> bool:

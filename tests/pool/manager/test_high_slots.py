@@ -20,7 +20,7 @@ from fogft.model.certificate_holder import Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.replica import LinkReport, LinkState, Member, Membership, ReplicaId
 from fogft.model.spec import GroupSpec
-from fogft.pool.commands import wishes
+from fogft.pool.commands import change
 from fogft.pool.commands.status import Seen, slots
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
@@ -172,9 +172,9 @@ def test_slots_are_listed_by_number(tmp_path: Path) -> None:
     rows = [replace(seen().replicas[0], slot=slot) for slot in (100, 9, 10, 99)]
     disk.write_json(PoolPaths(tmp_path).status, replace(seen(), replicas=rows).to_json())
     with pytest.raises(FogftError) as caught:
-        wishes.generation_in(PoolPaths(tmp_path), 5, NOW)
+        change.generation_in(PoolPaths(tmp_path), 5, NOW)
     assert caught.value.hint == "slots with a replica: 9, 10, 99, 100"
     with pytest.raises(FogftError, match="started by hand") as caught:
-        wishes.generation_in(PoolPaths(tmp_path), 1000, NOW)
+        change.generation_in(PoolPaths(tmp_path), 1000, NOW)
     assert "`fogft credentials revoke replica 1000`" in caught.value.hint
     assert slots(PoolPaths(tmp_path)) == [9, 10, 99, 100]

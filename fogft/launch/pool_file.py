@@ -1,6 +1,6 @@
-"""Turn what a launch file says of nodes and their pool into a pool file. Pure.
+"""Turn a launch file's nodes and pool into a pool file. Pure.
 
-Owns: the `run` command of a replica, and how a base file and a launch file's words merge.
+Owns: the `run` command of a replica, and how a base file and a launch file merge.
 Not here: substitutions and conditions (`actions`), what a pool file may say (`fogft.poolfile`).
 """
 
@@ -45,8 +45,8 @@ done"""
 
 
 @dataclass(frozen=True)
-class NodeWords:
-    """One node as its launch file asks for it, all substitutions made.
+class NodeCommand:
+    """How a node is started, all substitutions made.
 
     Attributes:
         package: Its ROS package; empty when `executable` is a path or a program's name.
@@ -62,7 +62,7 @@ class NodeWords:
     files: Mapping[str, str] = field(default_factory=dict)
 
 
-def run_text(nodes: Sequence[NodeWords]) -> str:
+def run_text(nodes: Sequence[NodeCommand]) -> str:
     """Return the shell text that runs these nodes on a replica, for bash.
 
     One node replaces the shell. Of several, the end of one ends all, so that they are
@@ -95,7 +95,7 @@ def run_text(nodes: Sequence[NodeWords]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _command(node: NodeWords, index: int, names: Mapping[str, str]) -> str:
+def _command(node: NodeCommand, index: int, names: Mapping[str, str]) -> str:
     words = [names.get(word, word) for word in node.arguments]
     first = f'"$node_{index}"' if node.package else shlex.quote(node.executable)
     environ = [shlex.quote(f"{key}={value}") for key, value in node.environ.items()]

@@ -1,4 +1,4 @@
-"""Change what the user wants of a pool besides its file: `scale`, `drain`, `exclude`, `include`.
+"""Change what a pool aims for besides its file: `scale`, `drain`, `exclude`, `include`.
 
 Each writes the new intent under the pool's lock and returns; the manager, now or when
 there is one again, acts on it.

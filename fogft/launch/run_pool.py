@@ -1,7 +1,7 @@
-"""``python -m fogft.launch.hold FILE``: what a launch file runs for a pool.
+"""``python -m fogft.launch.run_pool FILE``: the process that a launch file starts for a pool.
 
-Brings the pool up, says so in one line that the launch file waits for, then shows the logs
-of its replicas. On a signal it ends, and ends the pool where it is told to.
+Starts the pool, prints a line that the launch file waits for, then shows the logs of the
+replicas. On a signal it ends, and with `--down` it ends the pool first.
 
 Owns: that sequence. Not here: pools (all is done by the ``fogft`` command).
 """
@@ -18,7 +18,7 @@ from types import FrameType
 
 from fogft.child import tied
 
-READY = "fogft: the services answer"
+READY = "fogft_pool_ready"  # a line of stdout, for the launch file
 
 
 class _Interrupted(Exception):
@@ -26,8 +26,8 @@ class _Interrupted(Exception):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Hold a pool until a signal comes; return the exit status."""
-    parser = argparse.ArgumentParser(prog="fogft.launch.hold")
+    """Run a pool until a signal comes; return the exit status."""
+    parser = argparse.ArgumentParser(prog="fogft.launch.run_pool")
     parser.add_argument("file")
     parser.add_argument("--pool", required=True)
     parser.add_argument("--cloud")
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
     try:
-        return _hold(asked)
+        return _run(asked)
     except _Interrupted:
         status = 0
     finally:
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
     return ended if asked.down else status
 
 
-def _hold(asked: argparse.Namespace) -> int:
+def _run(asked: argparse.Namespace) -> int:
     options = ["--yes"]
     if asked.cloud:
         options += ["--cloud", asked.cloud]

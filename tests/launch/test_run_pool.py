@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft.launch.hold import READY
+from fogft.launch.run_pool import READY
 
 # Stands in for `python -m fogft`: notes its words, and behaves as FAKE_UP says.
 FAKE = """
@@ -29,7 +29,7 @@ if sys.argv[1] == "logs":
 
 
 @pytest.fixture
-def hold(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+def run_pool(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     package = tmp_path / "site" / "fogft"
     package.mkdir(parents=True)
     root = Path(__file__).parents[2] / "fogft"
@@ -43,7 +43,7 @@ def hold(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
             **os.environ, "PYTHONPATH": str(tmp_path / "site"), "FAKE_UP": up,
             "TRACE": str(tmp_path / "trace"),
         }  # fmt: skip
-        words = [sys.executable, "-m", "fogft.launch.hold", "f.yaml", "--pool", "p", *options]
+        words = [sys.executable, "-m", "fogft.launch.run_pool", "f.yaml", "--pool", "p", *options]
         child = subprocess.Popen(
             words, env=environ, cwd=tmp_path, stdout=subprocess.PIPE, text=True
         )
@@ -60,8 +60,8 @@ def trace(folder: Path) -> list[str]:
     return (folder / "trace").read_text().splitlines()
 
 
-def test_up_then_one_line_then_the_logs(hold, tmp_path: Path) -> None:
-    child = hold("--cloud", "local", "--timeout", "9")
+def test_up_then_one_line_then_the_logs(run_pool, tmp_path: Path) -> None:
+    child = run_pool("--cloud", "local", "--timeout", "9")
     assert child.stdout.readline() == f"{READY}\n"
     assert child.stdout.readline() == "0.1 a line\n"
     child.send_signal(signal.SIGINT)
@@ -73,8 +73,8 @@ def test_up_then_one_line_then_the_logs(hold, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_pool_ends_with_it_when_asked_to(hold, tmp_path: Path, number: int) -> None:
-    child = hold("--down")
+def test_the_pool_ends_with_it_when_asked_to(run_pool, tmp_path: Path, number: int) -> None:
+    child = run_pool("--down")
     assert child.stdout.readline() == f"{READY}\n"
     child.stdout.readline()
     child.send_signal(number)
@@ -84,15 +84,15 @@ def test_the_pool_ends_with_it_when_asked_to(hold, tmp_path: Path, number: int) 
     assert len(trace(tmp_path)) == 3
 
 
-def test_a_pool_that_does_not_come_up_is_told_by_the_status(hold, tmp_path: Path) -> None:
-    child = hold(up="3")
+def test_a_pool_that_does_not_come_up_is_told_by_the_status(run_pool, tmp_path: Path) -> None:
+    child = run_pool(up="3")
     assert child.wait(20) == 3
     assert READY not in child.stdout.read()
     assert trace(tmp_path) == ["up f.yaml --yes"]
 
 
-def test_an_interrupt_during_up_still_ends_the_pool(hold, tmp_path: Path) -> None:
-    child = hold("--down", up="slow")
+def test_an_interrupt_during_up_still_ends_the_pool(run_pool, tmp_path: Path) -> None:
+    child = run_pool("--down", up="slow")
     while not (tmp_path / "trace").exists():
         assert child.poll() is None
     child.send_signal(signal.SIGINT)

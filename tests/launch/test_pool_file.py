@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import FogftError
-from fogft.launch.words import FILE_LIMIT_BYTES, NodeWords, pool_tree, run_text
+from fogft.launch.pool_file import FILE_LIMIT_BYTES, NodeCommand, pool_tree, run_text
 
 SHOW = "import json, os, sys; print(json.dumps([sys.argv[1:], dict(os.environ)]))"
 WORD = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)
@@ -40,7 +40,7 @@ def bash(text: str, folder: Path, environ: dict[str, str]) -> subprocess.Complet
 def test_every_word_arrives_as_it_was_written(words: list[str], environ: dict[str, str]) -> None:
     """Quotes, newlines, dollars and blanks mean nothing to the shell."""
     environ.pop("PATH", None)
-    node = NodeWords("", sys.executable, ("-c", SHOW, *words), environ)
+    node = NodeCommand("", sys.executable, ("-c", SHOW, *words), environ)
     shown = subprocess.run(
         ["bash", "-c", run_text([node])], capture_output=True, check=True, timeout=20
     ).stdout
@@ -51,7 +51,7 @@ def test_every_word_arrives_as_it_was_written(words: list[str], environ: dict[st
 
 def test_an_executable_is_found_in_its_package(tmp_path: Path) -> None:
     environ = prefix_with(tmp_path)
-    node = NodeWords("tools", "show", ("a b", "--ros-args", "-r", "x:=y"), {"FLAVOUR": "sour"})
+    node = NodeCommand("tools", "show", ("a b", "--ros-args", "-r", "x:=y"), {"FLAVOUR": "sour"})
     shown = bash(run_text([node]), tmp_path, environ)
     arguments, seen = json.loads(shown.stdout)
     assert arguments == ["a b", "--ros-args", "-r", "x:=y"]
@@ -60,7 +60,7 @@ def test_an_executable_is_found_in_its_package(tmp_path: Path) -> None:
 
 def test_a_missing_executable_is_named_with_what_to_do(tmp_path: Path) -> None:
     environ = prefix_with(tmp_path)
-    shown = bash(run_text([NodeWords("tools", "gone")]), tmp_path, environ)
+    shown = bash(run_text([NodeCommand("tools", "gone")]), tmp_path, environ)
     assert shown.returncode == 127
     assert "package `tools` has no executable `gone` here" in shown.stderr
     assert "`setup`" in shown.stderr
@@ -70,9 +70,9 @@ def test_parameter_files_travel_whole(tmp_path: Path) -> None:
     """Also one that holds the mark that would end it, and one named twice."""
     content = "a: 1\nEND_OF_PARAMETERS\n$HOME `x`\n"
     arguments = ("--params-file", "/robot/p.yaml", "--params-file", "/robot/p.yaml")
-    node = NodeWords("", "cat", ("parameters-0.yaml",), files={"/robot/p.yaml": content})
+    node = NodeCommand("", "cat", ("parameters-0.yaml",), files={"/robot/p.yaml": content})
     assert bash(run_text([node]), tmp_path, {"PATH": os.environ["PATH"]}).stdout == content
-    named = run_text([NodeWords("", "x", arguments, files={"/robot/p.yaml": content})])
+    named = run_text([NodeCommand("", "x", arguments, files={"/robot/p.yaml": content})])
     assert named.count("--params-file parameters-0.yaml") == 2
     assert "/robot/p.yaml" not in named
 
@@ -80,7 +80,7 @@ def test_parameter_files_travel_whole(tmp_path: Path) -> None:
 def test_a_file_too_large_is_refused() -> None:
     files = {"/robot/p.yaml": "x" * (FILE_LIMIT_BYTES + 1)}
     with pytest.raises(FogftError, match=r"/robot/p.yaml.*too large"):
-        run_text([NodeWords("", "x", files=files)])
+        run_text([NodeCommand("", "x", files=files)])
 
 
 def test_of_several_nodes_the_end_of_one_ends_all(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_of_several_nodes_the_end_of_one_ends_all(tmp_path: Path) -> None:
     script += "if [ $1 = long ]; then touch begun; while :; do sleep 0.05; done; fi\n"
     script += "until [ -e begun ]; do sleep 0.05; done; exit 7\n"
     environ = prefix_with(tmp_path, script)
-    nodes = [NodeWords("tools", "show", ("long",)), NodeWords("tools", "show", ("short",))]
+    nodes = [NodeCommand("tools", "show", ("long",)), NodeCommand("tools", "show", ("short",))]
     assert bash(run_text(nodes), tmp_path, environ).returncode == 7
     assert (tmp_path / "trace").read_text() == "ended\n"
 
