@@ -13,6 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from fogft.link import batch_frames, frame
@@ -64,6 +65,25 @@ class Outlet(Protocol):
         """It is of no more use. Any thread, perhaps more than once."""
 
 
+@dataclass(frozen=True)
+class Callbacks:
+    """What a connection tells its link. Called from any thread; none may block.
+
+    Attributes:
+        answered: An attempt has ended; once for each.
+        late: A request that was forgotten (service, id) was answered.
+        room: A window that was full has room again.
+        large: Something large is sent, and `Attempts.watched` was not set.
+        lost: The connection is of no more use. Perhaps more than once.
+    """
+
+    answered: Callable[[Answer], None]
+    late: Callable[[str, bytes], None]
+    room: Callable[[], None]
+    large: Callable[[], None]
+    lost: Callable[[], None]
+
+
 class Attempts:
     """The attempts of one connection.
 
@@ -73,10 +93,7 @@ class Attempts:
         options: How the services' payloads are sent.
         gate: Shared with the robot's other connections.
         cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
-        answered: Called with each attempt's end, once. Must not block.
-        late: Called with service and id when a forgotten request was answered. Must not block.
-        room: Called when a window that was full has room again.
-        large: Called when something large is sent and `watched` is not set. Must not block.
+        tell: The link's callbacks.
         ended: What the sender thread does last.
         name: Of that thread.
 
@@ -96,10 +113,7 @@ class Attempts:
         options: SendOptions,
         gate: LargeSendGate,
         cancellations: Cancellations | None,
-        answered: Callable[[Answer], None],
-        late: Callable[[str, bytes], None],
-        room: Callable[[], None],
-        large: Callable[[], None],
+        tell: Callbacks,
         ended: Callable[[], None],
         name: str,
     ) -> None:
@@ -108,10 +122,10 @@ class Attempts:
         self._origin = origin
         self._gate = gate
         self._cancellations = cancellations
-        self._answered = answered
-        self._late = late
-        self._room = room
-        self._on_large = large
+        self._answered = tell.answered
+        self._late = tell.late
+        self._room = tell.room
+        self._on_large = tell.large
         self._ended = ended
         self.window: LinkWindow[OpenAttempt] = LinkWindow()
         self.packs = False

@@ -27,19 +27,17 @@ from zenoh import handlers
 from fogft.errors import FrameError, WireError
 from fogft.link import frame
 from fogft.link.cancellations import Cancellations
-from fogft.link.large_send_gate import LargeSendGate
-from fogft.link.port import Answer, Peer
-from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
+from fogft.link.port import Peer
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.flow_watch import FlowWatch
 from fogft.link.zenoh.robot.attempt import read_reply
-from fogft.link.zenoh.robot.attempts import Attempts
+from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
+from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.sockets import address
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.refusal import Refusal
-from fogft.records.record import Sign
 
 log = logging.getLogger(__name__)
 
@@ -69,17 +67,9 @@ class Connection:
     Args:
         config: Zenoh's configuration of the session.
         peer: Whom it must reach.
-        robot: Who we are.
         keys: Service name -> key.
-        sign: Signs our greeting.
-        options: How the services' payloads are sent.
-        gate: Shared with the robot's other connections.
-        cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
-        answered: Called with each attempt's end, once. Must not block.
-        late: Called with service and id when a forgotten request was answered. Must not block.
-        lost: Called, from any thread and perhaps more than once, when it is no longer of use.
-        room: Called when a window that was full has room again.
-        large: Called when something large is sent and it is not `watched`. Must not block.
+        shared: What all links of the robot share.
+        tell: The link's callbacks.
 
     Attributes:
         attempts: The requests open on it.
@@ -98,23 +88,16 @@ class Connection:
         self,
         config: zenoh.Config,
         peer: Peer,
-        robot: str,
         keys: Mapping[str, str],
-        *,
-        sign: Sign,
-        options: SendOptions = DEFAULT_OPTIONS,
-        gate: LargeSendGate,
-        cancellations: Cancellations | None = None,
-        answered: Callable[[Answer], None],
-        late: Callable[[str, bytes], None],
-        lost: Callable[[], None],
-        room: Callable[[], None],
-        large: Callable[[], None] = lambda: None,
+        shared: Shared,
+        tell: Callbacks,
     ) -> None:
-        self._on_lost = lost
+        self._on_lost = tell.lost
         self._begun = False
         self._token = secrets.token_bytes(frame.TOKEN_BYTES)
-        self.certificate, signature = sign(frame.greeted_bytes(self._token, peer.certificate_name))
+        self.certificate, signature = shared.sign(
+            frame.greeted_bytes(self._token, peer.certificate_name)
+        )
         greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
         self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
@@ -139,14 +122,11 @@ class Connection:
         self.attempts = Attempts(
             self,
             keys,
-            frame.origin(robot, self._token),
-            options=options,
-            gate=gate,
-            cancellations=cancellations,
-            answered=answered,
-            late=late,
-            room=room,
-            large=large,
+            frame.origin(shared.robot, self._token),
+            options=shared.options,
+            gate=shared.gate,
+            cancellations=Cancellations() if shared.tell_losers else None,
+            tell=tell,
             ended=partial(_close, self._session),
             name=f"fogft-send-{peer.id.short}",
         )

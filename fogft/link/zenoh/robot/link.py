@@ -18,10 +18,10 @@ from collections.abc import Callable, Mapping
 import zenoh
 
 from fogft.errors import CredentialError, WireError
-from fogft.link.cancellations import Cancellations
 from fogft.link.compression import ZLIB, ZLIB_ANSWERS
 from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.link.zenoh import settings
+from fogft.link.zenoh.robot.attempts import Callbacks
 from fogft.link.zenoh.robot.connection import Connection
 from fogft.link.zenoh.robot.opening import Opening
 from fogft.link.zenoh.robot.probing import Probing
@@ -63,6 +63,13 @@ class ZenohLink:
         self._woke_at = 0.0
         self._closed = False
         self._probing = Probing(peer, self._wake.set)
+        self._tell = Callbacks(
+            answered=self._answered,
+            late=self._late,
+            room=self._changed,
+            large=self._wake.set,
+            lost=self._wake.set,
+        )
         # Written by the link's thread only; `_live` is set exactly while the state is UP.
         self._live: Connection | None = None
         self._state = LinkState.CONNECTING
@@ -261,17 +268,9 @@ class ZenohLink:
                     {**self._config, **settings.open_within(self._opening.timeout_s)}
                 ),
                 self._peer,
-                self._shared.robot,
                 self._services,
-                sign=self._shared.sign,
-                options=self._shared.options,
-                gate=self._shared.gate,
-                cancellations=Cancellations() if self._shared.tell_losers else None,
-                answered=self._answered,
-                late=self._late,
-                lost=self._wake.set,
-                room=self._changed,
-                large=self._wake.set,
+                self._shared,
+                self._tell,
             )
         except (WireError, CredentialError) as error:
             self._say(error.message)

@@ -14,7 +14,7 @@ from fogft.link.cancellations import Cancellations
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
 from fogft.link.port import Answer
 from fogft.link.send_options import DEFAULT_OPTIONS
-from fogft.link.zenoh.robot.attempts import Attempts
+from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.model.refusal import Refusal
 from tests.link.wire_pool import request_id
 
@@ -72,10 +72,13 @@ class Scene:
             options=DEFAULT_OPTIONS,
             gate=LargeSendGate(),
             cancellations=Cancellations(),
-            answered=self.answers.append,
-            late=lambda service, id: self.late.append(id),
-            room=lambda: None,
-            large=lambda: None,
+            tell=Callbacks(
+                answered=self.answers.append,
+                late=lambda service, id: self.late.append(id),
+                room=lambda: None,
+                large=lambda: None,
+                lost=lambda: None,
+            ),
             ended=self._end,
             name="test-send",
         )
