@@ -14,7 +14,6 @@ from fogft.cli.options import DEFAULT_FILE, PoolArgument, PoolFile
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
-    from fogft.pool.commands.preview import Preview
     from fogft.pool.commands.status import Seen
 
 LIMIT_S = 300.0
@@ -85,9 +84,13 @@ def up(
 
     order = preview.order(file, cloud, told=output.say)
     progress.announce(order.preview)
-    if not yes and must_ask(order.preview) and not output.confirm(question(order.preview)):
-        output.say("nothing was done")
-        raise typer.Exit(1)
+    may_cost_more = order.preview.is_new or order.preview.changes
+    if order.preview.costs_money and may_cost_more and not yes:
+        count = len(order.preview.launches) if order.preview.is_new else 0
+        machines = f"{count} machine{'' if count == 1 else 's'}"
+        if not output.confirm(f"launch {machines} at these prices?" if count else "continue?"):
+            output.say("nothing was done")
+            raise typer.Exit(1)
     limit_s = timeout or (REAL_LIMIT_S if order.preview.costs_money else LIMIT_S)
     applied_at = time.time()
     if startup.start(order) and not order.preview.is_new:
@@ -126,19 +129,6 @@ def up(
     for service in () if awaited.services else status.services:
         output.say(f"offers {service.name} ({service.type})")
     output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
-
-
-def must_ask(preview: Preview) -> bool:
-    """Whether applying a pool file can cost more than was agreed to before."""
-    return preview.costs_money and (preview.is_new or bool(preview.changes))
-
-
-def question(preview: Preview) -> str:
-    """Return the question that is asked before money is spent."""
-    count = len(preview.launches)
-    if not preview.is_new or not count:
-        return "go on?"
-    return f"launch {count} machine{'' if count == 1 else 's'} at these prices?"
 
 
 def not_answering(seen: Seen, what: str) -> FogftError:

@@ -99,7 +99,7 @@ def _run(args: Sequence[str]) -> int:
         sys.stdout.flush()
         return int(exit_.exit_code)
     except FogftError as problem:
-        output.failure(problem)
+        output.error(problem.message, problem.hint)
         return 1
     except usage_error as problem:
         _explain_usage(problem)

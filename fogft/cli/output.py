@@ -130,11 +130,6 @@ def error(message: str, hint_text: str = "") -> None:
         hint(hint_text)
 
 
-def failure(problem: FogftError) -> None:
-    """Write a `FogftError`, without a stack trace."""
-    error(problem.message, problem.hint)
-
-
 def confirm(question: str) -> bool:
     """Ask a yes-or-no question on the terminal; anything but yes is no.
 

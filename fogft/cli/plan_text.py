@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from fogft.cli import output
+from fogft.cli.status_text import age
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from fogft.pool.commands.plan import PlanShown
 
 _HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST", "WHY NOT")
-# The units of ages, their lengths, and from which age on each is used.
-_UNITS = (("days", 86400.0, 2 * 86400.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
 
 
 def show(shown: PlanShown, *, everything: bool = False) -> None:
@@ -131,15 +130,7 @@ def price_source(offer: Offer, now: float) -> str:
     """Return where an offer's price comes from and how old it is; empty where it is made up."""
     if not offer.source or not offer.as_of:
         return offer.source
-    return f"{offer.source}, {_age(now - offer.as_of)} old"
-
-
-def _age(seconds: float) -> str:
-    """Return an age in its one largest unit: ``3 s``, ``5 min``, ``7 h``, ``2 days``."""
-    for unit, length_s, from_s in _UNITS:
-        if seconds >= from_s:
-            return f"{seconds / length_s:.0f} {unit}"
-    return f"{max(0.0, seconds):.0f} s"
+    return f"{offer.source}, {age(max(0.0, now - offer.as_of))} old"
 
 
 def _summary(shown: PlanShown) -> list[str]:

@@ -66,16 +66,14 @@ def _start_of_last(path: Path, count: int) -> tuple[int, int]:
         with open(path, "rb") as file:
             stat = os.fstat(file.fileno())
             position, newlines = stat.st_size, 0
-            while position > 0:
+            while position > 0 and newlines <= count:
                 step = min(_CHUNK_BYTES, position)
                 position -= step
                 file.seek(position)
-                chunk = file.read(step)
-                for offset in range(len(chunk) - 1, -1, -1):
-                    if chunk[offset] == 0x0A:
-                        newlines += 1
-                        if newlines > count:
-                            return position + offset + 1, stat.st_ino
-            return 0, stat.st_ino
+                newlines += file.read(step).count(b"\n")
+            file.seek(position)
+            for _ in range(newlines - count):
+                file.readline()
+            return file.tell(), stat.st_ino
     except OSError:
         return 0, -1

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from fogft.doctor import finding, leftovers, machine, pools, ros
-from fogft.doctor.finding import Check, Finding
+from fogft.doctor import leftovers, machine, pools, ros
+from fogft.doctor.finding import Check, Finding, Situation, run
 from fogft.pool.folder import known_pools
 from fogft.pool.folder.paths import home
 from fogft.poolfile.file import read
@@ -21,4 +22,5 @@ def examine(file: Path | None = None) -> Iterator[Finding]:
         SpecError: The first mistake in the pool file.
     """
     spec = None if file is None else read(file)
-    yield from finding.run(ALL, finding.situation(home(), known_pools.names(home()), spec))
+    pools_here = tuple(known_pools.names(home()))
+    yield from run(ALL, Situation(home(), pools_here, spec, time.time()))

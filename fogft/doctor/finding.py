@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -82,8 +81,3 @@ def run(checks: Iterable[Check], situation: Situation) -> Iterator[Finding]:
                 f"the check itself failed: {type(error).__name__}: {error}",
                 "report this as a defect of `fogft doctor`",
             )
-
-
-def situation(home: Path, pools: Iterable[str], spec: PoolSpec | None) -> Situation:
-    """Return what is to be looked at now."""
-    return Situation(home, tuple(pools), spec, time.time())

@@ -275,7 +275,7 @@ def test_distances_are_estimated_where_nothing_can_be_measured(pool, tmp_path, c
     prices = table(tmp_path, *(f"aws,{r},{r}a,m5.2xlarge,8,32,0.5,0.3,2026-01-01" for r in regions))
     assert main.run(["plan", str(pool), "--prices", prices, "--offline"]) == 0
     told = capsys.readouterr().out
-    assert re.search(r"us-west-1a .* table, \d+ days old +\d+ ms", told)
+    assert re.search(r"us-west-1a .* table, \d+ d old +\d+ ms", told)
     assert "(estimated, pool file)" in told
     assert main.run(["plan", str(pool), "--prices", prices, "--offline", "--json"]) == 0
     offers = {o["region"]: o for o in json.loads(capsys.readouterr().out)["offers"]}
