@@ -7,7 +7,7 @@ who is declined at once may be sent on another uplink, or to another replica.
 
 Known for ten seconds only: then a request is let through again, by which the link is measured anew.
 
-Owns: the judgement. Not here: rates, the bounds by bytes and by count (`link_window`).
+Owns: the judgement. Not here: rates, the bounds by bytes and by count (`window`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Whatever bytes come in, a decoder returns a value or raises `FrameError`, nothin
 peer is another process, perhaps of another version. Each frame begins with its version.
 
 Owns: the bytes. Not here: sending them, what they mean, and other frames (`probe_frames`,
-`batch_frames`, `record_frames`, `topic_frames`).
+`batch_frames`, `fogft.records.frames`, `fogft.topics.frames`).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ answers at once whatever the service does.
 
 Law of this port: `Link.offer` never blocks, whatever the peer does; a slow or dead peer
 costs its own link only. Callbacks come from the wire's threads; they must not block.
-Implementations: `fogft.link.zenoh.robot.link` and `zenoh_listener`, `tests.fakes.link`.
+Implementations: `fogft.link.zenoh.robot.link` and `replica.listener`, `tests.fakes.link`.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ its service's policy says, under one id: the replica runs it once, whichever cop
 When an uplink is lost with requests on it, they go out on another one, without the caller's
 policy hearing of it. Only when no uplink is left an attempt ends as lost.
 
-Owns: which uplinks an attempt is on. Not here: the links themselves (`zenoh_link`), policies
+Owns: which uplinks an attempt is on. Not here: the links themselves (`link`), policies
 (`fogft.model.uplinks`).
 """
 

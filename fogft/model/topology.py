@@ -5,7 +5,7 @@ to the replicas. A gateway may go through others, so they form trees; a loop is 
 wherever a topology is read.
 
 Owns: the topology, its plain form, and whom a holder talks to.
-Not here: the pool file's section (`spec_topology`), links (`fogft.proxy`).
+Not here: the pool file's section (`fogft.poolfile.topology`), links (`fogft.proxy`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ It holds what each replica still needs: requests by number while the log has the
 checkpoint and what came after. What is to be sent collects until `take`.
 
 Owns: one term's numbers, its log and checkpoint, and what each replica is to be sent.
-Not here: what replicas answer, and who obeys (`ordered_term`). Protocol: docs/design/state.md.
+Not here: what replicas answer, and who obeys (`term`). Protocol: docs/design/state.md.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ epoch and index. So a request needs no envelope, and its bytes are never copied 
 An answer is the payload that belongs to the operation, or a refusal.
 
 Owns: epochs, positions, orders, and their bytes.
-Not here: who sends which order (`sequencer`) and what becomes of it (`ordered_replica`).
+Not here: who sends which order (`sequencer`) and what becomes of it (`replica`).
 Protocol: docs/design/state.md.
 """
 

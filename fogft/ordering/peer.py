@@ -1,6 +1,6 @@
 """A replica as one term of a sequencer knows it, and an order to it. Pure values.
 
-Owns: what is remembered of each replica. Not here: what follows from it (`ordered_term`).
+Owns: what is remembered of each replica. Not here: what follows from it (`term`).
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ enough. When most of the replicas that stay run another version, that takes over
 the order.
 
 Owns: from what a term begins, which answer is returned, and when it is handed over.
-Not here: numbers and how replicas come to them (`ordered_term`), callers and deadlines
+Not here: numbers and how replicas come to them (`term`), callers and deadlines
 (`fogft.proxy.robot.ordered_dispatcher`). Protocol and its argument: docs/design/state.md.
 """
 

@@ -6,8 +6,8 @@ the fewest of our replicas wins; among those the one with the lowest score; amon
 the cheaper one; among those the first by name.
 
 Owns: the rank of an offer and the reason when none is left.
-Not here: the order within a rank (`listing`, `score`), how long a location rests or is avoided
-(`quarantine`) and how many are needed (`planner`).
+Not here: the order within a rank (`listing`, `model.scoring`), how long a location is avoided
+(`observed.backoff`) and how many are needed (`planner`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A pool file is a SkyPilot task with a `fogft` section. Ours is checked to the la
 SkyPilot's keys only the names are, and what a pool cannot do. The rest passes untouched.
 
 Owns: what may stand in our keys, and what to tell the user.
-Not here: YAML (`fogft.poolfile.yaml_tree`), loading types (`check_types`), prices and regions
+Not here: YAML (`fogft.poolfile.yaml_tree`), loading types (`fogft.ros.types`), prices and regions
 (the cloud judges `resources`).
 """
 

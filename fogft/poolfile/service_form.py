@@ -4,7 +4,7 @@ Only what differs from the default is written, so that a configuration stays sho
 written by an older manager means what it meant.
 
 Owns: the keys of a service in `proxy.yaml` and `replica.yaml`, which are the pool file's.
-Not here: judging a pool file (`spec_services`).
+Not here: judging a pool file (`services`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A new attempt begins every 0.4 s while earlier ones are still under way. One tha
 into a black hole would be repeated by TCP after 1, 3, 7 seconds; one that crosses a slow
 link needs seconds. Overlapping attempts serve both.
 
-Owns: TCP, TLS and the greeting. Not here: what is exchanged then (`record_exchange`).
+Owns: TCP, TLS and the greeting. Not here: what is exchanged then (`exchange`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Both ends of a connection do the same: tell what they have, send what the other 
 on at once what is new. So a rendezvous that comes back empty is filled by whoever connects.
 
 Owns: the record set, and the connections that it is exchanged over.
-Not here: making connections (`rendezvous_server`, `rendezvous_client`).
+Not here: making connections (`server`, `client`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ TLS proves the rendezvous to its callers; a caller proves itself by signing a ch
 comes from anybody else, or is no message, ends that connection, is counted by reason, and
 changes nothing.
 
-Owns: the port, the greeting and its limits. Not here: records (`record_exchange`), the
+Owns: the port, the greeting and its limits. Not here: records (`exchange`), the
 process (`fogft.pool.commands.rendezvous`).
 """
 

@@ -3,7 +3,7 @@
 Each has one thread that does what may block in Zenoh: asking, answering, declaring. Callbacks
 come from Zenoh's threads.
 
-Owns: queries under way, on either side. Not here: the session and the graph (`rmw_node`).
+Owns: queries under way, on either side. Not here: the session and the graph (`node`).
 """
 
 from __future__ import annotations

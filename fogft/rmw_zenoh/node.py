@@ -4,8 +4,8 @@ Services pass through as bytes. What a type is nobody here knows; that two ends 
 one is told by its hash, which is part of every key: a server's stands in its token, a client's
 in its own.
 
-Owns: the session, the graph, what is offered and called. Not here: requests (`rmw_entities`),
-settings (`rmw_session`), names (`rmw_zenoh.naming`).
+Owns: the session, the graph, what is offered and called. Not here: requests (`entities`),
+settings (`session`), names (`rmw_zenoh.naming`).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Replicas run the same nodes on the same input, so most of what they publish says the same.
 
-Owns: `leader`, `stamp`, `goal`, `all`. Not here: an action's status (`goal_status`).
+Owns: `leader`, `stamp`, `goal`, `all`. Not here: an action's status (`fogft.ros.goal_status`).
 """
 
 from __future__ import annotations

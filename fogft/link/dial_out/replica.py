@@ -3,7 +3,7 @@
 It keeps two connections waiting at each door. When one is taken into use, it is joined with
 this replica's own listener, and another one takes its place.
 
-Owns: connections to doors. Not here: the door (`dial_in`), the listener (`zenoh_listener`).
+Owns: connections to doors. Not here: the door (`robot`), the listener (`listener`).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ replica the TLS server, end to end, so no certificate needs any other right, and
 neither read nor change what passes.
 
 Owns: the door's port, the connections that wait, a loopback port for each replica.
-Not here: the replica's side (`dial_out`), links (`zenoh_link`).
+Not here: the replica's side (`replica`), links (`link`).
 """
 
 from __future__ import annotations

@@ -180,7 +180,7 @@ def end_sending(connection: socket.socket) -> None:
 
 
 def abort(connection: socket.socket) -> None:
-    """End a connection without a farewell: nothing more is taken, and its peer fails to send.
+    """Abort a connection: nothing more is taken, and its peer fails to send.
 
     Not where something is sent: see `end_sending`.
     """

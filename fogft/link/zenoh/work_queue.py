@@ -21,7 +21,7 @@ class WorkQueue:
     """A thread that does what it is given, in order. Nothing here blocks.
 
     Args:
-        counters: Count ``chores_dropped`` and ``failed``.
+        counters: Count ``control_queries_dropped`` and ``failed``.
     """
 
     def __init__(self, counters: Counters) -> None:
@@ -38,7 +38,7 @@ class WorkQueue:
     def offer(self, job: Callable[[], None]) -> bool:
         """Take a job, unless too many wait: then count it; return whether it was taken."""
         if len(self) >= LIMIT:
-            self._counters.add("chores_dropped")
+            self._counters.add("control_queries_dropped")
             return False
         self._queue.put(job)
         return True
@@ -57,4 +57,4 @@ class WorkQueue:
                 job()
             except Exception:
                 self._counters.add("failed")
-                log.exception("chore_failed")
+                log.exception("job_failed")

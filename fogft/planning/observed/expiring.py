@@ -1,6 +1,6 @@
 """Keep what follows from what happened at each place until it can be otherwise. Pure.
 
-Owns: how long a result holds. Not here: what it is (`quarantine`) and what happened (`history`).
+Owns: how long a result holds. Not here: what it is (`backoff`) and what happened (`history`).
 """
 
 from __future__ import annotations

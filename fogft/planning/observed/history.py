@@ -6,7 +6,7 @@ the only memory that must outlive a crash of the manager. Pure: events in, facts
 
 Owns: the events and the facts derived from them.
 Not here: the file they are stored in (`fogft.pool.folder.store`) and what to make of failures
-(`quarantine`).
+(`backoff`).
 """
 
 from __future__ import annotations

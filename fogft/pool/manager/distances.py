@@ -8,7 +8,7 @@ renewed in the background. A link refines what is known of a region otherwise: w
 else is known, a region with a replica would look nearer than all others.
 
 Owns: measuring, keeping, and the order above.
-Not here: what answers where (`fogft.cloud.geography`), what distances are for (`score`).
+Not here: what answers where (`fogft.cloud.geography`), what they are for (`fogft.model.scoring`).
 """
 
 from __future__ import annotations

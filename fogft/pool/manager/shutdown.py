@@ -4,7 +4,7 @@ Manager first (it would repair what we end), then the client proxy, then every m
 that carries the pool's uid, then the folder. Stopped half-way, it can be run again.
 
 Owns: the order, and the end of our own processes.
-Not here: the machines, and the proof that none is left (`farewell`).
+Not here: the machines, and the proof that none is left (`teardown`).
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ While no replica behind it can answer, it refuses what it holds, so that a robot
 gateway asks that one instead of waiting here.
 
 Owns: which requests of robots are under way, and whom each answer goes to.
-Not here: fanning out (`dispatcher`), links (`client`), files and signals (`gateway_process`).
+Not here: fanning out (`dispatcher`), links (`client`), files and signals (`process`).
 """
 
 from __future__ import annotations

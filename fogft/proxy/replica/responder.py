@@ -10,7 +10,7 @@ loses more, so what is passed on must never exceed that. What waits here past it
 is never begun, nor what its robot no longer wants.
 
 Owns: the requests that this replica holds, and what becomes of them.
-Not here: in what order they run and how many (`line`), readiness and `run` (`supervisor`),
+Not here: in what order they run and how many (`service_queue`), readiness and `run` (`supervisor`),
 the wire, ROS.
 """
 

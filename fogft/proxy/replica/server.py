@@ -9,7 +9,7 @@ would be lost. A new node knows only the living. When a service goes and the com
 restart its own nodes), what was passed on to that service is refused, to be sent again.
 
 Owns: the replica's state as probes tell it. Not here: requests (`responder`), the command
-(`supervisor`), files and signals (`server_process`).
+(`supervisor`), files and signals (`process`).
 """
 
 from __future__ import annotations

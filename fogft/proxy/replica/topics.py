@@ -6,7 +6,7 @@ waits in a ring; a robot pulls what comes after the last number that it has, and
 until there is something.
 
 Owns: this replica's publishers and subscriptions, its rings, and the pulls that are held.
-Not here: which message a robot passes on (`topics_robot`), bytes (`topics.frames`).
+Not here: which message a robot passes on (`fogft.proxy.robot.topics`), bytes (`topics.frames`).
 """
 
 from __future__ import annotations

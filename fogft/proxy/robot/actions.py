@@ -5,7 +5,7 @@ way: a goal outlives the replicas that it was given to. The first that succeeds 
 the others are then told to cancel. What a client cancels is cancelled everywhere.
 
 Owns: how goals and results differ from plain services (`dispatcher`). Not here: cancelling
-(`action_cancel`), feedback and status (`topics_robot`).
+(`action_cancel`), feedback and status (`topics`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ It follows the membership (one link a member), advertises each service as if it 
 once a replica can answer it, and hands requests to that service's `Dispatcher`.
 
 Owns: which links exist, and which of them each service uses now.
-Not here: files and signals (`client_process`), requests (`dispatcher`).
+Not here: files and signals (`process`), requests (`dispatcher`).
 """
 
 from __future__ import annotations

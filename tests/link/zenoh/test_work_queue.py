@@ -10,7 +10,7 @@ from fogft.link.zenoh.work_queue import LIMIT, WorkQueue
 from tests.link.wire_pool import LIMIT_S
 
 
-def test_chores_are_done_in_order_and_one_that_fails_stops_none(caplog):
+def test_jobs_are_done_in_order_and_one_that_fails_stops_none(caplog):
     counters, done, last = Counters(), [], threading.Event()
     work = WorkQueue(counters)
     work.add(lambda: done.append(1))
@@ -32,7 +32,7 @@ def test_only_so_many_wait_but_what_must_be_taken_is():
     assert not work.offer(print)
     work.add(print)
     assert len(work) == LIMIT + 1
-    assert counters.snapshot() == {"chores_dropped": 1}
+    assert counters.snapshot() == {"control_queries_dropped": 1}
 
 
 def test_what_happens_often_is_logged_seldom(caplog):

@@ -3,7 +3,7 @@
 These are queries. Zenoh's threads only decode them and hand them over; the worker thread
 answers them, and their ends queue behind the replies of their robot.
 
-Owns: who is let in. Not here: requests and their replies (`zenoh_listener`, `reply_queue`).
+Owns: who is let in. Not here: requests and their replies (`listener`, `reply_queue`).
 """
 
 from __future__ import annotations

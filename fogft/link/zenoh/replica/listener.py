@@ -297,7 +297,7 @@ class ZenohListener:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
         ``malformed``, ``records``, ``records_refused``, ``records_older``, ``not_admitted``,
         ``handshakes_refused``, ``unauthenticated``, ``revoked_links``, ``stuck_links``,
-        ``reply_dropped``, ``failed``, ``cancellations``, ``chores_dropped``.
+        ``reply_dropped``, ``failed``, ``cancellations``, ``control_queries_dropped``.
         """
         return self._counters.snapshot()
 

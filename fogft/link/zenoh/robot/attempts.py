@@ -4,7 +4,7 @@ A request is sent by whoever offers it where that cannot block (`credit`), else 
 connection's own, so a peer that takes nothing costs nobody else.
 
 Owns: open attempts, what waits for the sender thread, and that thread. Not here: the session
-(`zenoh_connection`), which requests there are and what becomes of them
+(`connection`), which requests there are and what becomes of them
 (`fogft.proxy.robot.dispatcher`).
 """
 

@@ -9,7 +9,7 @@ Everything of Zenoh's that can block (`put`, `close`) is called by the sender th
 attempts, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's threads.
 
 Owns: a session. Not here: the requests open on it (`attempts`), when to open and when to give
-up (`zenoh_link`).
+up (`link`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Makes links over Zenoh, and holds what all of a robot's links share.
 
 Owns: the robot's credentials in use, what its replicas are to be told. Not here: a link's
-life (`zenoh_link`).
+life (`link`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A thread of each link (`fogft-keep-...`) opens the connection, sends probes, and
 connection when it is lost or when probes go unanswered: never because a service is slow.
 `offer` only puts the attempt into the connection's queue.
 
-Owns: the state of a link. Not here: sessions (`zenoh_connection`), attempts (`attempts`), what a
+Owns: the state of a link. Not here: sessions (`connection`), attempts (`attempts`), what a
 replica's silence means for the pool (`fogft.planning`).
 """
 

@@ -1,6 +1,6 @@
 """Opening a link's connections, try after try: how long one may take, and why it failed, in words.
 
-Owns: patience, and how often words are looked for. Not here: trying (`zenoh_link`), and what plain
+Owns: patience, and how often words are looked for. Not here: trying (`link`), and what plain
 TLS says (`diagnosis`).
 """
 

@@ -2,7 +2,7 @@
 
 Owns: two silences, that of the replica over all connections, which people see, and that of the
 present connection, by which it is given up. Not here: when to probe, and what becomes of the link
-(`zenoh_link`); how a probe travels (`zenoh_connection`).
+(`link`); how a probe travels (`connection`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ On a thin uplink requests wait here for seconds. Of a service that wants the lat
 takes the turn of the oldest; the others keep waiting, and are sent while their time lasts.
 Between services the order is that of arrival.
 
-Owns: the order of sending. Not here: bounds (`link_window`), sending (`attempts`).
+Owns: the order of sending. Not here: bounds (`window`), sending (`attempts`).
 """
 
 from __future__ import annotations

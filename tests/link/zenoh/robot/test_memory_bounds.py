@@ -101,6 +101,6 @@ def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authorit
     for turn in range(3000):
         turns.came()
         control.later(lambda: None, Query(), turn)
-    dropped = counters.snapshot()["chores_dropped"]
+    dropped = counters.snapshot()["control_queries_dropped"]
     assert 0 < len(work) == 3000 - dropped <= 1024
     wait_for(lambda: Query.ended == dropped)
