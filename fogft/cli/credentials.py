@@ -18,9 +18,9 @@ from fogft.cli import output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolOption
 from fogft.errors import CredentialError, FogftError
-from fogft.model.certificate_holder import Holder, Role
 
 if TYPE_CHECKING:
+    from fogft.model.certificate_holder import Holder, Role
     from fogft.pool.credentials.ledger import Entry
 
 DAY_H = 24.0
@@ -144,6 +144,7 @@ def rotate(
     taken back. Replicas are replaced, the new one first. For a robot or a gateway on another
     machine issue a new bundle, join there with it, and revoke the old generation.
     """
+    from fogft.model.certificate_holder import Role
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import rotate_replicas, rotate_robot
 
@@ -209,6 +210,8 @@ def _alone(holder: Holder) -> str:
 
 
 def _role(text: str) -> Role:
+    from fogft.model.certificate_holder import Role
+
     allowed = (Role.ROBOT, Role.REPLICA, Role.GATEWAY, Role.RENDEZVOUS)
     for role in allowed:
         if role.value == text:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -12,8 +12,11 @@ from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
 from fogft.errors import CredentialError, FogftError
 from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.middleware import Speaks
+from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import read_identity
+from fogft.pool.manager import proxy_report
 
 _EXPIRY_WARNING = timedelta(days=3)
 # The client proxy reports twice a second.
@@ -132,48 +135,47 @@ def links(situation: Situation) -> Iterator[Finding]:
     """Every link of a running client proxy is up and its replica ready."""
     for pool in situation.pools:
         paths = PoolPaths.of(pool, situation.home)
-        try:
-            report = disk.read_json(paths.proxy_status) or {}
-        except FogftError as error:
-            yield fail("links", f"pool `{pool}`: {error.message}", "see its log")
-            continue
         if not disk.is_locked(paths.proxy_lock):
             continue
-        age_s = situation.now - float(report.get("written_at") or 0.0)
-        if age_s > _REPORT_LIMIT_S:
+        report = proxy_report.read(paths.proxy_status, read_identity(paths).uid)
+        age_s = situation.now - report.written_at if report else 0.0
+        if report is None:
+            yield fail(
+                "links",
+                f"pool `{pool}`: its client proxy has written no report that can be read",
+                f"see `{paths.proxy_log}`",
+            )
+        elif age_s > _REPORT_LIMIT_S:
             yield fail(
                 "links",
                 f"pool `{pool}`: its client proxy last reported {age_s:.0f} s ago",
-                f"it hangs or is stopped; end process {report.get('pid')}: "
-                "the manager starts another",
+                f"it hangs or is stopped; end process {report.pid}: the manager starts another",
             )
-            continue
-        yield from judge_links(pool, report.get("links") or [])
+        else:
+            yield from judge_links(pool, report.links)
 
 
-def judge_links(pool: str, reported: list[dict[str, object]]) -> Iterator[Finding]:
+def judge_links(pool: str, reported: Sequence[LinkReport]) -> Iterator[Finding]:
     """Judge the links that a client proxy reports."""
-    up = [link for link in reported if link.get("state") == "up"]
+    up = [link for link in reported if link.state is LinkState.UP]
     for link in reported:
-        slot = link.get("slot")
-        name = f"{slot}.{link.get('generation')}"
-        by_hand = isinstance(slot, int) and slot >= FIRST_BY_HAND
-        log = "the log on its machine" if by_hand else f"`fogft logs {slot}`"
-        if link.get("state") == "up" and link.get("detail"):
-            yield warn(
-                "replicas",
-                f"pool `{pool}`: replica `{name}` is not ready: {link.get('detail')}",
-                f"{log} shows what `run` says; is each `name` and `type` "
-                "in the pool file what the node offers?",
-            )
-        elif link.get("state") != "up":
-            detail = link.get("detail") or "it does not answer probes"
+        replica = f"pool `{pool}`: replica `{link.id.short}`"
+        by_hand = link.id.slot >= FIRST_BY_HAND
+        log = "the log on its machine" if by_hand else f"`fogft logs {link.id.slot}`"
+        if link.state is not LinkState.UP:
             yield warn(
                 "links",
-                f"pool `{pool}`: replica `{name}` is {link.get('state')}: {detail}",
+                f"{replica} is {link.state.value}: {link.detail or 'it does not answer probes'}",
                 f"it was started by hand, and nobody replaces it; see {log}"
                 if by_hand
-                else f"it is replaced by itself if it stays silent; see `fogft status` and {log}",
+                else f"it is replaced if it stays silent; see `fogft status` and {log}",
+            )
+        elif link.detail:
+            yield warn(
+                "replicas",
+                f"{replica} is not ready: {link.detail}",
+                f"{log} shows what `run` says; is each `name` and `type` "
+                "in the pool file what the node offers?",
             )
     if reported and not up:
         yield fail(

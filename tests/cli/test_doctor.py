@@ -16,9 +16,11 @@ from fogft.cloud.local import faults
 from fogft.cloud.local.faults import CloudFaults
 from fogft.doctor import checks, finding, leftovers, machine, pools, ros
 from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
+from fogft.model.replica import LinkReport, LinkState, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.ros import environment
+from tests.cli.pools import lay_down
 from tests.needs import needs
 
 UID = "0123456789abcdef"
@@ -255,8 +257,8 @@ def test_missing_processes_are_found_and_living_ones_seen(tmp_path):
 
 
 def test_silent_links_are_found():
-    silent = {"slot": 1, "generation": 2, "state": "suspect", "detail": ""}
-    up = {"slot": 0, "generation": 1, "state": "up"}
+    silent = LinkReport(ReplicaId(UID, 1, 2), LinkState.SUSPECT)
+    up = LinkReport(ReplicaId(UID, 0, 1), LinkState.UP)
     assert [f.verdict for f in pools.judge_links("p", [up])] == [Verdict.OK]
     found = list(pools.judge_links("p", [up, silent]))
     assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
@@ -265,7 +267,7 @@ def test_silent_links_are_found():
 
 
 def test_a_replica_whose_program_ends_is_found():
-    ends = {"slot": 1, "generation": 2, "state": "up", "detail": "`run` exit status 3"}
+    ends = LinkReport(ReplicaId(UID, 1, 2), LinkState.UP, detail="`run` exit status 3")
     found = list(pools.judge_links("p", [ends]))
     assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
     assert "`1.2` is not ready: `run` exit status 3" in found[0].text
@@ -283,11 +285,12 @@ def test_chaos_that_lasts_is_found(tmp_path):
 
 
 def test_a_proxy_that_hangs_is_found(tmp_path):
-    paths = PoolPaths.of("planner", tmp_path)
-    paths.folder.mkdir(parents=True)
+    paths = lay_down(tmp_path)
     report = {"pid": 4711, "written_at": time.time() - 60, "links": []}
     paths.proxy_status.write_text(json.dumps(report))
     with disk.locked(paths.proxy_lock):
         found = the_only(pools.links(situation(tmp_path, "planner")))
-    assert found.verdict is Verdict.FAIL
+        paths.proxy_status.write_text("{torn")
+        damaged = the_only(pools.links(situation(tmp_path, "planner")))
+    assert (found.verdict, damaged.verdict) == (Verdict.FAIL, Verdict.FAIL)
     assert "4711" in found.advice

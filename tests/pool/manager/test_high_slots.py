@@ -158,9 +158,8 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
 
 
 def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> None:
-    silent = {"state": "suspect", "slot": 1000, "generation": 2, "detail": ""}
-    [by_hand, _] = pools.judge_links("p", [silent])
-    [launched, _] = pools.judge_links("p", [{**silent, "slot": 105}])
+    [by_hand, _] = pools.judge_links("p", [LinkReport(id_of(1000, 2), LinkState.SUSPECT)])
+    [launched, _] = pools.judge_links("p", [LinkReport(id_of(105, 2), LinkState.SUSPECT)])
     assert "replica `1000.2` is suspect" in by_hand.text
     assert "replica `105.2` is suspect" in launched.text
     assert "nobody replaces it" in by_hand.advice
