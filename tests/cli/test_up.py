@@ -13,7 +13,6 @@ from fogft.cli import main, progress
 from fogft.errors import FogftError, SpecError
 from fogft.planning.rollout import Trial
 from fogft.pool.commands import composition, init, preview, startup
-from fogft.pool.commands.outcome import Awaited, Outcome
 from fogft.pool.commands.status import Seen, refreshed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
@@ -149,22 +148,6 @@ def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
     assert main.run(["up", str(file)]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "interrupted: `planner` continues to start; `fogft down planner` ends it"
-
-
-@pytest.mark.parametrize(
-    ("status", "answers"),
-    [
-        (UP, True),
-        (replace(UP, observed_at=9.0), False),  # seen before the file was applied
-        (replace(UP, proxy_alive=False), False),
-        (replace(UP, services=()), False),  # the manager has not read the new file
-        (replace(UP, services=(replace(UP.services[0], ready_replicas=0),)), False),
-        (replace(UP, services=(*UP.services, replace(UP.services[0], name="/old"))), False),
-    ],
-)
-def test_when_a_pool_answers(status, answers):
-    outcome = Awaited(frozenset({"/plan"}), since=10.0).outcome(Seen(status, 0.1, True))
-    assert outcome is (Outcome.ANSWERING if answers else Outcome.PENDING)
 
 
 # --- what is refused, and changes nothing
@@ -406,12 +389,3 @@ def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
     with disk.locked(paths.manager_lock):
         with pytest.raises(FogftError, match="did not look again"):
             refreshed(composition.make_store("planner"), limit_s=0.2)
-
-
-def test_a_schedule_that_wants_nobody_now_is_no_failure():
-    """`up` of a pool that sleeps at night does not wait for the morning."""
-    status = replace(UP, target=0, ready=0, replicas=(), observed_at=20.0)
-    awaited = Awaited(frozenset({"/plan"}), since=10.0)
-    assert awaited.outcome(Seen(status, 0.1, True)) is Outcome.ANSWERING
-    earlier = Seen(replace(status, observed_at=5.0), 0.1, True)
-    assert awaited.outcome(earlier) is Outcome.PENDING
