@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.pool import Machine, Pool
-from tests.records.rendezvous_pool import free_port
+from tests.ports import free_port
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(600)]
 

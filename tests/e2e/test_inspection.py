@@ -16,7 +16,7 @@ from fogft.pool.commands import init
 from tests.e2e.pool import Machine, Pool
 from tests.examples.loading import modules
 from tests.needs import need
-from tests.records.rendezvous_pool import free_port
+from tests.ports import free_port
 
 need("etcd")
 pytestmark = pytest.mark.timeout(240)

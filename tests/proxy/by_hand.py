@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from fogft.model import membership, names
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Topology
 from fogft.pool.credentials import authority
+from tests.ports import free_port
 
 UID = "0123456789abcdef"
 LIMIT_S = 60.0
@@ -102,9 +102,7 @@ class Replica:
         stem = f"r{slot}.{generation}"
         self._node = parts.node
         self.domain = parts.domain()
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.endpoint = f"127.0.0.1:{free.getsockname()[1]}"
+        self.endpoint = f"127.0.0.1:{free_port()}"
         parts.issue(self.id.certificate_name, authority.Role.REPLICA, stem)
         config = parts.folder / f"replica{slot}.{generation}.yaml"
         notice = "auto" if environ else "none"

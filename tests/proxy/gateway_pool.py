@@ -22,7 +22,7 @@ from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Gateway, Topology
 from tests.link.namespaces import inside
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
-from tests.records.rendezvous_pool import free_port
+from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 

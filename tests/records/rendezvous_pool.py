@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import threading
@@ -19,14 +18,9 @@ from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind
 from fogft.records.roster import SlotState, admission, admission_content, located
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
+from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
-
-
-def free_port(host: str = "127.0.0.1") -> int:
-    with socket.socket() as free:
-        free.bind((host, 0))
-        return int(free.getsockname()[1])
 
 
 class Rendezvous:

@@ -20,7 +20,8 @@ from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
 from fogft.records.roster import admission_content
 from fogft.records.signing import Signer
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
-from tests.records.rendezvous_pool import Party, Rendezvous, free_port, manager_files
+from tests.ports import free_port
+from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
 
 
 @pytest.fixture

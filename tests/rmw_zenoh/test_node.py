@@ -90,7 +90,7 @@ def test_a_service_is_in_the_graph_while_it_is_offered(
     wait_for(lambda: len(tokens(peer)) == 1, "the node's token")
     server = echo(node)
     wait_for(lambda: len(tokens(peer)) == 2, "the service's token")
-    (told,) = (token for token in tokens(peer) if "/SS/" in token)
+    (told,) = wait_for(lambda: [t for t in tokens(peer) if "/SS/" in t], "the service's token")
     assert told.endswith(
         f"/SS/%/%/fogft_p/%arm%grasp/my_msgs::srv::dds_::Grasp_/{HASH}/::2,:,:,:,,"
     )

@@ -11,7 +11,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,16 +22,11 @@ from typing import Any
 import pytest
 
 from tests.needs import needs
+from tests.ports import free_port
 
 HERE = Path(__file__).parent
 WITHIN_S = 300.0  # a busy machine takes minutes to start an API server
 pytestmark = [needs("skypilot", "moto", "skypilot-port"), pytest.mark.timeout(900)]
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> Any:

@@ -28,8 +28,9 @@ from fogft.model.replica import Member, ReplicaId
 from tests.link.namespaces import Namespaces, inside
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import POOL_UID
+from tests.ports import free_port
 from tests.proxy.gateway_pool import GatewayPool, Robot, ran, start_server
-from tests.records.rendezvous_pool import Rendezvous, free_port
+from tests.records.rendezvous_pool import Rendezvous
 
 ADDRESS = "10.82.9.9"
 REPLICAS = 3

@@ -24,7 +24,7 @@ def pool(tmp_path) -> Iterator[GatewayPool]:
 
 
 def test_a_robot_behind_a_gateway_sends_each_request_once(pool):
-    """Two replicas get it, the robot sends one copy and gets one response, its own."""
+    """Both replicas get some, the robot sends one copy and gets one response, its own."""
     pool.replica(0)
     pool.replica(1)
     edge = pool.gateway("edge")
@@ -35,7 +35,7 @@ def test_a_robot_behind_a_gateway_sends_each_request_once(pool):
     robot.ask(100, 1000)
     robot.all_right()
     assert robot.sent() == 100
-    wait_for(lambda: pool.ran() == 200)
+    wait_for(lambda: pool.ran() > 100)  # copies that lost early may be withdrawn
     report = robot.tell()["report"]
     assert [g["name"] for g in report["gateways"]] == ["edge"]
     assert {(li["slot"], li["through"]) for li in report["links"]} == {(0, "edge"), (1, "edge")}
