@@ -12,61 +12,16 @@ from typing import Annotated
 import typer
 
 
-def _quietly(source: Callable[[], Iterable[str]], incomplete: str) -> list[str]:
-    try:
-        return [value for value in source() if value.startswith(incomplete)]
-    except Exception:
-        return []
+def _offer(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Return a completion that offers what is known and begins as typed."""
 
+    def offer(incomplete: str) -> list[str]:
+        try:
+            return [value for value in known() if value.startswith(incomplete)]
+        except Exception:
+            return []
 
-def pools(incomplete: str) -> list[str]:
-    """Names of the pools on this machine."""
-    return _quietly(_pools, incomplete)
-
-
-def slots(incomplete: str) -> list[str]:
-    """Slots of the only pool, or of all pools."""
-
-    def found() -> Iterable[str]:
-        from fogft.pool.commands import status
-        from fogft.pool.folder.paths import PoolPaths
-
-        every = {slot for pool in _pools() for slot in status.slots(PoolPaths.of(pool))}
-        return map(str, sorted(every))
-
-    return _quietly(found, incomplete)
-
-
-def locations(incomplete: str) -> list[str]:
-    """Regions and zones that the pools' replicas are in."""
-
-    def found() -> Iterable[str]:
-        from fogft.pool.commands import status
-        from fogft.pool.folder.paths import PoolPaths
-
-        seen = [status.read(PoolPaths.of(pool), 0.0).status for pool in _pools()]
-        zones = {replica.location for one in seen for replica in one.replicas}
-        return sorted(zones | {zone.rsplit("/", 1)[0] for zone in zones})
-
-    return _quietly(found, incomplete)
-
-
-def excluded(incomplete: str) -> list[str]:
-    """Locations that are excluded now."""
-
-    def found() -> Iterable[str]:
-        from fogft.pool.commands import composition
-
-        return sorted({x for p in _pools() for x in composition.make_store(p).intent().excluded})
-
-    return _quietly(found, incomplete)
-
-
-def examples(incomplete: str) -> list[str]:
-    """Names of the examples that ``fogft init`` can write."""
-    from fogft.pool.commands import init
-
-    return _quietly(init.examples, incomplete)
+    return offer
 
 
 def _pools() -> list[str]:
@@ -74,6 +29,38 @@ def _pools() -> list[str]:
 
     return composition.pools()
 
+
+def _slots() -> list[str]:
+    from fogft.pool.commands import status
+    from fogft.pool.folder.paths import PoolPaths
+
+    every = {slot for pool in _pools() for slot in status.slots(PoolPaths.of(pool))}
+    return [str(slot) for slot in sorted(every)]
+
+
+def _locations() -> list[str]:
+    from fogft.pool.commands import status
+    from fogft.pool.folder.paths import PoolPaths
+
+    seen = [status.read(PoolPaths.of(pool), 0.0).status for pool in _pools()]
+    zones = {replica.location for one in seen for replica in one.replicas}
+    return sorted(zones | {zone.rsplit("/", 1)[0] for zone in zones})
+
+
+def _excluded() -> list[str]:
+    from fogft.pool.commands import composition
+
+    return sorted({x for p in _pools() for x in composition.make_store(p).intent().excluded})
+
+
+def _examples() -> Iterable[str]:
+    from fogft.pool.commands import init
+
+    return init.examples()
+
+
+pools, slots, examples = _offer(_pools), _offer(_slots), _offer(_examples)
+locations, excluded = _offer(_locations), _offer(_excluded)
 
 PoolOption = Annotated[
     str | None,

@@ -101,18 +101,16 @@ def replicas(
     rows: Sequence[ReplicaStatus], names: Sequence[str], *, width: int
 ) -> list[RenderableType]:
     """Return the table of replicas; details stand in it where there is room, else below it."""
-    from rich.console import Console
-
     if not rows:
         return []
     cells = [[*map(_of_replica(row).__getitem__, names)] for row in rows]
     details = [cell(row.detail) for row in rows]
     if not any(details):
         return [table(names, cells, right=NUMBERS)]
-    whole = table([*names, ""], [[*row, one] for row, one in zip(cells, details, strict=True)],
-                  right=NUMBERS)  # fmt: skip
-    if Console(width=1000).measure(whole).maximum <= width:
-        return [whole]
+    taken = sum(max(len(one) + 2 for one in column) for column in zip(names, *cells, strict=True))
+    if taken + max(map(len, details)) <= width:
+        beside = [[*row, one] for row, one in zip(cells, details, strict=True)]
+        return [table([*names, ""], beside, right=NUMBERS)]
     below = [(row[0], one) for row, one in zip(cells, details, strict=True) if one]
     return [table(names, cells, right=NUMBERS), "", table(("", ""), below, titled=False)]
 

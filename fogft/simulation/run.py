@@ -5,15 +5,21 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from fogft.errors import FogftError, SpecError
+from fogft.model.groups import groups_of, with_spot
+from fogft.model.replica import Offer, Placement
+from fogft.model.spec import PoolSpec
 from fogft.pool.commands.composition import cloud_named_by, make_cloud
-
-if TYPE_CHECKING:
-    from fogft.model.replica import Offer, Placement
-    from fogft.model.spec import PoolSpec
-    from fogft.simulation.market import FindOffers
-    from fogft.simulation.report import Report
+from fogft.poolfile.file import parse, read_text
+from fogft.poolfile.named_clouds import located as located_in_file
+from fogft.simulation import fitting, report
+from fogft.simulation.comparison import Scenario, spot_locations
+from fogft.simulation.market import FindOffers, remembered
+from fogft.simulation.model import MARKET_KEYS, MarketModel, Timing, applied, read_values
+from fogft.simulation.report import Report
+from fogft.simulation.traces import located, read
 
 
 def simulate(
@@ -42,14 +48,6 @@ def simulate(
     Raises:
         FogftError: The file, the traces or the numbers are wrong.
     """
-    from fogft.errors import FogftError
-    from fogft.poolfile.file import parse, read_text
-    from fogft.simulation import fitting, report
-    from fogft.simulation.comparison import Scenario, spot_locations
-    from fogft.simulation.market import remembered
-    from fogft.simulation.model import MARKET_KEYS, MarketModel, Timing, applied, read_values
-    from fogft.simulation.traces import located, read
-
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.parent)
     chosen = cloud or cloud_named_by(spec, source, file)
@@ -95,23 +93,18 @@ def simulate(
 
 def _pricing(find: FindOffers, source: str, file: Path) -> FindOffers:
     """Return the same, whose errors name the line of the pool file."""
-    from fogft.errors import SpecError
-    from fogft.poolfile.named_clouds import located
 
     def ask(resources: Mapping[str, Any]) -> Sequence[Offer]:
         try:
             return find(resources)
         except SpecError as error:
-            raise located(error, source, file) from None
+            raise located_in_file(error, source, file) from None
 
     return ask
 
 
 def _everything(spec: PoolSpec, find: FindOffers) -> list[Placement]:
     """Return what can be bought anywhere; at least what the pool may use."""
-    from fogft.errors import FogftError
-    from fogft.model.groups import groups_of, with_spot
-
     sold = [o for group in groups_of(spec) for o in find(with_spot(group.resources, True))]
     with contextlib.suppress(FogftError):  # not every cloud lists all that it has
         sold += find({"use_spot": True})

@@ -6,19 +6,23 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from fogft.cloud.table import PriceTable
 from fogft.errors import CloudError, PoolNotFound, SpecError
+from fogft.model.groups import groups_of, with_spot
+from fogft.model.intent import Intent
+from fogft.model.replica import Observed, Offer
+from fogft.model.spec import PoolSpec
+from fogft.planning.explain import Explanation, explain
+from fogft.planning.observed.history import History
 from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
 from fogft.pool.folder.paths import latency_file
-
-if TYPE_CHECKING:
-    from fogft.model.replica import Offer
-    from fogft.model.spec import PoolSpec
-    from fogft.planning.explain import Explanation
-    from fogft.pool.manager.distances import Distance
-    from fogft.pool.manager.offers import Seller
-    from fogft.pool.manager.traffic import Measured
+from fogft.pool.manager import offers
+from fogft.pool.manager.distances import Distance, Latencies, regions_of
+from fogft.pool.manager.offers import Seller
+from fogft.pool.manager.traffic import Measured, is_stated, measured, with_measured
+from fogft.poolfile import named_clouds
+from fogft.poolfile.file import parse, read_text
 
 
 @dataclass(frozen=True)
@@ -63,16 +67,6 @@ def plan_file(
         SpecError: The first mistake in the file or in the table.
         CloudError: Prices cannot be had.
     """
-    from fogft.cloud.table import PriceTable
-    from fogft.model.intent import Intent
-    from fogft.model.replica import Observed
-    from fogft.planning.explain import explain
-    from fogft.planning.observed.history import History
-    from fogft.pool.manager import offers
-    from fogft.pool.manager.traffic import is_stated, measured, with_measured
-    from fogft.poolfile import named_clouds
-    from fogft.poolfile.file import parse, read_text
-
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.parent)
     seller: Seller
@@ -124,8 +118,6 @@ def far(
         offline: Measure nothing.
         told: Called before anything is measured.
     """
-    from fogft.pool.manager.distances import Latencies, regions_of
-
     regions, latencies, notes = regions_of(sold), Latencies(latency_file()), []
     if not offline and (stale := latencies.stale(regions)):
         told(f"measuring the way to {len(stale)} regions")
@@ -138,8 +130,6 @@ def far(
 
 def _on_demand(seller: Seller, spec: PoolSpec) -> Sequence[Offer]:
     """Return what one on-demand machine of the pool's largest kind costs; none if not sold."""
-    from fogft.model.groups import groups_of, with_spot
-
     try:
         return seller.offers(with_spot(groups_of(spec)[-1].resources, False))
     except (SpecError, CloudError):
