@@ -15,6 +15,7 @@ from fogft.errors import FrameError
 from fogft.link import frame
 from fogft.link.frame import NO_STAMP, STAMP_BYTES, RequestHeader
 from fogft.link.port import Answer
+from fogft.model import refusal
 from fogft.model.names import REQUEST_ID_BYTES
 
 LIMIT = 64  # entries
@@ -75,9 +76,9 @@ def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
     A refusal takes the place of the payload where it is not empty.
     """
     parts = []
-    for id, payload, refusal in answers:
-        said = refusal.encode("ascii") if refusal else payload
-        parts.append(_ANSWER.pack(id, bool(refusal), len(said)))
+    for id, payload, reason in answers:
+        said = reason.encode("ascii") if reason else payload
+        parts.append(_ANSWER.pack(id, bool(reason), len(said)))
         parts.append(said)
     return _FIRST + stamp, b"".join(parts)
 
@@ -87,9 +88,14 @@ def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
     if not is_batch(header) or len(header) != _STAMPED:
         raise FrameError("no batch of answers")
     return header[1:], [
-        Answer(id, None, frame.read_reason(part)) if refused else Answer(id, part)
+        _refused(id, frame.read_reason(part)) if refused else Answer(id, part)
         for (id, refused, _), part in _entries(_ANSWER, payload)
     ]
+
+
+def _refused(id: bytes, said: str) -> Answer:
+    kind, detail = refusal.read(said)
+    return Answer(id, refusal=kind, detail=detail)
 
 
 def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[bytes, float, int], bytes]]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
 from fogft.link.send_options import SendOptions
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.type_definition import Definition
 from fogft.records.record import SignedRecord
@@ -112,12 +113,14 @@ class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thri
 
     Attributes:
         service: The name given to `Link.offer`.
+        detail: What belongs to a refusal of its kind.
     """
 
     request_id: bytes
     payload: bytes | None = None
-    refusal: str = ""
+    refusal: Refusal | None = None
     service: str = ""
+    detail: str = ""
 
 
 class LinkEvents(Protocol):
@@ -284,7 +287,7 @@ class Incoming(Protocol):
             more: Others will soon follow, to leave in one message with it.
         """
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: Refusal, detail: str = "") -> None:
         """Send a refusal. Never blocks."""
 
 

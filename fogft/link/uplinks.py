@@ -20,15 +20,13 @@ from typing import Any
 
 from fogft.link.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer
 from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
-from fogft.model.refusal import Refusal
+from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec
 from fogft.model.uplinks import UplinkPolicy, choose
 from fogft.records.record import SignedRecord
 
 _ANSWERED_KEPT = 1024
-# Another uplink may do.
-_ELSEWHERE = frozenset({Refusal.LOST, Refusal.TOO_SLOW})
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 
 
@@ -207,8 +205,8 @@ class UplinksLink:
             attempt.on.discard(index)
             if answer.payload is None and attempt.on:
                 return  # it is under way elsewhere
-            elsewhere = answer.payload is None and answer.refusal in _ELSEWHERE
-            again = elsewhere and not self._closed
+            kind = answer.refusal
+            again = kind is not None and Effect.OTHER_UPLINK in kind.effect and not self._closed
             if again:
                 self._again.append(answer.request_id)
         if again:

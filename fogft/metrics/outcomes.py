@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from fogft.model.refusal import Refusal
+from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import ReplicaId
 
 _LATENCIES_KEPT = 2000
@@ -25,10 +25,6 @@ _COUNTED = (
     *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
     *("request_bytes", "response_bytes"),
 )
-
-# Refusals that speak against the service; not those about load, links, who was faster, or a
-# start that takes its time.
-_FAILURES = frozenset({Refusal.CRASHED, Refusal.MALFORMED})
 
 
 class Outcomes:
@@ -79,7 +75,7 @@ class Outcomes:
         *,
         took_s: float,
         asked: Mapping[int, float] = MappingProxyType({}),
-        refused: Mapping[int, str] = MappingProxyType({}),
+        refused: Mapping[int, Refusal] = MappingProxyType({}),
         replica: str = "",
     ) -> None:
         """Trace how a request ended.
@@ -100,7 +96,7 @@ class Outcomes:
                     "replica": replica,
                     "took_s": round(took_s, 6),
                     "asked": {_short(key): round(after_s, 6) for key, after_s in asked.items()},
-                    "refused": {_short(key): reason for key, reason in refused.items()},
+                    "refused": {_short(key): reason.value for key, reason in refused.items()},
                 }
             )
 
@@ -108,10 +104,10 @@ class Outcomes:
         """Return how many requests a replica has answered first."""
         return self._won.get(replica, 0)
 
-    def refusal(self, reason: str, replica: ReplicaId | None = None) -> None:
+    def refusal(self, reason: Refusal, replica: ReplicaId | None = None) -> None:
         """Count a refusal, and hold it against the replica if it was of a request."""
-        self.refused[reason] = self.refused.get(reason, 0) + 1
-        if replica is not None and reason in _FAILURES:
+        self.refused[reason.value] = self.refused.get(reason.value, 0) + 1
+        if replica is not None and Effect.FAULT in reason.effect:
             self.failed(replica)
 
     def served(self, replica: ReplicaId) -> None:

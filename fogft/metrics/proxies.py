@@ -45,7 +45,6 @@ _WORK_COUNTS = {
     "wasted": ("fogft_requests_wasted_total", "Requests that were run for nobody."),
     "wasted_s": ("fogft_request_wasted_seconds_total", "Time that those took."),
 }
-_LIMIT = "limit "
 
 
 def of_client(report: Mapping[str, Any]) -> list[Family]:
@@ -108,14 +107,13 @@ def _who(link: Mapping[str, Any]) -> str:
 def of_server(report: Mapping[str, Any]) -> list[Family]:
     """Return the metrics of a server proxy from its report."""
     work: Mapping[str, float] = report["work"]
-    limits = {key[len(_LIMIT) :]: value for key, value in work.items() if key.startswith(_LIMIT)}
     return [
         *(of(name, GAUGE, help, [Sample(work[key])]) for key, (name, help) in _WORK_GAUGES.items()),
         *(of(name, COUNTER, help, [Sample(work[k])]) for k, (name, help) in _WORK_COUNTS.items()),
         of("fogft_refusals_total", COUNTER, "Requests that were refused, by reason.",
            (Sample(count, {"reason": reason}) for reason, count in report["refused"].items())),
         of("fogft_concurrency_limit", GAUGE, "Requests that a service is given at once.",
-           (Sample(limit, {"service": name}) for name, limit in limits.items())),
+           (Sample(limit, {"service": name}) for name, limit in report["limits"].items())),
         of("fogft_service_ready", GAUGE, "Whether a service can answer.",
            (Sample(ready, {"service": name}) for name, ready in report["services"].items())),
         of("fogft_draining", GAUGE, "Whether the machine will be taken.",

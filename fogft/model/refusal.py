@@ -1,22 +1,92 @@
-"""Why a replica, or the link to it, did not answer a request. Pure."""
+"""Why a replica, or the link to it, did not answer a request, and what follows from each. Pure.
+
+A new kind of refusal is a row here, the code that raises it, and a test.
+"""
 
 from __future__ import annotations
 
+from enum import Enum, Flag, auto
 
-class Refusal:
-    """Reasons of a refusal, as they travel. The robot tries elsewhere, or again later."""
 
-    NOT_READY = "not-ready"  # the local service is not there
-    OVERLOADED = "overloaded"  # the replica's own window is full
-    CRASHED = "crashed"  # the service died while it worked on this
-    EXPIRED = "expired"  # its deadline had passed on arrival
-    FORGOTTEN = "forgotten"  # it was run, but the answer is no longer kept
-    MALFORMED = "malformed"  # the request could not be read
-    NOT_ADMITTED = "not-admitted"  # who asks may not, or did not say who it is
-    REVOKED = "revoked"  # the certificate of who asks was taken back
-    EXPIRED_CERTIFICATE = "expired-certificate"  # by the replica's clock
-    CANCELLED = "cancelled"  # dropped, because the robot had its answer from elsewhere
-    LATE = "late"  # it was run, but the robot had its answer from elsewhere
-    SUPERSEDED = "superseded"  # made locally: a newer request took its place before it was sent
-    TOO_SLOW = "too-slow"  # made locally: over this link it would not have arrived in time
-    LOST = "lost"  # made locally: the link died before an answer came
+class Effect(Flag):
+    """What a refusal means at the robot, beside that another replica may be asked."""
+
+    NONE = 0
+    BLAMELESS = auto()  # the replica never began: no sign against the request itself
+    FINAL = auto()  # asked again, this replica would run it twice, or refuse it again
+    FAULT = auto()  # it speaks against the service
+    OTHER_UPLINK = auto()  # the same replica may be reached through another uplink
+    GOALS_LOST = auto()  # the action server may have lost the goals that it had
+
+
+class Refusal(str, Enum):
+    """The kinds of refusals: how each travels, and its effect."""
+
+    effect: Effect
+
+    def __new__(cls, text: str, effect: Effect = Effect.NONE) -> Refusal:
+        """Make a row."""
+        kind = str.__new__(cls, text)
+        kind._value_ = text
+        kind.effect = effect
+        return kind
+
+    # The service is not there
+    NOT_READY = "not-ready", Effect.BLAMELESS | Effect.GOALS_LOST
+    # The replica's own window is full
+    OVERLOADED = "overloaded", Effect.BLAMELESS
+    # The service died while it worked on this
+    CRASHED = "crashed", Effect.FAULT | Effect.GOALS_LOST
+    # Its deadline had passed on arrival
+    EXPIRED = "expired", Effect.FINAL
+    # It was run, but the answer is no longer kept
+    FORGOTTEN = "forgotten", Effect.FINAL
+    # The request, or the response, could not be read
+    MALFORMED = "malformed", Effect.FINAL | Effect.FAULT
+    # Who asks may not, or did not say who it is
+    NOT_ADMITTED = "not-admitted", Effect.BLAMELESS
+    # The certificate of who asks was taken back
+    REVOKED = "revoked", Effect.BLAMELESS
+    # By the replica's clock
+    EXPIRED_CERTIFICATE = "expired-certificate"
+    # Dropped, because the robot had its answer from elsewhere
+    CANCELLED = "cancelled"
+    # It was run, but the robot had its answer from elsewhere
+    LATE = "late"
+
+    # Of a stateful service; the detail is the number of the last three
+    # It obeys this term, and has not been brought to its state
+    NOT_JOINED = "not-joined"
+    # Another number is expected next: decimal
+    GAP = "gap"
+    # A later term is obeyed: hexadecimal
+    FENCED = "fenced"
+    # Another robot is obeyed: its name
+    HELD = "held"
+
+    # Made on the robot: a newer request took its place before it was sent
+    SUPERSEDED = "superseded", Effect.BLAMELESS
+    # Over this link it would not have arrived in time
+    TOO_SLOW = "too-slow", Effect.BLAMELESS | Effect.OTHER_UPLINK
+    # The link died before an answer came
+    LOST = "lost", Effect.BLAMELESS | Effect.OTHER_UPLINK | Effect.GOALS_LOST
+    # A kind that this version does not know; the detail is what was said
+    UNKNOWN = "unknown"
+
+    def __str__(self) -> str:
+        """Return the kind as it travels."""
+        return str(self.value)
+
+    def text(self, detail: str = "") -> str:
+        """Return the refusal as it travels: ASCII."""
+        said = f"{self.value}:{detail}" if detail else self.value
+        return said.encode("ascii", "replace").decode()
+
+
+def read(said: str) -> tuple[Refusal, str]:
+    """Return the kind of a refusal that came, and its detail."""
+    kind, _, detail = said.partition(":")
+    try:
+        return Refusal(kind), detail
+    except ValueError:
+        return Refusal.UNKNOWN, said

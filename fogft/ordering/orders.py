@@ -22,11 +22,6 @@ _INDEX = struct.Struct(">Q")
 INDEX_LIMIT = 1 << 56
 _EPOCH_LIMIT = 1 << 64
 
-NOT_JOINED = "not-joined"  # it obeys this term, and has not been brought to its state
-FORGOTTEN = "forgotten"  # it was applied, and its answer is no longer kept
-MALFORMED = "malformed"  # it was applied, to no effect: its bytes are no request
-_GAP, _FENCED, _HELD = "gap:", "fenced:", "held:"
-
 
 class OrderError(ValueError):
     """These bytes are no order, or not the answer to one."""
@@ -154,42 +149,19 @@ def _unpack(layout: struct.Struct, payload: bytes) -> tuple[int, ...]:
         raise OrderError(f"an answer of {len(payload)} bytes") from error
 
 
-def gap(expected: int) -> str:
-    """Return the refusal of a number that is too high: which one is expected."""
-    return f"{_GAP}{expected}"
+def read_index(detail: str) -> int | None:
+    """Return the number that is expected next, of a `Refusal.GAP`."""
+    return _number(detail, 10)
 
 
-def fenced(epoch: int) -> str:
-    """Return the refusal of an order of a term that has ended: the term that is obeyed."""
-    return f"{_FENCED}{epoch:x}"
+def read_epoch(detail: str) -> int | None:
+    """Return the term that is obeyed, of a `Refusal.FENCED`."""
+    return _number(detail, 16)
 
 
-def held(robot: str) -> str:
-    """Return the refusal of another robot's claim: whose order is obeyed."""
-    ascii_name = robot.encode("ascii", "replace").decode()
-    return f"{_HELD}{ascii_name[:48]}"
-
-
-def read_gap(reason: str) -> int | None:
-    """Return the expected number, if the refusal is a gap."""
-    return _number(reason, _GAP, 10)
-
-
-def read_fenced(reason: str) -> int | None:
-    """Return the epoch that is obeyed, if the refusal says so."""
-    return _number(reason, _FENCED, 16)
-
-
-def read_held(reason: str) -> str | None:
-    """Return the robot that is obeyed, if the refusal says so."""
-    return reason.removeprefix(_HELD) if reason.startswith(_HELD) else None
-
-
-def _number(reason: str, prefix: str, base: int) -> int | None:
-    if not reason.startswith(prefix):
-        return None
+def _number(detail: str, base: int) -> int | None:
     try:
-        number = int(reason.removeprefix(prefix), base)
+        number = int(detail, base)
     except ValueError:
         return None
     return number if 0 <= number < _EPOCH_LIMIT else None

@@ -15,12 +15,11 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from fogft.model.refusal import Refusal
 from fogft.ordering import orders
-from fogft.ordering.orders import FORGOTTEN, MALFORMED, NOT_JOINED, START, Op, Position, Promise
+from fogft.ordering.orders import START, Op, Position, Promise
 
 T = TypeVar("T")
-
-NOT_READY, CRASHED = "not-ready", "crashed"
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,8 @@ class Refuse(Generic[T]):
     """Refuse whoever gave this order."""
 
     to: T
-    reason: str
+    reason: Refusal
+    detail: str = ""
 
 
 @dataclass(frozen=True)
@@ -144,14 +144,14 @@ class OrderedReplica(Generic[T]):
         if op is Op.CLAIM:
             return self._claim(epoch, robot, to)
         if epoch != self.promised:
-            return [Refuse(to, orders.fenced(self.promised))]
+            return [self._fenced(to)]
         if op is Op.APPLY:
             return self._apply(index, payload, to)
         if op is Op.RECALL:
             known = self._recall(index, to)
-            return [Refuse(to, NOT_JOINED)] if known is None else known
+            return [Refuse(to, Refusal.NOT_JOINED)] if known is None else known
         if not self.serving:
-            return [Refuse(to, NOT_READY)]
+            return [Refuse(to, Refusal.NOT_READY)]
         if op is Op.JOIN:
             return self._join(payload, to)
         if op is Op.RESTORE:
@@ -161,24 +161,27 @@ class OrderedReplica(Generic[T]):
 
     def _claim(self, epoch: int, robot: str, to: T) -> list[Effect[T]]:
         if not self.serving:
-            return [Refuse(to, NOT_READY)]
+            return [Refuse(to, Refusal.NOT_READY)]
         if self.robot not in ("", robot):
-            return [Refuse(to, orders.held(self.robot))]
+            return [Refuse(to, Refusal.HELD, self.robot[:48])]
         if epoch < self.promised:
-            return [Refuse(to, orders.fenced(self.promised))]
+            return [self._fenced(to)]
         out: list[Effect[T]] = []
         if epoch > self.promised:
-            out = self._give_up(orders.fenced(epoch))
+            out = self._give_up(Refusal.FENCED, f"{epoch:x}")
             self.promised, self.robot = epoch, robot
             self.joined = False
         self._claims.append(to)
         return [*out, *self._go_on()]
 
+    def _fenced(self, to: T) -> Refuse[T]:
+        return Refuse(to, Refusal.FENCED, f"{self.promised:x}")
+
     def _join(self, payload: bytes, to: T) -> list[Effect[T]]:
         if not self.joined:
             at, goal = orders.decode_join(payload)
             if not self.sound or self.busy or at != self.position:
-                return [Refuse(to, NOT_JOINED)]
+                return [Refuse(to, Refusal.NOT_JOINED)]
             self.joined, self.goal = True, goal
             if at.epoch != self.promised:
                 self._forget_answers()
@@ -197,22 +200,22 @@ class OrderedReplica(Generic[T]):
         if self._is_behind(index):  # a copy, or not needed
             return [self._has_joined(to)]
         goal, state = orders.decode_snapshot(payload)
-        out: list[Effect[T]] = self._give_up(NOT_JOINED) if self.joined else []
+        out: list[Effect[T]] = self._give_up(Refusal.NOT_JOINED) if self.joined else []
         self.joined = False
         if self._restore is not None:
-            out.append(Refuse(self._restore[2], NOT_JOINED))
+            out.append(Refuse(self._restore[2], Refusal.NOT_JOINED))
         self._restore, self.goal = (index, state, to), goal
         return [*out, *self._go_on()]
 
     def _recall(self, index: int, to: T) -> list[Effect[T]] | None:
         """Answer a number that was taken before, now or when it is done; None for a new one."""
         if not self.joined:
-            return [Refuse(to, NOT_JOINED)]
+            return [Refuse(to, Refusal.NOT_JOINED)]
         if index <= self.position.index:
             if index not in self.kept:
-                return [Refuse(to, FORGOTTEN)]
+                return [Refuse(to, Refusal.FORGOTTEN)]
             answer = self.kept[index]
-            return [Refuse(to, MALFORMED) if answer is None else Reply(to, answer)]
+            return [Refuse(to, Refusal.MALFORMED) if answer is None else Reply(to, answer)]
         work = self._work
         if work is not None and work.op is Op.APPLY and work.index == index:
             work.waiting.append(to)
@@ -227,11 +230,11 @@ class OrderedReplica(Generic[T]):
         if known is not None:
             return known
         if index != self._expected:
-            return [Refuse(to, orders.gap(self._expected))]
+            return [Refuse(to, Refusal.GAP, str(self._expected))]
         limit, limit_bytes, _, _ = self._limits
         full = len(self._queue) >= limit or self._queued_bytes + len(payload) > limit_bytes
         if full and self._queue:
-            return [Refuse(to, orders.gap(index))]  # send it again, a little later
+            return [Refuse(to, Refusal.GAP, str(index))]  # send it again, a little later
         self._queue[index] = _Queued(payload, [to])
         self._queued_bytes += len(payload)
         return self._go_on()
@@ -252,14 +255,14 @@ class OrderedReplica(Generic[T]):
             else:
                 # It may have joined by another restore since; what it was sent then is not for
                 # the state that comes now.
-                out += self._give_up(NOT_JOINED)
+                out += self._give_up(Refusal.NOT_JOINED)
                 self.joined = self.sound = False
                 self._forget_answers()
                 return [*out, self._begin(Op.RESTORE, index, [to], payload)]
         if self._snapshots and self.joined:
             waiting, self._snapshots = self._snapshots, []
             return [*out, self._begin(Op.SNAPSHOT, self.position.index, waiting)]
-        out += [Refuse(to, NOT_JOINED) for to in self._snapshots]
+        out += [Refuse(to, Refusal.NOT_JOINED) for to in self._snapshots]
         self._snapshots = []
         while self._queue and self._work is None:
             index, queued = self._queue.popitem(last=False)
@@ -293,12 +296,12 @@ class OrderedReplica(Generic[T]):
             self.position = Position(work.epoch, work.index)
             self._keep(work.index, answer)
             out = [
-                Refuse(to, MALFORMED) if answer is None else Reply(to, answer)
+                Refuse(to, Refusal.MALFORMED) if answer is None else Reply(to, answer)
                 for to in work.waiting
             ]
         elif work.op is Op.SNAPSHOT:
             out = [
-                Refuse(to, NOT_READY)
+                Refuse(to, Refusal.NOT_READY)
                 if answer is None
                 else Reply(to, orders.encode_snapshot(work.index, answer))
                 for to in work.waiting
@@ -309,11 +312,11 @@ class OrderedReplica(Generic[T]):
 
     def _restored(self, work: _Work[T], ok: bool) -> list[Effect[T]]:
         if not ok:  # nobody knows what it has left
-            return [Refuse(to, NOT_JOINED) for to in work.waiting]
+            return [Refuse(to, Refusal.NOT_JOINED) for to in work.waiting]
         self.sound = True
         self.position = Position(work.epoch, work.index)
         if work.epoch != self.promised:  # fenced meanwhile
-            return [Refuse(to, orders.fenced(self.promised)) for to in work.waiting]
+            return [self._fenced(to) for to in work.waiting]
         self.joined = True
         return [self._has_joined(to) for to in work.waiting]
 
@@ -333,24 +336,24 @@ class OrderedReplica(Generic[T]):
 
     def lost(self) -> list[Effect[T]]:
         """The service has died, with its state: what starts next starts at the beginning."""
-        out = self._give_up(CRASHED)
+        out = self._give_up(Refusal.CRASHED)
         if self._work is not None:
-            out += [Refuse(to, CRASHED) for to in self._work.waiting]
-        out += [Refuse(to, NOT_READY) for to in self._claims]
+            out += [Refuse(to, Refusal.CRASHED) for to in self._work.waiting]
+        out += [Refuse(to, Refusal.NOT_READY) for to in self._claims]
         self._work, self._claims = None, []
         self.position, self.sound, self.joined, self.serving = START, True, False, False
         self._forget_answers()
         return out
 
-    def _give_up(self, reason: str) -> list[Effect[T]]:
+    def _give_up(self, reason: Refusal, detail: str = "") -> list[Effect[T]]:
         """Refuse all that has not begun."""
         out: list[Effect[T]] = [
-            Refuse(to, reason) for queued in self._queue.values() for to in queued.waiting
+            Refuse(to, reason, detail) for queued in self._queue.values() for to in queued.waiting
         ]
-        out += [Refuse(to, reason) for to in self._snapshots]
+        out += [Refuse(to, reason, detail) for to in self._snapshots]
         if self._restore is not None:
-            out.append(Refuse(self._restore[2], reason))
-        out += [Refuse(to, reason) for to in self._claims]
+            out.append(Refuse(self._restore[2], reason, detail))
+        out += [Refuse(to, reason, detail) for to in self._claims]
         self._queue.clear()
         self._queued_bytes = 0
         self._snapshots, self._restore, self._claims = [], None, []

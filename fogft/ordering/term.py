@@ -14,6 +14,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 
+from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.catching_up import CatchingUp
 from fogft.ordering.orders import START, Op, Position, Promise
@@ -201,14 +202,17 @@ class OrderedTerm(CatchingUp):
 
     # -- what does not succeed ------------------------------------------------------------
 
-    def refused(self, replica: int, op: Op, index: int, reason: str, now: float) -> None:
+    def refused(
+        self, replica: int, op: Op, index: int, reason: Refusal, now: float, *, detail: str = ""
+    ) -> None:
         """Take a refusal, or the loss of an order: the replica may or may not have obeyed it."""
-        epoch = orders.read_fenced(reason)
+        epoch = orders.read_epoch(detail) if reason is Refusal.FENCED else None
         if epoch is not None and epoch > self.epoch:
             self.deposed_by = max(epoch, self.deposed_by or 0)
             self._out.clear()
             return
-        self.held_by = orders.read_held(reason) or self.held_by
+        if reason is Refusal.HELD:
+            self.held_by = detail
         peer = self._peers.get(replica)
         if op is Op.SNAPSHOT:
             if self._asked_for_checkpoint == replica:
@@ -219,10 +223,10 @@ class OrderedTerm(CatchingUp):
             return
         if op in (Op.APPLY, Op.RECALL):
             peer.open.discard(index)
-            if reason in (orders.FORGOTTEN, orders.MALFORMED):
+            if reason in (Refusal.FORGOTTEN, Refusal.MALFORMED):
                 peer.acked = max(peer.acked, index)
                 return
-            expected = orders.read_gap(reason)
+            expected = orders.read_index(detail) if reason is Refusal.GAP else None
             if expected is not None:
                 peer.go_back(expected)
                 return

@@ -198,13 +198,13 @@ def test_a_request_gets_its_answer_once(
     world.settle()
     assert len(owner.answers) == 1
     answer = owner.answers[0][1]
-    assert (answer.payload, answer.refusal, answer.service) == (b"answer", "", SERVICE)
+    assert (answer.payload, answer.refusal, answer.service) == (b"answer", None, SERVICE)
     assert link.status().in_flight == 0
 
 
 @pytest.mark.parametrize("reason", [Refusal.NOT_READY, Refusal.OVERLOADED, Refusal.CRASHED])
 def test_a_refusal_arrives_with_its_reason(
-    world: World, replica: Replica, link: Link, owner: Owner, reason: str
+    world: World, replica: Replica, link: Link, owner: Owner, reason: Refusal
 ) -> None:
     link.offer(SERVICE, request_id(1), b"", 5.0)
     world.wait_for(lambda: replica.requests)

@@ -301,9 +301,9 @@ class MemoryIncoming:
         """Send the serialised response."""
         self.answer(Answer(self.request_id, payload=payload), "replies")
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: Refusal, detail: str = "") -> None:
         """Send a refusal."""
-        self.answer(Answer(self.request_id, refusal=reason), "refused")
+        self.answer(Answer(self.request_id, refusal=reason, detail=detail), "refused")
 
     def __del__(self) -> None:
         """Refuse what its owner forgot."""

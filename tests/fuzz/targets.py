@@ -20,7 +20,7 @@ from fogft.link import batch_frames, compression, frame, probe_frames
 from fogft.link.frame import Greeting
 from fogft.link.port import GatewayView, Probe, ProbeAnswer
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions, NotAdmittedError
-from fogft.model import certificate_holder, membership
+from fogft.model import certificate_holder, membership, refusal
 from fogft.model.replica import LinkState, Member, Membership, ReplicaId
 from fogft.model.type_definition import Definition
 from fogft.ordering import orders
@@ -148,7 +148,7 @@ def _content(data: bytes) -> None:
 def _order(data: bytes) -> None:
     """Read a sequencer's order, and each answer to one."""
     text = data.decode("latin-1")
-    for read_refusal in (orders.read_gap, orders.read_fenced, orders.read_held):
+    for read_refusal in (refusal.read, orders.read_index, orders.read_epoch):
         read_refusal(text)
     for read in (
         orders.decode_join,

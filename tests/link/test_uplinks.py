@@ -58,7 +58,9 @@ class Scene:
     def counts(self) -> list[int]:
         return [len(one.offered) for one in self.uplinks]
 
-    def end(self, at: int, payload: bytes | None = None, refusal: str = "", id: bytes = ID) -> None:
+    def end(
+        self, at: int, payload: bytes | None = None, refusal: Refusal | None = None, id: bytes = ID
+    ) -> None:
         one = self.uplinks[at]
         one.events.answered(one, Answer(id, payload, refusal, "/s"))
 
@@ -215,7 +217,8 @@ def test_each_accepted_attempt_ends_once_whatever_happens(policy, steps):
         elif what in ("answer", "refuse") and open_:
             id = open_[which % len(open_)]
             one.offered = [o for o in one.offered if o[1] != id]
-            scene.end(at, b"a" if what == "answer" else None, "" if what == "answer" else "x", id)
+            payload = b"a" if what == "answer" else None
+            scene.end(at, payload, None if payload else Refusal.OVERLOADED, id)
         elif what == "lose":
             scene.lose(at)
             one.offered = []

@@ -11,10 +11,10 @@ from typing import Any
 from fogft.ordering import orders
 from fogft.ordering.orders import START
 from fogft.ordering.peer import Order
-from fogft.ordering.replica import OrderedReplica
+from fogft.ordering.replica import OrderedReplica, Refuse
 from fogft.ordering.sequencer import Sequencer
 from tests.linearizability import Call
-from tests.ordering.service_world import LOST, Asked, Letter, ServiceWorld
+from tests.ordering.service_world import Asked, Letter, ServiceWorld, lost
 
 
 @dataclass(eq=False)
@@ -71,7 +71,7 @@ class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
         del self.hosts[replica]
         for letter in self.letters:
             if letter.sent.order.replica == replica:
-                self.end(letter.sent, None, LOST)
+                self.end(letter.sent, None, lost(letter.sent))
         self.reach()
 
     def reach(self) -> None:
@@ -122,7 +122,7 @@ class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
     def arrive(self, sent: Sent) -> None:
         host = self.hosts.get(sent.order.replica)
         if host is None:
-            self.end(sent, None, LOST)
+            self.end(sent, None, lost(sent))
             return
         order = sent.order
         id = orders.encode(order.op, sent.term, order.index)
@@ -130,7 +130,7 @@ class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
         effects = host.machine.order(op, epoch, index, order.payload, robot="r", to=sent)
         self.effects(host, effects)
 
-    def end(self, sent: Sent, payload: bytes | None, reason: str) -> None:
+    def end(self, sent: Sent, payload: bytes | None, refused: Refuse[Sent] | None) -> None:
         if not sent.open:
             return
         sent.open = False
@@ -138,7 +138,15 @@ class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
         if sent.term != self.sequencer.epoch:
             return  # an answer to a proxy that was killed
         if payload is None:
-            self.sequencer.refused(order.replica, order.op, order.index, reason, self.now)
+            assert refused is not None
+            self.sequencer.refused(
+                order.replica,
+                order.op,
+                order.index,
+                refused.reason,
+                self.now,
+                detail=refused.detail,
+            )
         else:
             first = self.sequencer.replied(order.replica, order.op, order.index, payload)
             if first:

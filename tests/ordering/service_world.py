@@ -10,12 +10,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
+from fogft.model.refusal import Refusal
 from fogft.ordering.orders import Op
 from fogft.ordering.replica import Begin, Refuse, Reply
 from tests.linearizability import Call, Step, linearizable
 
-LOST = "lost"
 S = TypeVar("S")
+
+
+def lost(sent: S) -> Refuse[S]:
+    """Return what the sender of a lost letter is told."""
+    return Refuse(sent, Refusal.LOST)
 
 
 @dataclass(eq=False)
@@ -25,7 +30,7 @@ class Letter(Generic[S]):
     sent: S
     to_replica: bool
     payload: bytes | None = None
-    reason: str = ""
+    refused: Refuse[S] | None = None
 
 
 @dataclass
@@ -90,17 +95,17 @@ class ServiceWorld(Generic[S, M]):
         if letter.to_replica:
             self.arrive(letter.sent)
         else:
-            self.end(letter.sent, letter.payload, letter.reason)
+            self.end(letter.sent, letter.payload, letter.refused)
 
     def lose(self, at: int) -> None:
         """The sender is told that a letter was lost: it may arrive all the same."""
-        self.end(self.letters[at].sent, None, LOST)
+        self.end(self.letters[at].sent, None, lost(self.letters[at].sent))
 
     def arrive(self, sent: S) -> None:
         """An order comes to its replica."""
         raise NotImplementedError
 
-    def end(self, sent: S, payload: bytes | None, reason: str) -> None:
+    def end(self, sent: S, payload: bytes | None, refused: Refuse[S] | None) -> None:
         """An order ends at who gave it."""
         raise NotImplementedError
 
@@ -122,7 +127,7 @@ class ServiceWorld(Generic[S, M]):
             if isinstance(effect, Reply):
                 self.letters.append(Letter(effect.to, False, effect.payload))
             elif isinstance(effect, Refuse):
-                self.letters.append(Letter(effect.to, False, None, effect.reason))
+                self.letters.append(Letter(effect.to, False, None, effect))
             else:
                 assert host.work is None, "the service was given two things at once"
                 host.work = effect

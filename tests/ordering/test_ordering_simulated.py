@@ -11,7 +11,7 @@ from fogft.ordering.catching_up import WINDOW
 from tests.linearizability import Call, counter, key_value, linearizable
 from tests.nightly import by_day
 from tests.ordering.ordering_world import World
-from tests.ordering.service_world import ask_counter, ask_key_value
+from tests.ordering.service_world import ask_counter, ask_key_value, lost
 
 CLIENTS = 3
 
@@ -134,7 +134,7 @@ def test_a_proxy_killed_after_an_answer_does_not_go_back_behind_it():
     for letter in list(world.letters):
         if letter.sent.order.replica == 1:
             world.letters.remove(letter)
-            world.end(letter.sent, None, "lost")
+            world.end(letter.sent, None, lost(letter.sent))
     world.deliver(0)
     world.work(0)
     while not world.history:

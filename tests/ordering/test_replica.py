@@ -8,6 +8,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.orders import Op, Position
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
@@ -51,7 +52,9 @@ class Replica(RuleBasedStateMachine):
                 at, state = orders.decode_snapshot(effect.payload)
                 assert state == bytes(range(1, at + 1))
             elif isinstance(effect, Refuse) and op is Op.APPLY:
-                expected = orders.read_gap(effect.reason)
+                expected = (
+                    orders.read_index(effect.detail) if effect.reason is Refusal.GAP else None
+                )
                 assert expected is None or expected <= 7
 
     @rule()

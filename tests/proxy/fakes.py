@@ -7,6 +7,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.link.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 
 UID = "0123456789abcdef"
@@ -77,7 +78,7 @@ class FakeLink:
 
     def refusal(self, reason: str, n: int = -1) -> Answer:
         service, request, _, _ = self.offered[n]
-        return Answer(request, refusal=reason, service=service)
+        return Answer(request, refusal=Refusal(reason), service=service)
 
 
 class FakeDialer:
@@ -135,7 +136,7 @@ class FakeIncoming:
         self.outcome.append(payload)
         self.more = more
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: Refusal, detail: str = "") -> None:
         self.outcome.append(f"refused {reason}")
 
 

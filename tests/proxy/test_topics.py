@@ -57,7 +57,7 @@ class Carried:
     def reply(self, payload: bytes, *, more: bool = False) -> None:
         self._end(Answer(self.request_id, payload=payload, service=self.service))
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: Refusal) -> None:
         self._end(Answer(self.request_id, refusal=reason, service=self.service))
 
     def _end(self, answer: Answer) -> None:

@@ -93,7 +93,7 @@ class Forwarder:
         self._queue: SimpleQueue[Passage | None] = SimpleQueue()
         self.passed = 0
         self.joined = 0
-        self.refused: Counter[str] = Counter()
+        self.refused: Counter[Refusal] = Counter()
 
     def start(self) -> None:
         """Begin to pass on: on a thread of its own, since the wire's threads must not send."""
@@ -123,26 +123,26 @@ class Forwarder:
                 if len(known.copies) > _COPIES_LIMIT:
                     del known.copies[0]  # refused as lost: its link is long gone
                 return
-            reason = "" if kept is not None else self._reason_to_refuse(incoming)
-            if kept is None and not reason:
+            reason = None if kept is not None else self._reason_to_refuse(incoming)
+            if kept is None and reason is None:
                 passage = Passage(incoming, now + incoming.remaining_s)
                 self._open[passage.id] = passage
                 self._by_robot[passage.robot] += 1
                 self._queue.put(passage)
         if kept is not None:
             incoming.reply(kept[1])
-        elif reason:
+        elif reason is not None:
             self._refuse(incoming, reason)
 
-    def _reason_to_refuse(self, incoming: Incoming) -> str:
+    def _reason_to_refuse(self, incoming: Incoming) -> Refusal | None:
         if incoming.remaining_s <= 0:
             return Refusal.EXPIRED
         if incoming.service not in self._ready:
             return Refusal.NOT_READY
         full = len(self._open) >= self._held or self._by_robot[incoming.robot] >= self._of_one
-        return Refusal.OVERLOADED if full else ""
+        return Refusal.OVERLOADED if full else None
 
-    def _refuse(self, incoming: Incoming, reason: str) -> None:
+    def _refuse(self, incoming: Incoming, reason: Refusal) -> None:
         self.refused[reason] += 1
         incoming.refuse(reason)
 
@@ -151,7 +151,7 @@ class Forwarder:
         for id in ids:
             self._stop(id, Refusal.CANCELLED)
 
-    def _stop(self, id: bytes, reason: str) -> None:
+    def _stop(self, id: bytes, reason: Refusal) -> None:
         with self._lock:
             passage = self._take(id)
         if passage is None:
@@ -255,7 +255,7 @@ class Forwarder:
             "in_flight": self.in_flight,
             "passed": self.passed,
             "joined": self.joined,
-            "refused": dict(self.refused),
+            "refused": {reason.value: count for reason, count in self.refused.items()},
         }
 
     def close(self) -> None:

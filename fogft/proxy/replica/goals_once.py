@@ -128,8 +128,8 @@ class GoalsOnce:
         server = self._servers[service]
         with self._lock:
             answer = server.accepted.get(goal)
-            reason = "" if answer is not None else self._reason_to_refuse(server, incoming, goal)
-            if answer is None and not reason:
+            reason = None if answer is not None else self._reason_to_refuse(server, incoming, goal)
+            if answer is None and reason is None:
                 known = server.open.get(goal)
                 if known is None:
                     known = server.open[goal] = _Open(incoming.payload)
@@ -137,12 +137,14 @@ class GoalsOnce:
                 known.waiting.append((self._clock() + incoming.remaining_s, incoming))
         if answer is not None:
             incoming.reply(answer)
-        elif reason:
+        elif reason is not None:
             incoming.refuse(reason)
         else:
             self._pass_on(service)
 
-    def _reason_to_refuse(self, server: _ActionServer, incoming: Incoming, goal: bytes) -> str:
+    def _reason_to_refuse(
+        self, server: _ActionServer, incoming: Incoming, goal: bytes
+    ) -> Refusal | None:
         if incoming.remaining_s <= 0:
             return Refusal.EXPIRED
         if not self._is_ready(incoming.service) or incoming.service not in self._clients:
@@ -152,8 +154,8 @@ class GoalsOnce:
             return Refusal.OVERLOADED
         known = server.open.get(goal)
         if known is None:
-            return Refusal.OVERLOADED if len(server.line) >= _LINE_LIMIT else ""
-        return Refusal.OVERLOADED if len(known.waiting) >= _COPIES_LIMIT else ""
+            return Refusal.OVERLOADED if len(server.line) >= _LINE_LIMIT else None
+        return Refusal.OVERLOADED if len(known.waiting) >= _COPIES_LIMIT else None
 
     # -- to the action server -------------------------------------------------------------
 
@@ -181,7 +183,7 @@ class GoalsOnce:
                 reason = Refusal.MALFORMED if hopeless else Refusal.OVERLOADED
                 self._drop(server, goal, known, reason)
 
-    def _drop(self, server: _ActionServer, goal: bytes, known: _Open, reason: str) -> None:
+    def _drop(self, server: _ActionServer, goal: bytes, known: _Open, reason: Refusal) -> None:
         """Forget a goal that the action server was not given after all."""
         with self._lock:
             if server.open.get(goal) is known:
@@ -277,7 +279,7 @@ class GoalsOnce:
                     known.holds, known.unheard = False, True
             self._refuse(name, unbegun, Refusal.NOT_READY)
 
-    def _refuse(self, service: str, ended: Collection[_Open], reason: str) -> None:
+    def _refuse(self, service: str, ended: Collection[_Open], reason: Refusal) -> None:
         client = self._clients.get(service)
         for known in ended:
             if client is not None and known.ticket is not None:

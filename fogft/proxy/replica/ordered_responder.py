@@ -127,7 +127,7 @@ class OrderedResponder:
             if isinstance(effect, Reply):
                 effect.to.reply(effect.payload)
             elif isinstance(effect, Refuse):
-                effect.to.refuse(effect.reason)
+                effect.to.refuse(effect.reason, effect.detail)
             else:
                 self._begin(effect)
 

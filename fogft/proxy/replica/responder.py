@@ -119,7 +119,7 @@ class Responder:
         self.interrupted = 0
         self.wasted = 0
         self.wasted_s = 0.0
-        self.refused: dict[str, int] = {}
+        self.refused: dict[Refusal, int] = {}
 
     @property
     def in_flight(self) -> int:
@@ -138,8 +138,12 @@ class Responder:
             "wasted_s": round(self.wasted_s, 3),
             "expired": self.refused.get(Refusal.EXPIRED, 0),
             "overloaded": self.refused.get(Refusal.OVERLOADED, 0),
-            **{f"limit {name}": line.limit.limit for name, line in self._lines.items()},
         }
+
+    @property
+    def limits(self) -> dict[str, int]:
+        """How many requests each service may have at once."""
+        return {name: line.limit.limit for name, line in self._lines.items()}
 
     def use(
         self,
@@ -165,11 +169,11 @@ class Responder:
                     known.waiting.append(incoming)
                     return
                 answer = known.answer
-                reason = Refusal.CANCELLED if known.unwanted else Refusal.FORGOTTEN
+                reason: Refusal | None = Refusal.CANCELLED if known.unwanted else Refusal.FORGOTTEN
             else:
                 answer = None
                 reason, displaced = self._reason_to_refuse(incoming, now)
-                if not reason:
+                if reason is None:
                     begun = self._accept(incoming, now)
         if displaced is not None:
             self._end(displaced.id, Refusal.OVERLOADED)
@@ -178,7 +182,7 @@ class Responder:
                 self._pass_on(incoming.service)
         elif answer is not None:
             incoming.reply(answer)
-        elif reason:
+        elif reason is not None:
             self._refuse(incoming, reason)
         else:
             self._pass_on(incoming.service)
@@ -216,8 +220,10 @@ class Responder:
             )
         return line
 
-    def _reason_to_refuse(self, incoming: Incoming, now: float) -> tuple[str, Work | None]:
-        """Return why a request is not taken, empty if it is, and what gives way to it."""
+    def _reason_to_refuse(
+        self, incoming: Incoming, now: float
+    ) -> tuple[Refusal | None, Work | None]:
+        """Return why a request is not taken, None if it is, and what gives way to it."""
         service, remaining_s = incoming.service, incoming.remaining_s
         if remaining_s <= 0:
             return Refusal.EXPIRED, None
@@ -231,9 +237,9 @@ class Responder:
         if held_bytes > self._held_bytes_limit and self._running:
             return Refusal.OVERLOADED, None
         if self._running < self._max_in_flight:
-            return "", None
+            return None, None
         displaced = line.give_way(incoming.robot, deadline)
-        return ("", displaced) if displaced is not None else (Refusal.OVERLOADED, None)
+        return (None, displaced) if displaced is not None else (Refusal.OVERLOADED, None)
 
     def cancel(self, ids: Iterable[bytes]) -> None:
         """Drop requests that are no longer wanted; those at work are told to stop, if they can.
@@ -361,7 +367,7 @@ class Responder:
         if self._kept.pop(id, None) is not None:
             self._kept_bytes -= len(work.answer or b"")
 
-    def _end(self, id: bytes, reason: str) -> None:
+    def _end(self, id: bytes, reason: Refusal) -> None:
         """End work without an answer: a copy that comes later may be run anew."""
         with self._lock:
             work = self._work.get(id)
@@ -373,14 +379,14 @@ class Responder:
             self._held_bytes -= work.size
             line = self._lines[work.service]
             line.remove(work)
-            if reason != Refusal.EXPIRED:
+            if reason is not Refusal.EXPIRED:
                 line.free(work)
             elif work.passed_on:
                 line.overdue(work, self._clock())
         for incoming in waiting:
             self._refuse(incoming, reason)
 
-    def _refuse(self, incoming: Incoming, reason: str) -> None:
+    def _refuse(self, incoming: Incoming, reason: Refusal) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1
         incoming.refuse(reason)
 

@@ -234,7 +234,8 @@ class ServerProxy:
         answering = self._answering()
         return {
             "work": self.responder.report(),
-            "refused": dict(self.responder.refused),
+            "limits": self.responder.limits,
+            "refused": {r.value: n for r, n in self.responder.refused.items()},
             "services": {s.name: s.name in answering for s in self._offering.services},
             "draining": self._draining,
             "restarts": max(self._supervisor.restarts, 0),

@@ -20,7 +20,7 @@ from typing import Any
 
 from fogft.link.port import Answer, Link
 from fogft.model.names import REQUEST_ID_BYTES
-from fogft.model.refusal import Refusal
+from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.action_cancel import CancelDispatcher
@@ -31,8 +31,6 @@ from fogft.topics import goals
 from fogft.topics.goals import Had, Took
 
 log = logging.getLogger(__name__)
-
-_MAY_HAVE_LOST_ITS_GOALS = frozenset({Refusal.CRASHED, Refusal.NOT_READY, Refusal.LOST})
 
 
 class GoalDispatcher(ReachingAll):
@@ -69,7 +67,7 @@ class GoalDispatcher(ReachingAll):
     def _took(self, answer: Answer, replica: int) -> Took | None:
         id, payload, now = answer.request_id, answer.payload, self._clock()
         with self.shared.lock:
-            if payload is None and answer.refusal != Refusal.MALFORMED:
+            if payload is None and answer.refusal is not Refusal.MALFORMED:
                 self.shared.goals.failed(id, replica, now)
                 return None
             accepts = payload is not None and goals.is_success(Part.GOAL, payload)
@@ -152,7 +150,7 @@ class ResultDispatcher(PartDispatcher):
             return
         replica, goal = key_of(link), goals.goal_of(pending.item.payload)
         if payload is None:
-            if answer.refusal in _MAY_HAVE_LOST_ITS_GOALS:
+            if answer.refusal is not None and Effect.GOALS_LOST in answer.refusal.effect:
                 with self.shared.lock:
                     self.shared.goals.lost(goal, replica)
             super().answered(link, answer)

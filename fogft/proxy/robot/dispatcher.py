@@ -27,7 +27,7 @@ from fogft.log_limits import worth_logging
 from fogft.metrics.outcomes import Outcomes
 from fogft.model.choices import Freshness
 from fogft.model.names import REQUEST_ID_BYTES
-from fogft.model.refusal import Refusal
+from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import HedgingMode, OnTimeout, ServiceSpec
 from fogft.proxy.robot.fallback_caller import Rescuer, Shared, note_end
@@ -41,23 +41,6 @@ log = logging.getLogger(__name__)
 
 Respond = Callable[[Any, bytes], None]
 _Short = tuple[bytes, Pending[Request]]
-
-# A refusal after which the same replica is not asked again for the same request: asking
-# again would run it twice (FORGOTTEN) or cannot end otherwise.
-_FINAL_REFUSALS = frozenset({Refusal.FORGOTTEN, Refusal.MALFORMED, Refusal.EXPIRED})
-# The replica never began, or may never have seen it: no sign against the request itself.
-_BLAMELESS_REFUSALS = frozenset(
-    {
-        Refusal.LOST,
-        Refusal.SUPERSEDED,
-        Refusal.TOO_SLOW,
-        Refusal.NOT_READY,
-        Refusal.OVERLOADED,
-        Refusal.NOT_ADMITTED,
-        Refusal.REVOKED,
-    }
-)
-
 
 _TRACE_KEPT = 20_000  # lines until they are written, twice a second
 
@@ -258,18 +241,18 @@ class Dispatcher:
                 link.forget(request)
 
     def _refused(self, id: ReplicaId, replica: int, answer: Answer) -> None:
-        now = self._clock()
+        now, refusal = self._clock(), answer.refusal or Refusal.LOST
         with self._lock:
-            self._outcomes.refusal(answer.refusal, id)
+            self._outcomes.refusal(refusal, id)
             pending = self._requests.get(answer.request_id)
             if pending is not None and pending.item.story is not None:
-                pending.item.story.refused[replica] = answer.refusal
+                pending.item.story.refused[replica] = refusal
             verdict = self._requests.failed(
                 answer.request_id,
                 replica,
                 now,
-                counts=answer.refusal not in _BLAMELESS_REFUSALS,
-                bar=answer.refusal in _FINAL_REFUSALS,
+                counts=Effect.BLAMELESS not in refusal.effect,
+                bar=Effect.FINAL in refusal.effect,
             )
             if verdict is Verdict.LATE:
                 self._hedging.late(answer.request_id, replica, now, answered=False)

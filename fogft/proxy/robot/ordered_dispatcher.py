@@ -184,19 +184,19 @@ class OrderedDispatcher:
     def _take_end(self, link: Link, id: OrderId, answer: Answer, now: float) -> bytes | None:
         """Pass the end of an order on; return the answer to its number if it is. Under the lock."""
         replica, applies = key_of(link), id[0] in _COPIES
-        refusal = answer.refusal
         if answer.payload is not None:
             try:
                 answers = self._order.replied(replica, id, answer.payload)
             except OrderError as error:
                 log.warning("order_unreadable service=%s reason=%r", self.spec.name, error)
-                refusal = Refusal.MALFORMED
+                answer = answer._replace(refusal=Refusal.MALFORMED)
             else:
                 if applies:
                     self._outcomes.served(link.peer.id)
                 return answer.payload if answers else None
-        self._outcomes.refusal(refusal.split(":")[0], link.peer.id if applies else None)
-        self._order.refused(replica, id, refusal, now)
+        refusal = answer.refusal or Refusal.LOST
+        self._outcomes.refusal(refusal, link.peer.id if applies else None)
+        self._order.refused(replica, id, answer, now)
         return None
 
     def late(self, link: Link, request: bytes) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from fogft.model.refusal import Refusal
+
 
 class Story:
     """Who was asked for a traced request. Moments are on the dispatcher's clock, seconds.
@@ -17,7 +19,7 @@ class Story:
 
     def __init__(self) -> None:
         self.asked: dict[int, float] = {}
-        self.refused: dict[int, str] = {}
+        self.refused: dict[int, Refusal] = {}
 
     def declined(self, replica: int, asked: float | None) -> None:
         """Take back that a replica was asked at this moment; it may have been before."""

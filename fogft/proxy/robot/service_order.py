@@ -14,6 +14,8 @@ import secrets
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from fogft.link.port import Answer
+from fogft.model.refusal import Refusal
 from fogft.ordering.orders import OrderId
 from fogft.ordering.peer import Order
 from fogft.ordering.sequencer import Handover, Sequencer
@@ -116,10 +118,11 @@ class ServiceOrder:
             self._mark.write(term.mark, term.office.holder or "")
         return answers
 
-    def refused(self, replica: int, id: OrderId, reason: str, now: float) -> None:
+    def refused(self, replica: int, id: OrderId, answer: Answer, now: float) -> None:
         """Take a refusal, or the loss of an order."""
         if self.is_current(id):
-            self._term.refused(replica, id[0], id[2], reason, now)
+            reason = answer.refusal or Refusal.LOST
+            self._term.refused(replica, id[0], id[2], reason, now, detail=answer.detail)
 
     def declined(self, replica: int, id: OrderId, now: float) -> None:
         """An order was not taken by its link."""

@@ -165,7 +165,7 @@ class RobotTopic:
             if way is None or number is None:
                 return
             if answer.payload is None:
-                self._refused(way, number, answer.refusal)
+                self._refused(way, number, answer.refusal or Refusal.LOST)
             elif number:
                 way.outbox.confirmed(number)
             else:
@@ -174,7 +174,7 @@ class RobotTopic:
         if due:
             self._wake()
 
-    def _refused(self, way: _Way, number: int, reason: str) -> None:
+    def _refused(self, way: _Way, number: int, reason: Refusal) -> None:
         self.count["refused"] += 1
         if reason != Refusal.LOST:
             way.rest_until = self._clock() + _AGAIN_S

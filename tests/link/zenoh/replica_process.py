@@ -21,6 +21,7 @@ from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from tests.link.wire_pool import POOL_UID, SERVICE, keys
 
@@ -68,7 +69,7 @@ class Service(threading.Thread):
 
     def _answer(self, incoming: Incoming) -> None:
         if incoming.payload.startswith(b"refuse:"):
-            incoming.refuse(incoming.payload[7:].decode())
+            incoming.refuse(Refusal(incoming.payload[7:].decode()))
         elif incoming.payload == b"ignore":
             pass
         elif incoming.payload.startswith((b"noise:", b"text:")):

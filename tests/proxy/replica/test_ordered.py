@@ -47,8 +47,9 @@ class Incoming:
     def reply(self, payload):
         self.scene.answers.append((self.link, Answer(self.request_id, payload=payload)))
 
-    def refuse(self, reason):
-        self.scene.answers.append((self.link, Answer(self.request_id, refusal=reason)))
+    def refuse(self, reason, detail=""):
+        answer = Answer(self.request_id, refusal=reason, detail=detail)
+        self.scene.answers.append((self.link, answer))
 
 
 class Scene:

@@ -76,7 +76,7 @@ class SimulatedLink:
     def _end(self, request: bytes, attempt: int, payload: bytes | None) -> None:
         if self.open.get(request) == attempt:
             del self.open[request]
-            refusal = "" if payload is not None else Refusal.LOST
+            refusal = None if payload is not None else Refusal.LOST
             answer = Answer(request, payload=payload, refusal=refusal, service="/s")
             self.world.dispatcher.answered(self, answer)
 

@@ -68,9 +68,9 @@ class ZenohIncoming:
         """Send the serialised response. Never blocks. With `more`, others will soon follow."""
         self._send(payload, "", more=more)
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: Refusal, detail: str = "") -> None:
         """Send a refusal. Never blocks."""
-        self._send(b"", reason, more=True)
+        self._send(b"", reason.text(detail), more=True)
 
     def _send(self, payload: bytes, refusal: str, *, more: bool) -> None:
         try:

@@ -29,11 +29,11 @@ class NotAdmittedError(Exception):
     """A connection is not admitted.
 
     Args:
-        refusal: One of `model.refusal`, as it travels.
+        refusal: What is answered.
         detail: The reason for people.
     """
 
-    def __init__(self, refusal: str, detail: str) -> None:
+    def __init__(self, refusal: Refusal, detail: str) -> None:
         super().__init__(detail)
         self.refusal = refusal
 

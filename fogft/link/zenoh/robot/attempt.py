@@ -15,6 +15,7 @@ from fogft.errors import FrameError
 from fogft.link import batch_frames, frame
 from fogft.link.compression import unpack
 from fogft.link.port import Answer
+from fogft.model import refusal
 from fogft.model.refusal import Refusal
 
 
@@ -50,8 +51,9 @@ def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:
     ok = reply.ok
     if ok is None:
         err = reply.err
-        stamp, id, refusal = frame.decode_refusal(b"" if err is None else err.payload.to_bytes())
-        return stamp, (Answer(id, None, refusal),)
+        stamp, id, said = frame.decode_refusal(b"" if err is None else err.payload.to_bytes())
+        kind, detail = refusal.read(said)
+        return stamp, (Answer(id, refusal=kind, detail=detail),)
     attachment = ok.attachment
     if attachment is None:
         raise FrameError("an answer without a header")

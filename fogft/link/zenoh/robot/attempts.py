@@ -265,10 +265,17 @@ class Attempts:
             self._telling = True
             self._queue.put(_TELL)
 
-    def _end(self, attempt: OpenAttempt, payload: bytes | None, refusal: str = "") -> None:
+    def _end(
+        self,
+        attempt: OpenAttempt,
+        payload: bytes | None,
+        refusal: Refusal | None = None,
+        detail: str = "",
+    ) -> None:
         if self.window.remove(attempt):
             attempt.payload = None
-            self._answered(Answer(attempt.request_id, payload, refusal, attempt.service))
+            service = attempt.service
+            self._answered(Answer(attempt.request_id, payload, refusal, service, detail))
             if self.window.regained_room():
                 self._room()
 
@@ -371,11 +378,11 @@ class Attempts:
         if answer.payload is not None:
             self._credit.heard(attempt.mark)  # requests of one connection arrive in order
         if self.window.holds(attempt):
-            self._end(attempt, answer.payload, answer.refusal)
+            self._end(attempt, answer.payload, answer.refusal, answer.detail)
             return
         if self._cancellations is not None:  # it was forgotten, or has ended
             self._cancellations.answered(answer.request_id)
-        if answer.payload is not None or answer.refusal == Refusal.LATE:
+        if answer.payload is not None or answer.refusal is Refusal.LATE:
             self._late(attempt.service, answer.request_id)
 
     # -- the link's thread ----------------------------------------------------------------

@@ -36,7 +36,7 @@ from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.sockets import address
 from fogft.link.zenoh.threads import join_at_exit
-from fogft.model import names
+from fogft.model import names, refusal
 from fogft.model.refusal import Refusal
 
 log = logging.getLogger(__name__)
@@ -255,10 +255,10 @@ class Connection:
 
     def _probe_refused(self, content: bytes) -> None:
         try:
-            _, _, reason = frame.decode_refusal(content)
+            _, _, said = frame.decode_refusal(content)
         except FrameError:
             return  # Zenoh's own: it timed out, and the link's thread counts the silence
-        words = _REFUSED.get(reason, f"the replica refuses our probes: {reason}")
+        words = _REFUSED.get(refusal.read(said)[0], f"the replica refuses our probes: {said}")
         self.lose(words)
 
     def tell_records(self, key: str, records: bytes) -> None:
