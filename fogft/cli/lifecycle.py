@@ -35,10 +35,21 @@ def init(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
+    schema: Annotated[
+        bool,
+        typer.Option("--schema", help="Print the JSON Schema of pool files, and stop."),
+    ] = False,
 ) -> None:
     """Write an example pool: its pool file and its nodes."""
     from fogft.pool.commands.init import DEFAULT_EXAMPLE, copy_example
 
+    if schema:
+        import json
+
+        from fogft.poolfile.schema import pool_schema
+
+        output.data(json.dumps(pool_schema(), indent=2))
+        return
     name = name or DEFAULT_EXAMPLE
     files = copy_example(name, into or Path(name), force=force)
     for file in files:

@@ -14,7 +14,7 @@ from fogft.cli import options
 
 
 def _endpoint(value: str | None) -> str | None:
-    from fogft.model.endpoint import is_endpoint
+    from fogft.model.names import is_endpoint
 
     if value is not None and not is_endpoint(value):
         raise typer.BadParameter(f"`{value}` is not HOST:PORT, such as 127.0.0.1:9464")

@@ -22,12 +22,12 @@ from typing import Protocol
 from fogft.cloud import notice_formats
 from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.errors import CloudError
+from fogft.model.names import NOTICE_SOURCES
 
 log = logging.getLogger(__name__)
 
 __all__ = ["Notice", "NoticeKind", "Watch", "watch"]
 
-SOURCES = ("auto", "aws", "azure", "gcp")
 POLL_S = 1.0
 FILE_POLL_S = 0.1  # costs nothing, and a local machine may live for a second only
 LOST_POLL_S = 30.0
@@ -118,7 +118,7 @@ def watch(
     if source.startswith("file:") and source != "file:":
         sources: list[Source] = [_File(Path(source.removeprefix("file:")))]
         poll_s = FILE_POLL_S if poll_s is None else poll_s
-    elif source in SOURCES:
+    elif source in NOTICE_SOURCES:
         known: dict[str, Source] = {
             "aws": _Aws(metadata or _address("aws")),
             "gcp": _Gcp(metadata or _address("gcp")),
@@ -128,7 +128,7 @@ def watch(
     else:
         raise CloudError(
             f"there is no source of preemption notices `{source}`",
-            f"`file:PATH`, {', '.join(f'`{name}`' for name in SOURCES)}",
+            f"`file:PATH`, {', '.join(f'`{name}`' for name in NOTICE_SOURCES)}",
         )
     return Watch(sources, on_notice, POLL_S if poll_s is None else poll_s)
 

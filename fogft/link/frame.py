@@ -16,8 +16,8 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from fogft.errors import FrameError
-from fogft.model.names import REQUEST_ID_BYTES
-from fogft.poolfile.service_form import LONGEST_S
+from fogft.model.keys import LONGEST_S
+from fogft.model.names import REQUEST_ID_BYTES, ROBOT_BYTES_LIMIT
 
 VERSION = 4
 # Beside the version, only towards peers that have said that they know them.
@@ -28,7 +28,6 @@ _REQUEST_FLAGS = _PACKED | _MAY_PACK | _READS_PACKED
 TOKEN_BYTES = 8
 STAMP_BYTES = 4
 NO_STAMP = bytes(STAMP_BYTES)  # nothing was seen yet, or nobody asks
-ROBOT_BYTES_LIMIT = 64
 REASON_LIMIT = 64
 REMAINING_LIMIT_S = LONGEST_S
 CANCEL_LIMIT = 4096

@@ -284,7 +284,7 @@ class UplinkDialer:
         old = (self.interfaces, self._options.latest, self._options.plain)
         changed = (tuple(interfaces), options.latest, options.plain) != old
         self.interfaces, self._options = tuple(interfaces), options
-        self._policies = {service.name: service.uplinks for service in services}
+        self._policies = {service.name: service.uplink_policy for service in services}
         self.adopt(options)
         return changed
 

@@ -1,18 +1,39 @@
-"""What a pool file may say about where, how many, when and at what price. Values only.
+"""What a pool file says about where, how many, when and at what price. Values only.
 
-Reading and judging is `spec_plan`'s; what follows from them is `sizing`'s, `schedule`'s,
-`score`'s and `migration`'s.
+Each field that is made by `key` is a key of the pool file.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from fogft.model.keys import (
+    DAY_S,
+    Flag,
+    Free,
+    Map,
+    Maps,
+    Number,
+    Special,
+    Table,
+    Text,
+    Whole,
+    key,
+    within,
+)
+from fogft.model.names import endpoint
+from fogft.model.ros_names import service_name
 from fogft.model.scoring import Weights
-from fogft.planning.availability import Assumption
+
+MAX_REPLICAS = 16
+MAX_USD_PER_HOUR = 1_000_000
+DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+_LOCATION = re.compile(r"[\w.-]+(/[\w.-]+)?")
+_CLOCK = re.compile(r"(\d{1,2}):(\d{2})")
 
 
 class Freshness(str, Enum):
@@ -30,30 +51,90 @@ class Compression(str, Enum):
 
 
 @dataclass(frozen=True)
-class AvailabilitySpec:
-    """How available the pool shall be, and what is assumed of machines.
+class Correlation:
+    """How much replicas are down together. Each in [0, 1], and none above the one before.
+
+    The defaults for a region and a cloud were measured in public traces of AWS's V100 spot
+    machines: 9 zones, 45 days (over all pairs of zones 0.22). That for a zone is assumed, above
+    them. docs/design/availability.md has the source.
 
     Attributes:
-        target: Fraction of time that a replica shall answer, in (0, 1).
+        zone: Between two replicas in one zone.
+        region: Between two in different zones of one region.
+        cloud: Between two in different regions of one cloud.
     """
 
-    target: float
-    assumed: Assumption = field(default_factory=Assumption)
+    zone: float = 0.5
+    region: float = 0.43
+    cloud: float = 0.14
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.cloud <= self.region <= self.zone <= 1:
+            raise ValueError(
+                "correlations must be from 0 to 1, and zone >= region >= cloud, not "
+                f"{self.zone:g}, {self.region:g} and {self.cloud:g}"
+            )
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """What is taken for granted about machines, for lack of a measurement.
+
+    With 20 min of recovery, 12 million seconds are the 99.99 % that clouds promise.
+    """
+
+    spot_uptime_s: float = key(
+        Number(1e9, "seconds"),
+        "Mean time from ready to preempted of a spot machine; FogROS2-FT's 15 h.",
+        default=54_000.0,
+    )
+    on_demand_uptime_s: float = key(
+        Number(1e9, "seconds"),
+        "Mean time from ready to failed of an on-demand machine.",
+        default=12_000_000.0,
+    )
+    recovery_s: float = key(
+        Number(DAY_S, "seconds"),
+        "Time from gone to ready elsewhere; FogROS2-FT's 20 min.",
+        default=1200.0,
+    )
+    correlation: Correlation = field(default_factory=Correlation)
+
+
+@dataclass(frozen=True)
+class AvailabilitySpec:
+    """How available the pool shall be, and what is assumed of machines."""
+
+    target: float = key(
+        Number(0.99999, "one"), "Fraction of time that at least one replica answers."
+    )
+    assumed: Assumption = within(Assumption)
+
+
+def _metrics(default_port: int) -> Text:
+    hint = f"write an address that only your Prometheus reaches, such as `127.0.0.1:{default_port}`"
+    return Text("`host:port`", hint, endpoint)
 
 
 @dataclass(frozen=True)
 class MetricsSpec:
-    """Where processes listen for Prometheus: ``host:port``; empty for nowhere.
+    """Where processes listen for Prometheus: ``host:port``; empty for nowhere."""
 
-    Attributes:
-        proxy: The client proxy of the robot that ran `fogft up`.
-        manager: The manager.
-        replica: The server proxies; replica SLOT has the port plus SLOT.
-    """
-
-    proxy: str = ""
-    manager: str = ""
-    replica: str = ""
+    proxy: str = key(
+        _metrics(9464),
+        "The client proxy of the robot that ran `fogft up`; another robot's is set in its own "
+        "`proxy.yaml`.",
+        default="",
+        usual="off",
+    )
+    manager: str = key(_metrics(9465), "The manager.", default="", usual="off")
+    replica: str = key(
+        _metrics(9466),
+        "The server proxies: replica `SLOT` listens on this port plus `SLOT`. Applies to replicas "
+        "launched from then on.",
+        default="",
+        usual="off",
+    )
 
     def of_replica(self, slot: int) -> str:
         """Return the endpoint of a slot's replica."""
@@ -63,29 +144,90 @@ class MetricsSpec:
 
 @dataclass(frozen=True)
 class OnDemandSpec:
-    """How spot and on-demand machines are mixed.
+    """How spot and on-demand machines are mixed."""
 
-    Attributes:
-        base: Replicas that are always on demand.
-        fallback: Whether on-demand machines stand in while no spot machine can be had.
-    """
+    base: int = key(
+        Whole(0, MAX_REPLICAS, "machines"),
+        "Number of replicas that are always on demand; the others are spot.",
+        default=0,
+    )
+    fallback: bool = key(
+        Flag(),
+        "Whether an on-demand machine stands in while no spot machine can be had, within "
+        "`max_usd_per_hour`. When spot is back it is replaced, the new one first.",
+        default=False,
+    )
 
-    base: int = 0
-    fallback: bool = False
+
+def _group_name(written: str) -> str:
+    if not re.fullmatch(r"[a-z][a-z0-9-]{0,19}", written) or written == "critical":
+        raise ValueError
+    return written
 
 
 @dataclass(frozen=True)
 class GroupSpec:
-    """Replicas of one pool that have machines of their own kind.
+    """Replicas of one pool that have machines of their own kind."""
 
-    Attributes:
-        resources: As under `resources`, whole: the file's own with the group's on top.
-    """
+    name: str = key(
+        Text(
+            "a group's name",
+            "use lower-case letters, digits and dashes, at most 20, and not `critical`",
+            _group_name,
+        ),
+        "Name of the group: lower-case letters, digits and dashes, at most 20.",
+    )
+    replicas: int = key(
+        Whole(1, MAX_REPLICAS, "machines"),
+        f"Number of replicas in the group; at most {MAX_REPLICAS} in all groups together.",
+        default=1,
+    )
+    resources: Mapping[str, Any] = key(
+        Free("write resources as at the top level"),
+        "Merged over the file's own `resources`, key by key.",
+        default_factory=dict,
+        usual="none",
+    )
+    on_demand: OnDemandSpec = key(
+        Map(OnDemandSpec), "As the pool's, for this group.", default_factory=OnDemandSpec
+    )
 
-    name: str
-    replicas: int
-    resources: Mapping[str, Any] = field(default_factory=dict)
-    on_demand: OnDemandSpec = field(default_factory=OnDemandSpec)
+
+def _days(written: Any) -> frozenset[int]:
+    parts = written if isinstance(written, list) else str(written).split(",")
+    found: set[int] = set()
+    for part in parts:
+        first, _, last = str(part).strip().lower().partition("-")
+        for name in (first, last or first):
+            if name not in DAYS:
+                raise ValueError(f"{name!r:.40} is not a day; write `mon-fri` or `[sat, sun]`")
+        begin, end = DAYS.index(first), DAYS.index(last or first)
+        found |= {(begin + n) % 7 for n in range((end - begin) % 7 + 1)}
+    return frozenset(found)
+
+
+def _clock(written: Any) -> int:
+    """Return a time of the day in seconds. YAML 1.1 reads 18:00 as the number 1080."""
+    minutes = written if isinstance(written, int) and not isinstance(written, bool) else -1
+    match = _CLOCK.fullmatch(written) if isinstance(written, str) else None
+    if match and int(match[2]) < 60:
+        minutes = int(match[1]) * 60 + int(match[2])
+    if not 0 <= minutes <= 24 * 60:
+        raise ValueError(f"{written!r:.40} is not a time of the day; write hours and minutes: 8:30")
+    return minutes * 60
+
+
+def _clock_text(seconds: int) -> str:
+    return f"{seconds // 3600}:{seconds // 60 % 60:02}"
+
+
+_CLOCK_FORM = Special("hours:minutes", _clock, _clock_text, {"type": ["string", "integer"]})
+_DAYS_FORM = Special(
+    "days of the week",
+    _days,
+    lambda days: [DAYS[day] for day in sorted(days)],
+    {"type": ["string", "array"]},
+)
 
 
 @dataclass(frozen=True)
@@ -100,11 +242,39 @@ class WindowSpec:
         max_usd_per_hour: The cap within it; None for the pool's own.
     """
 
-    days: frozenset[int]
-    begins_s: int
-    ends_s: int
-    replicas: int | None = None
-    max_usd_per_hour: float | None = None
+    days: frozenset[int] = key(
+        _DAYS_FORM,
+        "Days on which the window begins: `mon-fri`, `sat,sun` or `[mon, wed]`.",
+        default=frozenset(range(7)),
+        usual="every day",
+    )
+    begins_s: int = key(
+        _CLOCK_FORM,
+        "Start, by the clock on the wall: windows follow daylight-saving time.",
+        name="from",
+        default=0,
+        usual="0:00",
+    )
+    ends_s: int = key(
+        _CLOCK_FORM,
+        "End; at or before `from` it is on the next day.",
+        name="to",
+        default=86_400,
+        usual="24:00",
+    )
+    replicas: int | None = key(
+        Whole(0, MAX_REPLICAS, "machines"),
+        "Number of replicas within the window. A number set by `fogft scale` overrides it.",
+        default=None,
+        usual="the pool's",
+    )
+    max_usd_per_hour: float | None = key(
+        Number(MAX_USD_PER_HOUR, "US dollars per hour"),
+        "Cap within the window. Replicas that do not fit under a lower cap are ended, the most "
+        "expensive first; one stays.",
+        default=None,
+        usual="the pool's",
+    )
 
 
 @dataclass(frozen=True)
@@ -112,13 +282,17 @@ class ScheduleSpec:
     """Replicas and cap by the time of the week.
 
     Attributes:
-        time_zone: A name of the IANA database, or ``UTC``.
-        windows: The first that holds a moment decides it.
-        prelaunch_s: So long before a window its replicas are launched.
+        prelaunch_s: Seconds before a window at which its replicas are launched.
     """
 
-    time_zone: str
-    windows: tuple[WindowSpec, ...]
+    time_zone: str = key(
+        Text("a time zone", "write a time zone, such as `time_zone: Europe/Berlin`"),
+        "IANA time zone of the windows, such as `America/Los_Angeles`, or `UTC`.",
+    )
+    windows: tuple[WindowSpec, ...] = key(
+        Maps(WindowSpec, "write `windows: [{days: mon-fri, from: 8:00, ...}]`"),
+        "The first window that holds a moment applies; outside all, the pool's own numbers.",
+    )
     prelaunch_s: float = 600.0
 
 
@@ -135,27 +309,75 @@ class MigrationSpec:
     stay_s: float = 3600.0
 
 
+def _robot_at(written: Any) -> tuple[float, float]:
+    is_pair = isinstance(written, list) and len(written) == 2
+    if not is_pair or any(isinstance(n, bool) or not isinstance(n, (int, float)) for n in written):
+        raise ValueError(
+            f"must be a latitude and a longitude, not {written!r:.40}; "
+            "write degrees, such as `[37.87, -122.26]`"
+        )
+    if not (-90 <= written[0] <= 90 and -180 <= written[1] <= 180):
+        raise ValueError(
+            f"{written!r:.40} is not on Earth; write `[latitude, longitude]` in degrees"
+        )
+    return float(written[0]), float(written[1])
+
+
+def _location(written: str) -> str:
+    if not _LOCATION.fullmatch(written):
+        raise ValueError
+    return written
+
+
 @dataclass(frozen=True)
 class PlacementSpec:
     """How locations are weighed, and what is known of distances.
 
     Attributes:
-        robot_at: Latitude and longitude in degrees, for estimates; None for unknown.
         rtt_s: ``cloud/region`` or ``cloud`` -> round trip in seconds; goes before measurements.
     """
 
-    weights: Weights = field(default_factory=Weights)
-    robot_at: tuple[float, float] | None = None
-    rtt_s: Mapping[str, float] = field(default_factory=dict)
+    weights: Weights = within(Weights)
+    robot_at: tuple[float, float] | None = key(
+        Special(
+            "latitude and longitude",
+            _robot_at,
+            lambda at: list(at or ()),
+            {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
+        ),
+        "Where the robot is, in degrees: distances are estimated where they cannot be measured.",
+        default=None,
+        usual="unknown",
+    )
+    rtt_s: Mapping[str, float] = key(
+        Table(
+            Number(60, "seconds"),
+            Text("a `cloud/region`", "write a place such as `aws/us-west-2`", _location),
+        ),
+        "Round trips that you know better than fogft, by `cloud/region`, such as "
+        "`{aws/us-west-2: 0.021}`.",
+        default_factory=dict,
+        usual="measured",
+    )
 
 
 @dataclass(frozen=True)
 class TrafficSpec:
     """What is asked of one service, for costs. Zero where it is not said."""
 
-    requests_per_s: float = 0.0
-    request_bytes: float = 0.0
-    response_bytes: float = 0.0
+    requests_per_s: float = key(
+        Number(1e6, "requests", from_zero=True), "Mean over the whole month.", default=0.0
+    )
+    request_bytes: float = key(
+        Number(1e10, "bytes", from_zero=True),
+        "Size of one request; clouds do not charge for what comes in.",
+        default=0.0,
+    )
+    response_bytes: float = key(
+        Number(1e10, "bytes", from_zero=True),
+        "Size of one response; each replica that is asked sends one.",
+        default=0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -163,14 +385,25 @@ class FallbackSpec:
     """The service on the robot that answers when the replicas do not.
 
     Attributes:
-        service: Its name; of the same type.
-        after_s: Ask it so long after the request came, beside the replicas; None for not
-            before the deadline.
-        while_none_ready: Ask it at once while no replica is ready.
         limit_s: How long its answer is awaited past the deadline.
     """
 
-    service: str
-    after_s: float | None = None
-    while_none_ready: bool = False
+    service: str = key(
+        Text("a service name", "write the name of a service on the robot", service_name),
+        "Service of the same type that runs on the robot.",
+        name="name",
+    )
+    after_s: float | None = key(
+        Number(DAY_S, "seconds"),
+        "Ask it this long after the request came, beside the replicas: the first answer wins. "
+        "Below `timeout_s`.",
+        default=None,
+        usual="at the deadline",
+    )
+    while_none_ready: bool = key(
+        Flag(),
+        "Ask it at once while no replica is ready. The service is then offered on the robot from "
+        "the start.",
+        default=False,
+    )
     limit_s: float = 1.0

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from fogft.model import keys
+
 
 @dataclass(frozen=True)
 class CredentialPaths:
     """Where a process finds its certificate, its key and the pool's CA."""
 
-    ca: Path
-    certificate: Path
-    key: Path
+    ca: Path = keys.key(keys.PATH, "The pool's certificate authority.")
+    certificate: Path = keys.key(keys.PATH, "Certificate of this process.")
+    key: Path = keys.key(keys.PATH, "Its private key.")

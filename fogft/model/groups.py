@@ -81,7 +81,7 @@ def _groups_of(spec: PoolSpec) -> tuple[Group, ...]:
 
 def critical_services(spec: PoolSpec) -> tuple[ServiceSpec, ...]:
     """Return the services that ask for a number of replicas of their own."""
-    return tuple(service for service in spec.services if service.replicas)
+    return tuple(service for service in spec.services if service.min_replicas)
 
 
 def critical_group(spec: PoolSpec, wanted: int) -> Group:
@@ -94,7 +94,7 @@ def critical_group(spec: PoolSpec, wanted: int) -> Group:
     key = CRITICAL, wanted
     if key not in spec.derived:
         last = groups_of(spec)[-1]
-        most = max((service.replicas for service in spec.services), default=0)
+        most = max((service.min_replicas for service in spec.services), default=0)
         spec.derived[key] = Group(
             CRITICAL,
             last.offers,

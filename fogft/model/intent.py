@@ -15,7 +15,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fogft.errors import FogftError, StateError
-from fogft.model.spec import MAX_REPLICAS, PoolSpec
+from fogft.model.choices import MAX_REPLICAS
+from fogft.model.spec import PoolSpec
 
 LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
 
@@ -86,7 +87,7 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
             f"cannot scale `{spec.name}` to {wanted} replicas: at most {MAX_REPLICAS} can be had"
         )
     for service in spec.services:
-        if service.quorum > max(wanted, service.replicas):
+        if service.quorum > max(wanted, service.min_replicas):
             raise FogftError(
                 f"cannot scale `{spec.name}` to {wanted} replicas: `{service.name}` has a quorum "
                 f"of {service.quorum}, and no answer could win",

@@ -19,8 +19,7 @@ from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.certificate_holder import holder_of
-from fogft.model.endpoint import is_endpoint
-from fogft.model.names import POOL_UID_PATTERN
+from fogft.model.names import POOL_UID_PATTERN, is_endpoint
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import Topology

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from fogft.model.keys import OneOf, key
+
 
 class Speaks(str, Enum):
     """How a proxy speaks ROS."""
@@ -18,12 +20,15 @@ class Speaks(str, Enum):
 
 @dataclass(frozen=True)
 class Middleware:
-    """How each side's proxy speaks ROS.
+    """How each side's proxy speaks ROS."""
 
-    Attributes:
-        robot: The client proxy of every robot.
-        replica: The server proxy of every replica.
-    """
-
-    robot: Speaks = Speaks.RCLPY
-    replica: Speaks = Speaks.RCLPY
+    robot: Speaks = key(
+        OneOf(Speaks),
+        "How every robot's client proxy talks to the robot's nodes.",
+        default=Speaks.RCLPY,
+    )
+    replica: Speaks = key(
+        OneOf(Speaks),
+        "How every replica's server proxy talks to what `run` starts; a change replaces replicas.",
+        default=Speaks.RCLPY,
+    )

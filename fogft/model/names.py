@@ -14,6 +14,18 @@ import re
 
 REQUEST_ID_BYTES = 16
 GATEWAY_SLOTS = 1 << 32  # from here on, slots are gateways
+# SkyPilot's names of clouds, kept so that reading a pool file needs no SkyPilot;
+# `tests/sky/test_installed.py` holds them to the installed one's.
+VM_CLOUDS = (
+    *("aws", "azure", "cudo", "do", "fluidstack", "gcp", "hyperbolic", "ibm", "lambda", "mithril"),
+    *("nebius", "oci", "paperspace", "primeintellect", "runpod", "scp", "seeweb", "shadeform"),
+    *("vast", "verda", "vsphere", "yotta"),
+)
+# SkyPilot can use them, but they have no machines of their own to replicate on.
+NO_VM_CLOUDS = ("k8s", "kubernetes", "slurm", "ssh")
+# Where a replica may learn that its machine will be preempted; also `file:PATH` and `none`.
+NOTICE_SOURCES = ("auto", "aws", "azure", "gcp")
+ROBOT_BYTES_LIMIT = 64  # of a robot's name
 POOL_UID_PATTERN = re.compile(r"[0-9a-f]{16}")
 POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
@@ -91,3 +103,19 @@ def rendezvous_certificate_name(pool_uid: str, rendezvous: str, generation: int 
 def manager_certificate_name(pool_uid: str) -> str:
     """Return the common name of the certificate whose key signs the pool's membership."""
     return f"manager.manager.1.{pool_uid}"
+
+
+def is_endpoint(text: str) -> bool:
+    """Whether this is ``host:port``; an IPv6 address stands in brackets."""
+    host, _, port = text.rpartition(":")
+    in_brackets = host.startswith("[") and host.endswith("]")
+    if not host or not (in_brackets or ":" not in host) or not host.isascii():
+        return False
+    return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
+
+
+def endpoint(written: str) -> str:
+    """Return ``host:port`` as it is. Raises ValueError where it is none."""
+    if not is_endpoint(written):
+        raise ValueError
+    return written

@@ -79,3 +79,39 @@ def suggested_service_type(name: str) -> str:
 def is_field_name(name: str) -> bool:
     """Whether a ROS message may have a field of this name."""
     return bool(_FIELD.fullmatch(name))
+
+
+def service_name(written: str) -> str:
+    """Return a service's or topic's absolute name. Raises ValueError with what is wrong."""
+    return absolute_service_name(written)
+
+
+def service_type(written: str) -> str:
+    """Return a service type's name as it is. Raises ValueError."""
+    return _form(written, is_service_type(written))
+
+
+def message_type(written: str) -> str:
+    """Return a message type's name as it is. Raises ValueError."""
+    return _form(written, is_type(written, "msg"))
+
+
+def action_type(written: str) -> str:
+    """Return an action type's name as it is. Raises ValueError."""
+    return _form(written, is_type(written, "action"))
+
+
+def field_name(written: str) -> str:
+    """Return a field's name as it is. Raises ValueError."""
+    return _form(written, is_field_name(written))
+
+
+def field_path(written: str) -> str:
+    """Return a field's path, such as ``plan.cost``, as it is. Raises ValueError."""
+    return _form(written, all(map(is_field_name, written.split("."))))
+
+
+def _form(written: str, is_right: bool) -> str:
+    if not is_right:
+        raise ValueError
+    return written

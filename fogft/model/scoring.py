@@ -17,6 +17,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from fogft.model.keys import Number, key
 from fogft.model.replica import Offer, Placement
 
 # Below these, less no longer matters.
@@ -35,7 +36,12 @@ class Weights:
     """
 
     price: float = 1.0
-    latency: float = 1.0
+    latency: float = key(
+        Number(100, "times", from_zero=True),
+        "Weight of a percent of round trip against a percent of price; 0 to ignore distance.",
+        name="latency_weight",
+        default=1.0,
+    )
 
 
 @dataclass(frozen=True)

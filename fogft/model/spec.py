@@ -1,4 +1,4 @@
-"""What a pool file asks for, as values. Reading and judging the file is `spec_reader`'s."""
+"""What a pool file asks for, as values. Each field made by `key` is a key of the file."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from functools import cached_property
 from typing import Any
 
 from fogft.model.choices import (
+    MAX_REPLICAS,
+    MAX_USD_PER_HOUR,
     AvailabilitySpec,
     Compression,
     FallbackSpec,
@@ -23,13 +25,23 @@ from fogft.model.choices import (
     ScheduleSpec,
     TrafficSpec,
 )
+from fogft.model.keys import DAY_S, Flag, Listed, Map, Maps, Number, OneOf, Table, Text, Whole, key
 from fogft.model.middleware import Middleware, Speaks
-from fogft.model.topic import TopicSpec
+from fogft.model.names import endpoint
+from fogft.model.ros_names import (
+    field_name,
+    field_path,
+    service_name,
+    service_type,
+    suggested_service_type,
+)
+from fogft.model.state import StateSpec
+from fogft.model.topic import ActionSpec, TopicSpec
 from fogft.model.topology import Topology
-from fogft.model.uplinks import UplinkPolicy
-from fogft.poolfile.state import StateSpec
+from fogft.model.uplinks import UplinkPolicy, interface
 
-MAX_REPLICAS = 16
+CONCURRENCY_LIMIT = 512  # a replica holds no more requests
+MAX_HOURS = 8000  # the certificates last 365 days
 # Keys of `resources` that say where a machine may be, not what it is.
 _WHEREABOUTS = frozenset({"infra", "cloud", "region", "zone", "any_of", "ordered", "job_recovery"})
 
@@ -67,52 +79,164 @@ class Part(str, Enum):
     CANCEL = "cancel"
 
 
+def _service_hint(key: str) -> str:
+    return f"write a service's name, such as `{key}: /detect_{key}`"
+
+
 @dataclass(frozen=True)
 class ServiceSpec:
     """One proxied service.
 
     Attributes:
-        timeout_s: From the request's arrival at the client proxy to its deadline.
-        ok_field: Name of a boolean response field that must be true while another
-            attempt is left; empty for none.
         hedging_budget: Extra copies under `adaptive`, as a share of requests.
-        replicas: At least so many carry it; 0 for as many as the pool has.
-        traffic: What is asked of it, for costs.
-        concurrency: Requests that a replica gives the service at once; 0 to learn it.
-        fallback: Who answers at the deadline, or before; only with `on_timeout: fallback`.
-        advertise: When the service is offered on the robot; None for what `advertised` says.
-        trace: Whether each request leaves a line in the client proxy's `trace.jsonl`.
-        cancel: Name of the service's cancel service (`std_srvs/srv/Trigger`); empty for none.
-        quorum: The answer is the one that so many replicas agree on; 1 for the first.
-        tolerance: Path of a float field of the response -> how far apart still agrees.
-        state: How its state is taken and given; None for a service that keeps none.
-        uplinks: Which of the robot's uplinks its requests take.
-        freshness: Which goes first where several wait.
-        compression: Whether payloads are compressed on thin links.
         part: Which part of an action it is.
     """
 
-    name: str
-    type: str
-    timeout_s: float = 10.0
-    on_timeout: OnTimeout = OnTimeout.SILENT
-    ok_field: str = ""
-    hedging: HedgingMode = HedgingMode.ALL
+    name: str = key(
+        Text("a service name", "write a name such as `/detect`", service_name),
+        "Name of the service, on the robot and on the replicas; `detect` is `/detect`.",
+        on_replica=True,
+    )
+    type: str = key(
+        Text(
+            "a service type",
+            "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`",
+            service_type,
+            suggested_service_type,
+        ),
+        "Its type. It must be installed on the robot; with `rmw: zenoh` only where a policy looks "
+        "into responses.",
+        on_replica=True,
+    )
+    timeout_s: float = key(
+        Number(DAY_S, "seconds"),
+        "Time from the request's arrival at the client proxy to its deadline.",
+        default=10.0,
+        parameter=True,
+    )
+    on_timeout: OnTimeout = key(
+        OneOf(OnTimeout),
+        "What the caller gets at the deadline: no response (`silent`; an empty list of obstacles "
+        "is never mistaken for a clear road), a default-constructed one (`empty`), or that of a "
+        "service on the robot (`fallback`).",
+        default=OnTimeout.SILENT,
+        parameter=True,
+    )
+    ok_field: str = key(
+        Text("the name of a field", "name a boolean field, such as `success`", field_name),
+        "Boolean field of the response. While it is false, another replica's response is awaited.",
+        default="",
+        usual="none",
+        parameter=True,
+    )
+    hedging: HedgingMode = key(
+        OneOf(HedgingMode),
+        "How many replicas get a request: every one at once (`all`), the best one and the next "
+        "when that takes unusually long (`adaptive`), or one and another when that fails "
+        "(`failover`).",
+        default=HedgingMode.ALL,
+        parameter=True,
+    )
     hedging_budget: float = 0.1
-    replicas: int = 0
-    traffic: TrafficSpec = field(default_factory=TrafficSpec)
-    concurrency: int = 0
-    cancel: str = ""
-    quorum: int = 1
-    tolerance: tuple[tuple[str, float], ...] = ()
-    state: StateSpec | None = None
-    fallback: FallbackSpec | None = None
-    trace: bool = False
-    uplinks: UplinkPolicy = UplinkPolicy.PREFER
-    freshness: Freshness = Freshness.EVERY
-    compression: Compression = Compression.AUTO
-    advertise: Advertise | None = None
-    part: Part = Part.NONE
+    min_replicas: int = key(
+        Whole(1, MAX_REPLICAS, "machines"),
+        "Replicas that carry this service, where that is more than the pool has. The additional "
+        "ones carry such services alone; `run` finds their names in `FOGFT_SERVICES`.",
+        default=0,
+        usual="as the pool",
+    )
+    traffic: TrafficSpec = key(
+        Map(TrafficSpec, "write `{requests_per_s: 10, request_bytes: 100000}`"),
+        "Load on the service, for the costs that `fogft plan` shows; measured where it is not set.",
+        default_factory=TrafficSpec,
+    )
+    concurrency: int = key(
+        Whole(1, CONCURRENCY_LIMIT, "requests"),
+        "Requests that a replica gives the service at once.",
+        default=0,
+        usual="learned",
+        on_replica=True,
+    )
+    cancel: str = key(
+        Text("a service name", _service_hint("cancel"), service_name),
+        "Service (`std_srvs/srv/Trigger`) that cancels the request at work, called when the robot "
+        "has its answer from elsewhere.",
+        default="",
+        usual="none",
+        on_replica=True,
+    )
+    quorum: int = key(
+        Whole(2, MAX_REPLICAS, "replicas"),
+        "Return the response that this many replicas agree on, for deterministic services. A "
+        "replica that disagrees 3 times in 20 no longer counts and is replaced.",
+        default=1,
+        usual="the first",
+    )
+    tolerance: tuple[tuple[str, float], ...] = key(
+        Table(
+            Number(1e12, "the field's own"),
+            Text("the path of a field", "write a path such as `plan.cost`", field_path),
+            as_pairs=True,
+        ),
+        "With `quorum`: how far apart two values of a float field may be, such as "
+        "`{plan.poses.pose.position.x: 0.01}`. All else must be equal.",
+        default=(),
+        usual="none",
+    )
+    state: StateSpec | None = key(
+        Map(StateSpec, "write `state: {snapshot: /svc/get_state, restore: /svc/set_state}`"),
+        "The service keeps state: all replicas apply all requests in one order, and a new replica "
+        "is given the state of another.",
+        default=None,
+        usual="none",
+        on_replica=True,
+    )
+    fallback: FallbackSpec | None = key(
+        Map(FallbackSpec, "name a service on the robot, such as `{name: /detect_onboard}`"),
+        "With `on_timeout: fallback`: the service on the robot that answers instead.",
+        name="fallback_service",
+        default=None,
+        usual="none",
+    )
+    freshness: Freshness = key(
+        OneOf(Freshness),
+        "Which request goes first where several wait: the one with the nearest deadline (`every`), "
+        "or the newest (`latest`), for services whose older requests are worth less.",
+        default=Freshness.EVERY,
+        on_replica=True,
+    )
+    trace: bool = key(
+        Flag(),
+        "Write a line for each request to the client proxy's `trace.jsonl`.",
+        default=False,
+        advanced=True,
+        parameter=True,
+    )
+    uplink_policy: UplinkPolicy = key(
+        OneOf(UplinkPolicy),
+        "With several `uplinks`: use the first that is up (`prefer`), one until it fails "
+        "(`failover`), or all at once (`all`).",
+        default=UplinkPolicy.PREFER,
+        advanced=True,
+    )
+    compression: Compression = key(
+        OneOf(Compression),
+        "Compress payloads on slow links where that is measured to pay (`auto`), or never (`off`).",
+        default=Compression.AUTO,
+        advanced=True,
+    )
+    advertise: Advertise | None = key(
+        OneOf(Advertise),
+        "When the robot sees the service: while a replica can answer (`while_ready`), from the "
+        "first that can (`once_ready`), or from the start (`always`).",
+        default=None,
+        usual="by policy",
+        advanced=True,
+        parameter=True,
+    )
+    part: Part = key(
+        OneOf(Part), "Part of an action.", default=Part.NONE, internal=True, on_replica=True
+    )
 
     @property
     def needs_type(self) -> bool:
@@ -134,19 +258,29 @@ class ServiceSpec:
 
 @dataclass(frozen=True)
 class HealthSpec:
-    """When a replica is doubted, and when it is replaced. Seconds.
+    """When a replica is doubted, and when it is replaced."""
 
-    Attributes:
-        suspect_after_s: Probes unanswered for so long: nothing more is sent there.
-        replace_after_s: Suspect for so long, while others answer: it is replaced.
-        start_limit_s: Not ready so long after its launch: the launch has failed.
-        orphan_after_s: A replica that hears of no manager for so long ends itself.
-    """
+    suspect_after_s: float = key(
+        Number(3600, "seconds"),
+        "Mark a replica suspect after this long without a probe reply; nothing more is sent "
+        "there. A slow service never counts.",
+        default=2.0,
+    )
+    replace_after_s: float = key(
+        Number(DAY_S, "seconds"),
+        "Replace a replica that has been suspect for this long while others answer. The only "
+        "replica: after four times as long.",
+        default=15.0,
+    )
+    start_limit_s: float = key(
+        Number(DAY_S, "seconds"),
+        "Give up on a launch that is not ready after this long.",
+        default=900.0,
+    )
 
-    suspect_after_s: float = 2.0
-    replace_after_s: float = 15.0
-    start_limit_s: float = 900.0
-    orphan_after_s: float = 3600.0
+
+def _endpoint(hint: str) -> Text:
+    return Text("`host:port`", hint, endpoint)
 
 
 @dataclass(frozen=True)
@@ -155,48 +289,160 @@ class PoolSpec:
 
     Attributes:
         name: The pool's name: lower-case letters, digits and dashes, at most 40.
-        services: At least one, names distinct.
+        services: Names distinct; the services of actions are among them.
         replicas: How many should be ready. With groups: their sum. With an availability
             target: the fewest.
-        max_surge: How many more may exist while one replaces another.
-        max_usd_per_hour: Cap on the price of all machines together, surge included;
-            None for no cap.
-        max_hours: After so many hours the pool ends by itself; None for never.
         availability: A target from which the number follows; None for none.
         groups: Kinds of machines; none for one kind, the task's `resources`.
-        on_demand: How spot and on-demand are mixed, where there are no groups.
         migration: When a replica moves to a better location; None for never.
-        rendezvous: ``host:port`` of each rendezvous.
-        dial_in: ``host:port`` where replicas dial the robot; empty where the robot dials them.
-        topology: Who talks through whom.
-        uplinks: Network interfaces of this machine's robot, the preferred one first; none for
-            whatever its routes say.
-        metrics: Where processes listen for Prometheus.
         topics: What passes besides services; those of actions are among them.
-        rmw: How the proxies speak ROS.
         task: The SkyPilot task: the file without its `fogft` section.
     """
 
-    name: str
-    services: tuple[ServiceSpec, ...]
-    replicas: int = 2
-    max_surge: int = 1
-    max_usd_per_hour: float | None = None
-    max_hours: float | None = None
-    health: HealthSpec = field(default_factory=HealthSpec)
-    availability: AvailabilitySpec | None = None
-    placement: PlacementSpec = field(default_factory=PlacementSpec)
-    on_demand: OnDemandSpec = field(default_factory=OnDemandSpec)
-    groups: tuple[GroupSpec, ...] = ()
-    schedule: ScheduleSpec | None = None
-    migration: MigrationSpec | None = field(default_factory=MigrationSpec)
-    rendezvous: tuple[str, ...] = ()
-    dial_in: str = ""
-    topology: Topology = field(default_factory=Topology)
-    uplinks: tuple[str, ...] = ()
-    metrics: MetricsSpec = field(default_factory=MetricsSpec)
-    topics: tuple[TopicSpec, ...] = ()
-    rmw: Middleware = field(default_factory=Middleware)
+    name: str = ""
+    services: tuple[ServiceSpec, ...] = key(
+        Maps(
+            ServiceSpec,
+            "write a list, such as `services: [{name: /detect, type: my_msgs/srv/Detect}]`",
+        ),
+        "The services that the robot calls and the replicas run. Left out: what `run` advertises, "
+        "without the services of ROS itself.",
+        default=(),
+        usual="what `run` advertises",
+    )
+    replicas: int = key(
+        Whole(1, MAX_REPLICAS, "machines"), "Number of replicas to keep ready.", default=2
+    )
+    max_surge: int = key(
+        Whole(0, 4, "machines"),
+        "Additional machines while one replaces another. With 0, one that still serves is replaced "
+        "only where the file has changed, and ends before its successor begins.",
+        default=1,
+    )
+    max_usd_per_hour: float | None = key(
+        Number(MAX_USD_PER_HOUR, "US dollars per hour"),
+        "Cap on the price of all machines together, those being launched or ended included. "
+        "Without headroom a launch waits, and `fogft status` says so.",
+        default=None,
+        usual="no cap",
+    )
+    max_hours: float | None = key(
+        Number(MAX_HOURS, "hours"),
+        "Hours after `fogft up` at which the pool shuts down: replicas, client proxy and manager.",
+        default=None,
+        usual="never",
+    )
+    health: HealthSpec = key(
+        Map(HealthSpec), "When a replica is doubted and replaced.", default_factory=HealthSpec
+    )
+    availability: AvailabilitySpec | None = key(
+        Map(AvailabilitySpec, short=("target",)),
+        "How often a replica must answer; the number of replicas follows, and `replicas` is the "
+        "least. `0.9995` is short for `{target: 0.9995}`.",
+        default=None,
+        usual="none",
+    )
+    placement: PlacementSpec = key(
+        Map(PlacementSpec),
+        "How price and distance are weighed, and what is known of distances. Failure domains count "
+        "first.",
+        default_factory=PlacementSpec,
+    )
+    on_demand: OnDemandSpec = key(
+        Map(OnDemandSpec),
+        "How spot and on-demand machines are mixed; what is not on demand is then spot.",
+        default_factory=OnDemandSpec,
+    )
+    groups: tuple[GroupSpec, ...] = key(
+        Maps(GroupSpec, "write `groups: [{name: anchor, replicas: 1, ...}]`"),
+        "Replicas with machines of different kinds, at most eight groups, in place of `replicas` "
+        "and `on_demand`. Add new ones at the end: a group is known by its place in the list.",
+        default=(),
+        usual="none",
+    )
+    schedule: ScheduleSpec | None = key(
+        Map(ScheduleSpec, "write `time_zone` and `windows`"),
+        "Replicas and cap by the time of the week.",
+        default=None,
+        usual="none",
+    )
+    migration: MigrationSpec | None = key(
+        Map(MigrationSpec, "write `migration: false`, or remove it", off=True),
+        "`false`: never move a replica to a cheaper or nearer location.",
+        default_factory=MigrationSpec,
+        advanced=True,
+        usual="moves for 30 % less",
+    )
+    rendezvous: tuple[str, ...] = key(
+        Listed(_endpoint("write a list, such as `rendezvous: [meet.example.org:7450]`"), 4),
+        "Where `fogft rendezvous` runs, for pools with several robots, gateways, or replicas whose "
+        "address the cloud does not know.",
+        default=(),
+        usual="none",
+    )
+    dial_in: str = key(
+        _endpoint(
+            "write the robot's own address and a port, such as `dial_in: robot.example.org:7460`"
+        ),
+        "Robot's own address, for replicas that cannot be reached: they dial the robot.",
+        default="",
+        usual="none",
+    )
+    topology: Topology = key(
+        Map(Topology),
+        "Gateways, and who uses them. Needs a `rendezvous`.",
+        default_factory=Topology,
+    )
+    uplinks: tuple[str, ...] = key(
+        Listed(
+            Text(
+                "a network interface's name",
+                "write what `ip link` lists, such as `uplinks: [wlan0, wwan0]`",
+                interface,
+            ),
+            4,
+        ),
+        "Network interfaces of this machine's robot to use at once, the preferred one first. Each "
+        "needs a route of its own to the replicas.",
+        default=(),
+        usual="by route",
+    )
+    metrics: MetricsSpec = key(
+        Map(MetricsSpec, "write a map, such as `metrics: {proxy: 127.0.0.1:9464}`"),
+        "Where processes answer Prometheus (`GET /metrics`).",
+        default_factory=MetricsSpec,
+    )
+    topics: tuple[TopicSpec, ...] = key(
+        Maps(
+            TopicSpec,
+            "write a list, such as "
+            "`topics: [{name: /map, type: nav_msgs/msg/OccupancyGrid, from: robot}]`",
+        ),
+        "Topics that pass between the robot and the replicas. Not with `topology`.",
+        default=(),
+        usual="none",
+    )
+    rmw: Middleware = key(
+        Map(Middleware, short=("robot", "replica")),
+        "How the proxies speak ROS: `rclpy`, by the ROS 2 that is installed where they run, or "
+        "`zenoh`, as nodes of `rmw_zenoh` do, with no ROS installed. One word for both sides, or a "
+        "map.",
+        default_factory=Middleware,
+    )
+    actions: tuple[ActionSpec, ...] = key(
+        Maps(
+            ActionSpec,
+            "write a list, such as `actions: [{name: /move, type: my_msgs/action/Move}]`",
+        ),
+        "Actions that every replica runs. Not with `topology`.",
+        default=(),
+        usual="none",
+    )
+    orphan_after_s: float = key(
+        Number(30 * DAY_S, "seconds"),
+        "A replica that hears of no manager for this long shuts its machine down.",
+        default=3600.0,
+    )
     task: Mapping[str, Any] = field(default_factory=dict)
     discovered: tuple[ServiceSpec, ...] = ()
 
@@ -228,7 +474,7 @@ class PoolSpec:
         """
         asked: dict[str, Any] = {
             "services": sorted(_run_by_replica(s) for s in services),
-            "orphan_after_s": self.health.orphan_after_s,
+            "orphan_after_s": self.orphan_after_s,
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
         }
         if self.topics:

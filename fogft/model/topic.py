@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+
+from fogft.model.keys import DAY_S, Flag, Number, OneOf, Text, Whole, key
+from fogft.model.ros_names import action_type, message_type, service_name
 
 PREFIX = "topic "  # of a topic's name on the wire, where it stands beside services
 DEPTH_LIMIT = 1000
@@ -39,21 +40,55 @@ class Quality:
 
 @dataclass(frozen=True)
 class TopicSpec:
-    """One proxied topic.
+    """One proxied topic."""
 
-    Attributes:
-        depth: Messages that are kept for who is slow, or comes later where it is latched.
-        reliable: Quality of service at both ends; best effort where false.
-        latched: Whether who comes later gets the last `depth` messages (transient local).
-    """
-
-    name: str
-    type: str
-    origin: Origin
-    select: Select = Select.LEADER
-    depth: int = 10
-    reliable: bool = True
-    latched: bool = False
+    name: str = key(
+        Text("the name of a topic", "write a name such as `/topic`", service_name),
+        "Name of the topic, on the robot and on the replicas.",
+        on_replica=True,
+    )
+    type: str = key(
+        Text(
+            "a message type",
+            "write `package/msg/Name`, such as `type: sensor_msgs/msg/Image`",
+            message_type,
+        ),
+        "Its type; it must be installed on the robot.",
+        on_replica=True,
+    )
+    origin: Origin = key(
+        OneOf(Origin),
+        "Who publishes it. `robot`: each message goes to every replica. `replicas`: what they "
+        "publish comes to the robot, duplicates dropped.",
+        name="from",
+        on_replica=True,
+    )
+    select: Select = key(
+        OneOf(Select, hidden=(Select.GOAL, Select.STATUS)),
+        "With `from: replicas`, which messages the robot gets: those of one replica at a time "
+        "(`leader`), the first with each `header.stamp` (`stamp`), or every one (`all`).",
+        default=Select.LEADER,
+        on_replica=True,
+    )
+    depth: int = key(
+        Whole(1, DEPTH_LIMIT, "messages"),
+        "Messages kept for a slow subscriber, and of a latched topic for a late one.",
+        default=10,
+        on_replica=True,
+    )
+    reliable: bool = key(
+        Flag(),
+        "Reliability at both ends; a publisher that offers best effort only needs `false`.",
+        default=True,
+        on_replica=True,
+    )
+    latched: bool = key(
+        Flag(),
+        "Transient local at both ends: nodes and replicas that come later get the last `depth` "
+        "messages.",
+        default=False,
+        on_replica=True,
+    )
 
     @property
     def key_name(self) -> str:
@@ -65,32 +100,30 @@ class TopicSpec:
         """The quality of service that both ends ask ROS for."""
         return Quality(self.depth, self.reliable, self.latched)
 
-    def to_plain(self) -> dict[str, Any]:
-        """Return what a configuration file says of it; defaults are left out."""
-        return {
-            field.name: getattr(value, "value", value)
-            for field in fields(TopicSpec)
-            if (value := getattr(self, field.name)) != field.default
-        }
 
-    @classmethod
-    def from_plain(cls, raw: Mapping[str, Any]) -> TopicSpec:
-        """Return the topic of a configuration file.
+@dataclass(frozen=True)
+class ActionSpec:
+    """One proxied action: three services and two topics."""
 
-        Raises:
-            KeyError: Name, type or origin are missing.
-            ValueError: A value is out of range or unknown.
-            TypeError: A value is of the wrong type.
-        """
-        depth = int(raw.get("depth") or cls.depth)
-        if not 1 <= depth <= DEPTH_LIMIT:
-            raise ValueError(f"a depth of {depth}")
-        return cls(
-            name=str(raw["name"]),
-            type=str(raw["type"]),
-            origin=Origin(raw["origin"]),
-            select=Select(raw.get("select") or cls.select),
-            depth=depth,
-            reliable=bool(raw.get("reliable", True)),
-            latched=bool(raw.get("latched", False)),
-        )
+    name: str = key(
+        Text("the name of an action", "write a name such as `/action`", service_name),
+        "Name of the action, on the robot and on the replicas.",
+    )
+    type: str = key(
+        Text(
+            "an action type",
+            "write `package/action/Name`, such as `type: nav2_msgs/action/Spin`",
+            action_type,
+        ),
+        "Its type; it must be installed on the robot.",
+    )
+    timeout_s: float = key(
+        Number(DAY_S, "seconds"),
+        "Time until a goal is accepted or refused, or a cancellation answered.",
+        default=10.0,
+    )
+    result_timeout_s: float = key(
+        Number(30 * DAY_S, "seconds"),
+        "Time until a goal has its result; then there is no answer.",
+        default=3600.0,
+    )

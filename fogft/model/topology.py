@@ -11,15 +11,27 @@ Not here: the pool file's section (`fogft.poolfile.topology`), links (`fogft.pro
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.certificate_holder import NAME_PATTERN, Holder, Role
-from fogft.model.endpoint import is_endpoint
+from fogft.model.keys import Listed, Maps, Text, key
+from fogft.model.names import endpoint as is_reached_at
+from fogft.model.names import is_endpoint
 
 GATEWAYS_LIMIT = 64
 ROBOTS_LIMIT = 512
+
+
+def _is_name(written: str) -> str:
+    if not NAME_PATTERN.fullmatch(written):
+        raise ValueError
+    return written
+
+
+_NAME = Text("a name", "use letters, digits and dashes, 28 at most", _is_name)
+_NAMES = Listed(_NAME, GATEWAYS_LIMIT, least=0)
 
 
 @dataclass(frozen=True)
@@ -27,15 +39,34 @@ class Gateway:
     """A gateway as the pool file describes it.
 
     Attributes:
-        endpoint: ``host:port`` where robots and other gateways reach it.
-        through: Names of the gateways that it goes through itself; none for the replicas.
         generations: Of its certificates that are good; more than one while they change.
     """
 
-    name: str
-    endpoint: str
-    through: tuple[str, ...] = ()
+    name: str = key(_NAME, "Name of the gateway, as in its certificate.")
+    endpoint: str = key(
+        Text(
+            "`host:port`",
+            "write where robots reach it, such as `endpoint: edge.example.org:7470`",
+            is_reached_at,
+        ),
+        "Address where robots and other gateways reach it.",
+    )
+    through: tuple[str, ...] = key(
+        _NAMES,
+        "Gateways that it forwards to itself; none for the replicas. A loop is an error.",
+        name="upstream",
+        default=(),
+        usual="the replicas",
+    )
     generations: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class RobotRoute:
+    """The gateways of one robot."""
+
+    name: str = key(_NAME, "Name of the robot, as in its certificate.")
+    gateways: tuple[str, ...] = key(_NAMES, "Its gateways; `[]` for the replicas themselves.")
 
 
 @dataclass(frozen=True)
@@ -44,13 +75,43 @@ class Topology:
 
     Attributes:
         gateways: All of them, names distinct.
-        robots: Name of a robot -> the gateways that it goes through; none for the replicas.
-        through: The gateways of every robot that is not among `robots`.
+        routes: The gateways of some robots.
+        through: The gateways of every other robot.
     """
 
-    gateways: tuple[Gateway, ...] = ()
-    robots: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    through: tuple[str, ...] = ()
+    gateways: tuple[Gateway, ...] = key(
+        Maps(
+            Gateway,
+            "write a list, such as `gateways: [{name: edge, endpoint: edge.example.org:7470}]`",
+            GATEWAYS_LIMIT,
+        ),
+        "The gateways of the pool.",
+        default=(),
+    )
+    routes: tuple[RobotRoute, ...] = key(
+        Maps(
+            RobotRoute,
+            "write a list, such as `robots: [{name: ada, gateways: [edge]}]`",
+            ROBOTS_LIMIT,
+        ),
+        "Robots that do not use `default_gateways`.",
+        name="robots",
+        default=(),
+        usual="none",
+    )
+    through: tuple[str, ...] = key(
+        _NAMES,
+        "Gateways of every robot that `robots` does not name; none for the replicas themselves. "
+        "Of several, one gets a request, and another when that is late or lost.",
+        name="default_gateways",
+        default=(),
+        usual="the replicas",
+    )
+
+    @property
+    def robots(self) -> dict[str, tuple[str, ...]]:
+        """Name of a robot -> its gateways; none for the replicas."""
+        return {route.name: route.gateways for route in self.routes}
 
     def __bool__(self) -> bool:
         """Whether there is any gateway."""
@@ -114,8 +175,8 @@ class Topology:
                 raise ValueError("an endpoint that is not host:port")
             if len(raw["robots"]) > ROBOTS_LIMIT:
                 raise ValueError("too many robots")
-            robots = {_name(name): _names(through) for name, through in raw["robots"].items()}
-            topology = cls(gateways, robots, _names(raw["through"]))
+            routes = tuple(RobotRoute(_name(n), _names(g)) for n, g in raw["robots"].items())
+            topology = cls(gateways, routes, _names(raw["through"]))
         except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
             raise StateError(f"not a topology: {error}") from error
         wrong = trouble(topology)

@@ -24,63 +24,22 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from fogft.model.choices import Assumption, Correlation
 from fogft.model.replica import Placement
 from fogft.planning.reliability import system_unavailability, unavailability
 
 HOUR_S = 3600.0
 
 
-@dataclass(frozen=True)
-class Correlation:
-    """How much replicas are down together. Each in [0, 1], and none above the one before.
-
-    The defaults for a region and a cloud were measured in public traces of AWS's V100 spot
-    machines: 9 zones, 45 days (over all pairs of zones 0.22). That for a zone is assumed, above
-    them. docs/design/availability.md has the source.
-
-    Attributes:
-        zone: Between two replicas in one zone.
-        region: Between two in different zones of one region.
-        cloud: Between two in different regions of one cloud.
-    """
-
-    zone: float = 0.5
-    region: float = 0.43
-    cloud: float = 0.14
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.cloud <= self.region <= self.zone <= 1:
-            raise ValueError(
-                "correlations must be from 0 to 1, and zone >= region >= cloud, not "
-                f"{self.zone:g}, {self.region:g} and {self.cloud:g}"
-            )
-
-
 INDEPENDENT = Correlation(0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Assumption:
-    """What is taken for granted about machines, for lack of a measurement. Seconds.
-
-    Attributes:
-        spot_uptime_s: From ready to preempted, on average. 15 h is FogROS2-FT's figure.
-        on_demand_uptime_s: From ready to failed. With 20 min of recovery, 12 million
-            seconds are the 99.99 % that clouds promise.
-        recovery_s: From gone to ready elsewhere. 20 min is FogROS2-FT's figure.
-    """
-
-    spot_uptime_s: float = 15 * HOUR_S
-    on_demand_uptime_s: float = 12_000_000.0
-    recovery_s: float = 1200.0
-    correlation: Correlation = field(default_factory=Correlation)
-
-    def unavailability(self, *, spot: bool) -> float:
-        """Return the fraction of time that one replica does not answer."""
-        uptime_s = self.spot_uptime_s if spot else self.on_demand_uptime_s
-        return unavailability(uptime_s, self.recovery_s)
+def unavailability_of(assumed: Assumption, *, spot: bool) -> float:
+    """Return the fraction of time that one replica does not answer."""
+    uptime_s = assumed.spot_uptime_s if spot else assumed.on_demand_uptime_s
+    return unavailability(uptime_s, assumed.recovery_s)
 
 
 @dataclass(frozen=True)
@@ -98,7 +57,7 @@ class Expected:
 
 def expected(placements: Sequence[Placement], assumed: Assumption) -> Expected:
     """Return how available a pool with replicas in these places is. Of none: never."""
-    down = [assumed.unavailability(spot=place.spot) for place in placements]
+    down = [unavailability_of(assumed, spot=place.spot) for place in placements]
     together = joint_unavailability(zip(placements, down, strict=True), assumed.correlation)
     return Expected(1.0 - together, 1.0 - system_unavailability(down))
 

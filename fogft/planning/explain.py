@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from fogft.model.choices import Assumption
 from fogft.model.groups import group_at, services_at
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec, ServiceSpec
-from fogft.planning.availability import Assumption, Expected, expected
+from fogft.planning.availability import Expected, expected
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
 from fogft.planning.listing import is_possible

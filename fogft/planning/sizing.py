@@ -17,13 +17,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from fogft.model.choices import MAX_REPLICAS
 from fogft.model.groups import Group, critical_group, groups_of, shares
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer
 from fogft.model.schedule import Wish, wish
 from fogft.model.scoring import Scale
-from fogft.model.spec import MAX_REPLICAS, PoolSpec
-from fogft.planning.availability import Expected, expected
+from fogft.model.spec import PoolSpec
+from fogft.planning.availability import Expected, expected, unavailability_of
 from fogft.planning.listing import catalogue
 from fogft.planning.placement import Market
 from fogft.planning.reliability import replicas_needed
@@ -158,7 +159,7 @@ def _for_target(
     if asked is None:
         return _Found(spec.replicas)
     if not observed.offers:
-        one = 1.0 - asked.assumed.unavailability(spot=True)
+        one = 1.0 - unavailability_of(asked.assumed, spot=True)
         needed = replicas_needed(one, asked.target, limit=10_000)
         return _Found(min(MAX_REPLICAS, max(spec.replicas, running, needed)))
     scale = Scale(spec.placement.weights, observed.rtt_s)

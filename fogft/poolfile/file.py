@@ -11,7 +11,7 @@ from pathlib import Path
 from fogft.errors import SpecError
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import yaml_tree
-from fogft.poolfile.reader import FieldCheck, StateCheck, ToleranceCheck, TypeCheck, pool_spec
+from fogft.poolfile.pool import FieldCheck, StateCheck, ToleranceCheck, TypeCheck, pool_spec
 
 MAX_BYTES = 1 << 20
 

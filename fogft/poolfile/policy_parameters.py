@@ -14,17 +14,20 @@ from dataclasses import replace
 from typing import Any, TypeAlias
 
 from fogft.errors import SpecError
-from fogft.model.spec import HedgingMode, OnTimeout, Part, ServiceSpec
-from fogft.poolfile.service_form import LONGEST_S, to_plain
-from fogft.poolfile.services import read_service
+from fogft.model.keys import LONGEST_S, keys_of
+from fogft.model.spec import OnTimeout, Part, ServiceSpec
+from fogft.poolfile.plain import to_plain
+from fogft.poolfile.reader import ADVANCED, Reader
+from fogft.poolfile.rules import RULES
 from fogft.poolfile.tree import Section, tree
 
 Value: TypeAlias = "bool | float | str"
 FieldCheck: TypeAlias = "Callable[[str, str], str | None]"  # of a type and a boolean response field
 
-KEYS = ("timeout_s", "on_timeout", "hedging", "hedging_budget", "ok_field", "trace", "advertise")
-_NOT_WITH_STATE = frozenset({"hedging", "hedging_budget", "ok_field", "trace"})
-_NOT_WITH_QUORUM = frozenset({"hedging", "hedging_budget", "ok_field"})
+KEYS = tuple(entry.name for entry in keys_of(ServiceSpec) if entry.key.parameter)
+_ADVANCED = frozenset(entry.name for entry in keys_of(ServiceSpec) if entry.key.advanced)
+_NOT_WITH_STATE = frozenset({"hedging", "ok_field", "trace"})
+_NOT_WITH_QUORUM = frozenset({"hedging", "ok_field"})
 
 
 def prefix(service: str) -> str:
@@ -39,23 +42,15 @@ def shown(spec: ServiceSpec) -> dict[str, Value]:
     unfit: frozenset[str] = _NOT_WITH_QUORUM if spec.quorum > 1 else frozenset()
     if spec.state is not None:
         unfit = _NOT_WITH_STATE
-    values = {
-        "timeout_s": spec.timeout_s,
-        "on_timeout": spec.on_timeout.value,
-        "hedging": spec.hedging.value,
-        "hedging_budget": spec.hedging_budget,
-        "ok_field": spec.ok_field,
-        "trace": spec.trace,
-        "advertise": spec.advertised.value,
-    }
-    return {key: value for key, value in values.items() if key not in unfit}
+    values = {key: getattr(spec, key) for key in KEYS if key not in unfit}
+    values["advertise"] = spec.advertised
+    return {key: getattr(value, "value", value) for key, value in values.items()}
 
 
 def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
     """Return a service's policy with other values for some keys.
 
-    What only has a meaning beside another value (`hedging_budget`, `fallback`) is left out where
-    that value is gone.
+    A `fallback_service` is left out where `on_timeout` asks for none any more.
 
     Raises:
         ValueError: The pool file's reader would refuse it, or it has no such parameter; with why.
@@ -70,18 +65,19 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
     if spec.part is not Part.NONE:
         return replace(spec, timeout_s=_timeout(spec, news["timeout_s"]))
     raw: dict[str, Any] = {**to_plain(spec), **news}
-    if raw.get("hedging") != HedgingMode.ADAPTIVE.value and "hedging_budget" not in news:
-        raw.pop("hedging_budget", None)
     if raw.get("on_timeout") != OnTimeout.FALLBACK.value:
-        raw.pop("fallback", None)
+        raw.pop("fallback_service", None)
     if raw.get("ok_field") == "":
         del raw["ok_field"]
+    below = {key: raw.pop(key) for key in _ADVANCED & raw.keys()}
+    section = Section("parameter", spec.name, tree({**raw, ADVANCED: below}))
     try:
-        read = read_service(Section("parameter", spec.name, tree(raw)))
+        read: ServiceSpec = Reader(RULES).map(ServiceSpec, section)
     except SpecError as error:
         reason = error.message.partition(f"{spec.name}.")[2] or error.message
+        reason = reason.removeprefix(f"{ADVANCED}.")
         raise ValueError(f"{reason}; {error.hint}" if error.hint else reason) from None
-    return replace(read, replicas=spec.replicas, traffic=spec.traffic)
+    return replace(read, min_replicas=spec.min_replicas, traffic=spec.traffic)
 
 
 def _timeout(spec: ServiceSpec, value: Value) -> float:

@@ -7,8 +7,33 @@ from __future__ import annotations
 
 import re
 
-from fogft.poolfile.keys import LATER_KEYS, REFUSED_TASK_KEYS, TASK_KEYS, places
+from fogft.model.spec import PoolSpec
+from fogft.poolfile import removed
 from fogft.poolfile.tree import Section, plain, shown
+
+# The task schema of SkyPilot 0.14.1, without the keys that it keeps for itself.
+TASK_KEYS = (
+    "name",
+    "workdir",
+    "event_callback",
+    "num_nodes",
+    "resources",
+    "file_mounts",
+    "setup",
+    "run",
+    "envs",
+    "secrets",
+    "managed_secrets",
+    "inputs",
+    "outputs",
+    "config",
+    "volumes",
+    "api_server_access",
+)
+REFUSED_TASK_KEYS = {
+    "service": "it is SkyServe's; list what to replicate under `fogft.services` instead",
+    "pool": "it is for SkyPilot's own worker pools; the file is a pool by its `fogft` section",
+}
 
 _ENV_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -22,7 +47,7 @@ def check_task(top: Section) -> None:
     for key, reason in REFUSED_TASK_KEYS.items():
         if key in top.children:
             raise top.error(key, "cannot stand in a pool file", reason, at_key=True)
-    top.only((*TASK_KEYS, "fogft"), later=LATER_KEYS, elsewhere=places(TASK_KEYS))
+    top.only((*TASK_KEYS, "fogft"), hints=removed.hints(PoolSpec), elsewhere=removed.places(None))
     if "fogft" not in top.children:
         raise top.error("fogft", "is missing", "add `fogft:` with `services:` below it")
     top.text("run", "write the command that starts your service, such as `run: exec python3 x.py`")

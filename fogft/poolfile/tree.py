@@ -1,6 +1,6 @@
 """A pool file as a tree that remembers its lines, and typed access to it.
 
-`fogft.poolfile.yaml_tree` makes the tree; `spec_reader` says what must be in it. Every
+`fogft.poolfile.yaml_tree` makes the tree; `reader` says what must be in it. Every
 complaint is one `SpecError` that begins with ``file:line: key:`` and is one line long,
 whatever the file holds; its hint says what would be right.
 
@@ -99,6 +99,8 @@ class Section:
 
     def error(self, key: str, what: str, hint: str = "", *, at_key: bool = False) -> SpecError:
         """Return the error that a key of this section deserves, at its line or at ours."""
+        if key not in self.children and self.has(key):
+            return self.section("advanced").error(key, what, hint, at_key=at_key)
         node = self.children.get(key)
         line = self.node.key_line if node is None else node.key_line if at_key else node.line
         word = key if key and key == key.strip() else f'"{key}"'
@@ -109,22 +111,23 @@ class Section:
         self,
         known: Iterable[str],
         *,
-        later: Mapping[str, str] | None = None,
+        hints: Mapping[str, str] | None = None,
         elsewhere: Mapping[str, str] | None = None,
     ) -> None:
         """Refuse every key that is not known.
 
         Args:
             known: The keys that may stand here.
-            later: Keys that are planned, each with what to do today.
+            hints: Keys that are no longer or not yet there: what is to be said, and what to do.
             elsewhere: Keys that have their place in another section, with that place.
         """
         allowed = set(known)
         for key in self.children:
             if key in allowed:
                 continue
-            if later and key in later:
-                raise self.error(key, "is not supported yet", later[key], at_key=True)
+            if hints and key in hints:
+                what, _, todo = hints[key].partition("; ")
+                raise self.error(key, what, todo, at_key=True)
             if elsewhere and key in elsewhere:
                 hint = f"`{key}` belongs {elsewhere[key]}"
             else:
@@ -132,8 +135,12 @@ class Section:
             raise self.error(key, "unknown key", hint, at_key=True)
 
     def has(self, key: str) -> bool:
-        """Whether the key is there with a value."""
-        return key in self.children and self.children[key].value is not None
+        """Whether the key is there with a value, here or under `advanced`."""
+        if key in self.children:
+            return self.children[key].value is not None
+        advanced = self.children.get("advanced")
+        below = advanced.value if advanced is not None else None
+        return isinstance(below, Mapping) and key in below and below[key].value is not None
 
     def text(self, key: str, hint: str, default: str | None = None) -> str:
         """Return a text that is not blank; without a default it is required."""
@@ -192,14 +199,20 @@ class Section:
             raise self.error(key, f"must be {limits}, not {shown(node.value)}", hint)
         return float(node.value)
 
-    def choice(self, key: str, default: Choice) -> Choice:
-        """Return one of an enumeration's values, the default's own."""
-        values = [str(member.value) for member in type(default)]
-        allowed = " or ".join(f"`{value}`" for value in values)
-        text = self.text(key, f"write {allowed}", default=str(default.value))
-        if text not in values:
-            raise self.error(key, f"must be {allowed}, not {shown(text)}", nearest(text, values))
-        return type(default)(text)
+    def choice(self, key: str, members: Sequence[Choice]) -> Choice:
+        """Return one of some members of an enumeration."""
+        by_value = {str(member.value): member for member in members}
+        allowed = " or ".join(f"`{value}`" for value in by_value)
+        text = self.text(key, f"write {allowed}")
+        if text not in by_value:
+            raise self.error(key, f"must be {allowed}, not {shown(text)}", nearest(text, by_value))
+        return by_value[text]
+
+    def below(self, key: str, children: Mapping[str, Node]) -> Section:
+        """Return a map below that something shorter stands for."""
+        node = self.children[key]
+        path = f"{self.path}.{key}" if self.path else key
+        return Section(self.file, path, Node(children, node.line, node.key_line))
 
     def section(self, key: str, hint: str = "") -> Section:
         """Return a map below; an empty one if the key is absent."""

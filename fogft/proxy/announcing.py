@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import Protocol
 
 from fogft.link.dial_out.replica import DialOut
+from fogft.model.proxy_config import ServerProxyConfig
 from fogft.model.replica import ReplicaId
-from fogft.proxy.config import ServerProxyConfig
 from fogft.records.client import Known, RendezvousClient
 from fogft.records.record import RecordError, RecordKind
 from fogft.records.roster import SlotState, dial_in

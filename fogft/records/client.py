@@ -21,7 +21,7 @@ from typing import Any
 
 from fogft.errors import StateError, WireError
 from fogft.model.credentials import CredentialPaths
-from fogft.model.endpoint import is_endpoint
+from fogft.model.names import is_endpoint
 from fogft.records.cache import read, write
 from fogft.records.dialling import Caller
 from fogft.records.exchange import Exchange

@@ -15,9 +15,8 @@ from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.certificate_holder import Holder, holder_of
-from fogft.model.endpoint import is_endpoint
 from fogft.model.membership import from_parts, to_dict
-from fogft.model.names import gateway_slot
+from fogft.model.names import gateway_slot, is_endpoint
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import COUNT_LIMIT, Record, RecordError, RecordKind
 

@@ -14,7 +14,7 @@ import re
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.poolfile.state import StateService, StateSpec
+from fogft.model.state import StateService, StateSpec
 from fogft.ros.types import load_service_type
 
 _SEQUENCE = re.compile(r"sequence<(octet|uint8|int8|char)(?:, \d+)?>")

@@ -26,9 +26,9 @@ from fogft import disk
 from fogft.model import membership as memberships
 from fogft.model import names
 from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.model.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
 from fogft.pool.credentials import authority
-from fogft.poolfile.service_form import to_plain
-from fogft.poolfile.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
+from fogft.poolfile.plain import to_plain
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
 from tests.bench.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
@@ -135,7 +135,7 @@ class Rig:
         self._rmw = rmw
         self._environ = environ
         self._action = ACTION_SERVICES if graph else ()
-        self._topics = [topic.to_plain() for topic in TOPICS] if graph else []
+        self._topics = [to_plain(topic) for topic in TOPICS] if graph else []
         self._stateful = stateful
         self._policy: dict[str, Any] = policy or {}
         self.robot_domain, self.bare_domain, *domains = free_domains(2 + 2 * replicas)
@@ -325,7 +325,7 @@ class Rig:
         flag, other = ({"name": n, "type": t, "timeout_s": 10.0} for n, t in (FLAG, MAP))
         services = [{**flag, **of_flag}, other, *map(to_plain, self._action)]
         if self._stateful:
-            return [{**s, "state": _state(str(s["name"])).to_plain()} for s in services]
+            return [{**s, "state": to_plain(_state(str(s["name"])))} for s in services]
         return services
 
     def _start(

@@ -18,8 +18,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from fogft.model.middleware import Speaks
-from fogft.model.topic import Origin, TopicSpec
-from fogft.poolfile.topics import action_services
+from fogft.model.topic import ActionSpec, Origin, TopicSpec
+from fogft.poolfile.actions import action_services
 from fogft.proxy import middleware
 
 FLAG = ("/bench_flag", "std_srvs/srv/SetBool")
@@ -33,7 +33,7 @@ TOPICS = (
     TopicSpec("/bench_in", STRING, Origin.ROBOT, depth=100),
     TopicSpec("/bench_out", STRING, Origin.REPLICAS, depth=100),
 )
-ACTION_SERVICES = action_services("/bench_act", FIBONACCI, 10.0, 60.0)
+ACTION_SERVICES = action_services(ActionSpec("/bench_act", FIBONACCI, 10.0, 60.0))
 CANCEL = ("/bench_cancel", "std_srvs/srv/Trigger")
 _DEFAULTS = ("0", "0", "0", "0", "16")
 

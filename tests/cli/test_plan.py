@@ -246,7 +246,7 @@ resources: {cpus: 8+, use_spot: true}
 run: exec true
 fogft:
   services:
-    - {name: /plan, type: nav_msgs/srv/GetPlan, replicas: 3}
+    - {name: /plan, type: nav_msgs/srv/GetPlan, min_replicas: 3}
     - {name: /map, type: nav_msgs/srv/GetMap}
   groups:
     - {name: steady, replicas: 1, resources: {cpus: 2+, use_spot: false}}

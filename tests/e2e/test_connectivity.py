@@ -77,7 +77,7 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
     pool.write(
         replicas=2,
         more=f"  rendezvous: ['{meeting}']\n  dial_in: {local()}\n"
-        f"  topology: {{gateways: [{listed}], through: [{', '.join(GATEWAYS)}]}}\n",
+        f"  topology: {{gateways: [{listed}], default_gateways: [{', '.join(GATEWAYS)}]}}\n",
     )
     up = subprocess.Popen(
         [sys.executable, "-m", "fogft", "up", str(pool.file), "--yes"],

@@ -157,7 +157,8 @@ class Picking(Defaults):
 
 def _pool_file(pools: Pools, workspace: Path) -> Path:
     run = shlex.join([sys.executable, "tag_service.py", "--service", SERVICE])
-    entry = f"{{name: {SERVICE}, type: {TYPE}, timeout_s: {TIMEOUT_S:g}, trace: true}}"
+    advanced = "advanced: {trace: true}"
+    entry = f"{{name: {SERVICE}, type: {TYPE}, timeout_s: {TIMEOUT_S:g}, {advanced}}}"
     return comparing.pool_file(pools, POOL, 2, workspace, run, entry)
 
 

@@ -18,7 +18,7 @@ from fogft.link.socket_progress import BULK_BYTES, KEPT_S, Flow, SocketProgress,
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.spec import ServiceSpec
-from fogft.poolfile.state import StateService, StateSpec
+from fogft.model.state import StateService, StateSpec
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import (
     POOL_UID,

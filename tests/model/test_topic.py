@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.errors import SpecError
 from fogft.model.topic import Origin, Select, TopicSpec
+from fogft.poolfile.plain import from_plain, to_plain
 from fogft.topics.queues import Outbox, Ring, Seen
 from fogft.topics.select import QUIET_LIMIT_S, QUIET_S, Selection
 
@@ -160,9 +162,9 @@ def test_feedback_has_a_leader_for_each_goal():
 @pytest.mark.parametrize("select", Select)
 def test_a_configuration_says_all_of_a_topic(select):
     topic = TopicSpec("/a", "p/msg/T", Origin.REPLICAS, select, 3, reliable=False, latched=True)
-    assert TopicSpec.from_plain(topic.to_plain()) == topic
-    assert TopicSpec("/a", "p/msg/T", Origin.ROBOT).to_plain() == {
-        "name": "/a", "type": "p/msg/T", "origin": "robot",
+    assert from_plain(TopicSpec, to_plain(topic)) == topic
+    assert to_plain(TopicSpec("/a", "p/msg/T", Origin.ROBOT)) == {
+        "name": "/a", "type": "p/msg/T", "from": "robot",
     }  # fmt: skip
-    with pytest.raises(ValueError):
-        TopicSpec.from_plain({**topic.to_plain(), "depth": 0.5})
+    with pytest.raises(SpecError, match="depth: must be a whole number"):
+        from_plain(TopicSpec, {**to_plain(topic), "depth": 0.5})

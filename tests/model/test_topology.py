@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import StateError
 from fogft.model.certificate_holder import Holder, Role
-from fogft.model.topology import Gateway, Topology, find_loop
+from fogft.model.topology import Gateway, RobotRoute, Topology, find_loop
 
 UID = "0123456789abcdef"
 NAMES = ["a", "b", "c", "d"]
@@ -21,7 +21,7 @@ graphs = st.fixed_dictionaries(dict.fromkeys(NAMES, through))
 
 def made(graph: dict[str, tuple[str, ...]]) -> Topology:
     gateways = tuple(Gateway(name, "h:1", ups, (1,)) for name, ups in graph.items())
-    return Topology(gateways, {"ada": ("a", "b")}, ("c",))
+    return Topology(gateways, (RobotRoute("ada", ("a", "b")),), ("c",))
 
 
 def reaches(graph: dict[str, tuple[str, ...]], start: str) -> set[str]:

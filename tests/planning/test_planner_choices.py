@@ -281,7 +281,7 @@ def test_without_fallback_nothing_stands_in():
 
 
 def test_critical_services_get_replicas_that_carry_them_alone():
-    critical = replace(SERVICE, name="/stop", replicas=4)
+    critical = replace(SERVICE, name="/stop", min_replicas=4)
     asked = replace(spec(2), services=(SERVICE, critical))
     planned = World(asked).plan()
     assert planned.wanted == 4

@@ -13,12 +13,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fogft.errors import SpecError
+from fogft.model.keys import keys_of
 from fogft.model.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
 from fogft.poolfile import file, yaml_tree
-from fogft.poolfile.keys import FOGFT_KEYS, LATER_KEYS
 from fogft.poolfile.tree import plain
 from tests.needs import needs
 from tests.nightly import by_day
+
+FOGFT_KEYS = [*(e.name for e in keys_of(PoolSpec) if not e.key.advanced), "advanced"]
 
 GOOD = """\
 name: perception
@@ -71,7 +73,8 @@ def test_a_whole_file():
         max_surge=0,
         max_usd_per_hour=1.5,
         max_hours=12.0,
-        health=HealthSpec(3.0, 20.5, 600.0, 60.0),
+        health=HealthSpec(3.0, 20.5, 600.0),
+        orphan_after_s=60.0,
         task=task,
     )
 
@@ -127,12 +130,12 @@ MISTAKES = {
     "key that comes later": (
         pool("autoscale: true"),
         "pool.yaml:4: fogft.autoscale: is not supported yet",
-        LATER_KEYS["autoscale"],
+        "remove it: `fogft scale` or `schedule` say how many replicas there are",
     ),
     "key that comes later, in a service": (
         pool(services="[{name: a, autoscale: 2}]"),
         "pool.yaml:3: fogft.services[0].autoscale: is not supported yet",
-        "remove it; `fogft scale` or `schedule` say how many replicas there are",
+        "remove it: `fogft scale` or `schedule` say how many replicas there are",
     ),
     "SkyServe's section": (
         pool(top="service: {replicas: 2}"),
@@ -198,7 +201,7 @@ MISTAKES = {
     "no name of a service": (
         pool(services="\n    - type: a/srv/A"),
         "pool.yaml:4: fogft.services[0].name: is missing",
-        "write the service's name, such as `name: /detect`",
+        "write a name such as `/detect`",
     ),
     "no type": (
         pool(services="\n    - name: /a\n    - {name: /b, type: a/srv/A}"),
@@ -346,7 +349,7 @@ MISTAKES = {
     "duplicate service": (
         pool(services="\n    - {name: /a, type: a/srv/A}\n    - {name: a, type: b/srv/B}"),
         "pool.yaml:5: fogft.services[1].name: `/a` stands here twice (first in line 4)",
-        "give each service one entry",
+        "give each one entry",
     ),
     "malformed field": (
         pool(services="[{name: a, type: a/srv/A, ok_field: result.ok}]"),
@@ -365,33 +368,52 @@ MISTAKES = {
         "not `adaptiv`",
         "did you mean `adaptive`?",
     ),
-    "budget without hedging": (
+    "key that is gone": (
         pool(services="[{name: a, type: a/srv/A, hedging_budget: 0.2}]"),
-        "pool.yaml:3: fogft.services[0].hedging_budget: has no meaning here: only "
-        "`hedging: adaptive` sends extra copies by a budget",
-        "write `hedging: adaptive`, or remove it",
+        "pool.yaml:3: fogft.services[0].hedging_budget: is no key any more",
+        "remove it: the default is right",
+    ),
+    "key with another name now": (
+        pool(services="[{name: a, type: a/srv/A, replicas: 4}]"),
+        "pool.yaml:3: fogft.services[0].replicas: is called `min_replicas` now",
+        "write that",
+    ),
+    "advanced key beside the others": (
+        pool(services="[{name: a, type: a/srv/A, trace: true}]"),
+        "pool.yaml:3: fogft.services[0].trace: unknown key",
+        "`trace` belongs in a service, under `fogft.services`, in `advanced`",
+    ),
+    "wrong value of an advanced key": (
+        pool(services="[{name: a, type: a/srv/A, advanced: {trace: 1}}]"),
+        "pool.yaml:3: fogft.services[0].advanced.trace: must be true or false, not the number `1`",
+        "write `trace: true` or `trace: false`",
     ),
     "fallback without a service": (
         pool(services="[{name: a, type: a/srv/A, on_timeout: fallback}]"),
-        "pool.yaml:3: fogft.services[0].fallback: is missing",
-        "name a service of the same type on the robot, such as `fallback: {service: /a_onboard}`",
+        "pool.yaml:3: fogft.services[0].fallback_service: is missing",
+        "name a service of the same type on the robot, such as "
+        "`fallback_service: {name: /a_onboard}`",
     ),
     "fallback that is not used": (
-        pool(services="[{name: a, type: a/srv/A, fallback: {service: b}}]"),
-        "pool.yaml:3: fogft.services[0].fallback: is not used: `on_timeout` is not `fallback`",
+        pool(services="[{name: a, type: a/srv/A, fallback_service: {name: b}}]"),
+        "pool.yaml:3: fogft.services[0].fallback_service: is not used: `on_timeout` is not "
+        "`fallback`",
         "write `on_timeout: fallback`, or remove it",
     ),
     "fallback that is the service": (
-        pool(services="[{name: a, type: a/srv/A, on_timeout: fallback, fallback: {service: a}}]"),
-        "pool.yaml:3: fogft.services[0].fallback.service: is the service itself",
-        "write the name of a service on the robot, such as `service: /a_service`",
+        pool(
+            services="[{name: a, type: a/srv/A, on_timeout: fallback, fallback_service: {name: a}}]"
+        ),
+        "pool.yaml:3: fogft.services[0].fallback_service.name: is the service itself",
+        "write the name of a service on the robot, such as `fallback_service: {name: /a_onboard}`",
     ),
     "fallback after the deadline": (
         pool(
             services="[{name: a, type: a/srv/A, timeout_s: 2, on_timeout: fallback, "
-            "fallback: {service: b, after_s: 2}}]"
+            "fallback_service: {name: b, after_s: 2}}]"
         ),
-        "pool.yaml:3: fogft.services[0].fallback.after_s: must be below `timeout_s`, which is 2",
+        "pool.yaml:3: fogft.services[0].fallback_service.after_s: must be below `timeout_s`, "
+        "which is 2",
         "make it shorter, or remove it: at the deadline the fallback is asked anyway",
     ),
     "cancel service and concurrency": (

@@ -38,7 +38,7 @@ def test_it_replaces_no_replica():
     ("metrics", "words"),
     [
         ("9464", "must be a map"),
-        ("{proxy: 9464}", "not `host:port`"),
+        ("{proxy: 9464}", "must be text"),
         ("{robot: 127.0.0.1:9464}", "unknown key"),
         ("{proxy: 127.0.0.1:1, manager: 127.0.0.1:1}", "stands here twice"),
         ("{replica: 127.0.0.1:65530}", "above 65535"),

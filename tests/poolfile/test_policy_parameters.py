@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from fogft.model.choices import FallbackSpec, TrafficSpec
 from fogft.model.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
+from fogft.model.state import StateService, StateSpec
 from fogft.poolfile.policy_parameters import KEYS, Policies, changed, prefix, shown
-from fogft.poolfile.state import StateService, StateSpec
 
 PLAN = ServiceSpec("/arm/plan", "nav_msgs/srv/GetPlan")
 STATE = StateSpec(
@@ -23,7 +23,6 @@ STATE = StateSpec(
 @st.composite
 def services(draw):
     hedging = draw(st.sampled_from(HedgingMode))
-    adaptive = hedging is HedgingMode.ADAPTIVE
     on_timeout = draw(st.sampled_from(OnTimeout))
     falls_back = on_timeout is OnTimeout.FALLBACK
     return ServiceSpec(
@@ -31,13 +30,12 @@ def services(draw):
         "nav_msgs/srv/GetPlan",
         timeout_s=draw(st.floats(1.0, 100.0)),
         hedging=hedging,
-        hedging_budget=draw(st.floats(0.01, 1.0)) if adaptive else ServiceSpec.hedging_budget,
         on_timeout=on_timeout,
         fallback=FallbackSpec("/on_board", after_s=0.5) if falls_back else None,
         ok_field=draw(st.sampled_from(("", "success"))),
         trace=draw(st.booleans()),
         advertise=draw(st.sampled_from((None, *Advertise))),
-        replicas=draw(st.integers(0, 3)),
+        min_replicas=draw(st.integers(0, 3)),
         traffic=TrafficSpec(requests_per_s=draw(st.sampled_from((0.0, 5.0)))),
     )
 
@@ -60,7 +58,7 @@ def test_what_is_shown_can_be_set_back_and_changes_nothing(service):
 
 @given(service=services(), news=values)
 def test_what_holds_is_shown_and_nothing_else_has_changed(service, news):
-    """Of the policy; a budget or a fallback without its mode is gone with that."""
+    """Of the policy; a fallback without its mode is gone with that."""
     before = shown(service)
     try:
         after = changed(service, news)
@@ -68,14 +66,13 @@ def test_what_holds_is_shown_and_nothing_else_has_changed(service, news):
         return
     now = shown(after)
     assert {key: now[key] for key in news} == news
-    kept = KEYS if "hedging" not in news else set(KEYS) - {"hedging_budget"}
     # Unless told, when a service is advertised follows from what happens at its deadline.
-    kept = set(kept) - {"advertise"} if service.advertise is None else kept
+    kept = set(KEYS) - {"advertise"} if service.advertise is None else set(KEYS)
     assert {k: now[k] for k in kept if k not in news} == {
         k: before[k] for k in kept if k not in news
     }
-    assert (after.name, after.type, after.replicas, after.traffic) == (
-        service.name, service.type, service.replicas, service.traffic,
+    assert (after.name, after.type, after.min_replicas, after.traffic) == (
+        service.name, service.type, service.min_replicas, service.traffic,
     )  # fmt: skip
 
 
@@ -85,8 +82,7 @@ def test_what_holds_is_shown_and_nothing_else_has_changed(service, news):
         ({"timeout_s": 0.0}, "timeout_s: must be above 0"),
         ({"timeout_s": "soon"}, "timeout_s: must be a number"),
         ({"hedging": "some"}, "hedging: must be `all` or"),
-        ({"hedging_budget": 0.5}, "hedging_budget: has no meaning here"),
-        ({"on_timeout": "fallback"}, "fallback: is missing"),
+        ({"on_timeout": "fallback"}, "fallback_service: is missing"),
         ({"trace": "yes"}, "trace: must be true or false"),
         ({"advertise": "never"}, "advertise: must be"),
         ({"ok_field": "Not A Field"}, "ok_field: `Not A Field` is not"),
@@ -100,9 +96,7 @@ def test_what_a_pool_file_may_not_say_is_refused_with_the_reason(news, why):
 
 def test_a_policy_is_not_offered_where_the_service_cannot_have_it():
     assert set(shown(PLAN)) == set(KEYS)
-    assert set(shown(replace(PLAN, quorum=2))) == set(KEYS) - {
-        "hedging", "hedging_budget", "ok_field",
-    }  # fmt: skip
+    assert set(shown(replace(PLAN, quorum=2))) == set(KEYS) - {"hedging", "ok_field"}
     stateful = shown(replace(PLAN, state=STATE))
     assert set(stateful) == {"timeout_s", "on_timeout", "advertise"}
 

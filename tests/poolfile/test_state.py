@@ -6,9 +6,10 @@ import pytest
 
 from fogft.errors import FogftError, SpecError
 from fogft.model.intent import Intent, scale
+from fogft.model.spec import ServiceSpec
+from fogft.model.state import StateService, StateSpec
 from fogft.poolfile import file as pool_file
-from fogft.poolfile import service_form
-from fogft.poolfile.state import StateService, StateSpec
+from fogft.poolfile.plain import from_plain, to_plain
 
 FILE = """
 name: p
@@ -48,9 +49,9 @@ def test_any_types_and_fields_can_be_named():
 @pytest.mark.parametrize("state", [SHORT, LONG])
 def test_both_proxies_read_what_is_written(state):
     (service,) = parse(state).services
-    assert service_form.from_plain(service_form.to_plain(service)) == service
-    for_replica = service_form.to_plain(service, service_form.REPLICA_KEYS)
-    assert service_form.from_plain(for_replica).state == service.state
+    assert from_plain(ServiceSpec, to_plain(service)) == service
+    for_replica = to_plain(service, on_replica=True)
+    assert from_plain(ServiceSpec, for_replica).state == service.state
 
 
 def test_running_replicas_are_replaced_when_a_service_becomes_stateful():
@@ -112,7 +113,7 @@ def test_a_quorum_and_its_tolerances_reach_the_client_proxy():
         VOTING + "      tolerance: {plan.cost: 0.5, x: 1}\n", file="p.yaml"
     ).services
     assert (service.quorum, service.tolerance) == (2, (("plan.cost", 0.5), ("x", 1.0)))
-    assert service_form.from_plain(service_form.to_plain(service)) == service
+    assert from_plain(ServiceSpec, to_plain(service)) == service
 
 
 @pytest.mark.parametrize(
@@ -140,7 +141,7 @@ WINDOW = "  schedule: {time_zone: UTC, windows: [{days: mon, replicas: %d}]}\n"
     ("more", "fewest"),
     [
         ("      quorum: 3\n", 2),
-        ("      quorum: 5\n      replicas: 4\n", 4),
+        ("      quorum: 5\n      min_replicas: 4\n", 4),
         ("      quorum: 3\n  replicas: 2\n", 2),
         ("      quorum: 2\n  availability: 0.99\n", 1),
         ("      quorum: 2\n  groups: [{name: a, replicas: 1}]\n", 1),
@@ -159,7 +160,7 @@ def test_a_quorum_that_cannot_be_reached_is_refused(more, fewest):
     "more",
     [
         "      quorum: 2\n",
-        "      quorum: 4\n      replicas: 4\n",
+        "      quorum: 4\n      min_replicas: 4\n",
         "      quorum: 3\n  replicas: 3\n" + WINDOW % 4,
         "      quorum: 2\n  replicas: 2\n  availability: 0.99\n",
     ],

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import SpecError
-from fogft.model.spec import Part
+from fogft.model.spec import Part, ServiceSpec
 from fogft.model.topic import Origin, Select, TopicSpec
 from fogft.poolfile import file
-from fogft.poolfile.service_form import from_plain, to_plain
+from fogft.poolfile.plain import from_plain, to_plain
 
 FILE = """\
 name: p
@@ -43,7 +43,10 @@ def test_an_action_is_three_services_and_two_topics():
         ("/a/_action/feedback", Select.GOAL, False),
         ("/a/_action/status", Select.STATUS, True),
     ]
-    assert tuple(from_plain(to_plain(service)) for service in spec.services) == spec.services
+    assert (
+        tuple(from_plain(ServiceSpec, to_plain(service)) for service in spec.services)
+        == spec.services
+    )
 
 
 def test_a_topic_more_replaces_the_replicas():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import SpecError
-from fogft.model.topology import Gateway, Topology
+from fogft.model.topology import Gateway, RobotRoute, Topology
 from fogft.poolfile import file
 
 FILE = """name: p
@@ -24,30 +24,33 @@ def parse(topology: str, service: str = "", drop: str = ""):
 
 def test_what_is_written_is_what_is_meant():
     found = parse(
-        "{gateways: [{name: a, endpoint: h:1, through: [b]}, {name: b, endpoint: h:2}],"
-        " robots: [{name: ada, through: [a, b]}, {name: bob, through: []}], through: [b]}"
+        "{gateways: [{name: a, endpoint: h:1, upstream: [b]}, {name: b, endpoint: h:2}],"
+        " robots: [{name: ada, gateways: [a, b]}, {name: bob, gateways: []}],"
+        " default_gateways: [b]}"
     )
     assert found == Topology(
-        (Gateway("a", "h:1", ("b",)), Gateway("b", "h:2")), {"ada": ("a", "b"), "bob": ()}, ("b",)
+        (Gateway("a", "h:1", ("b",)), Gateway("b", "h:2")),
+        (RobotRoute("ada", ("a", "b")), RobotRoute("bob", ())),
+        ("b",),
     )
 
 
 ONE = "gateways: [{name: a, endpoint: h:1}]"
 WRONG = {
-    "a loop": ("{gateways: [{name: a, endpoint: h:1, through: [b]},"
-               " {name: b, endpoint: h:2, through: [a]}]}", "loop: a -> b -> a"),
-    "itself": ("{gateways: [{name: a, endpoint: h:1, through: [a]}]}", "loop: a -> a"),
-    "unknown": ("{" + ONE + ", through: [c]}", "there is no gateway"),
-    "unknown of a robot": ("{" + ONE + ", robots: [{name: r, through: [c]}]}", "there is no"),
+    "a loop": ("{gateways: [{name: a, endpoint: h:1, upstream: [b]},"
+               " {name: b, endpoint: h:2, upstream: [a]}]}", "loop: a -> b -> a"),
+    "itself": ("{gateways: [{name: a, endpoint: h:1, upstream: [a]}]}", "loop: a -> a"),
+    "unknown": ("{" + ONE + ", default_gateways: [c]}", "there is no gateway"),
+    "unknown of a robot": ("{" + ONE + ", robots: [{name: r, gateways: [c]}]}", "there is no"),
     "robot twice": (
-        "{" + ONE + ", robots: [{name: r, through: []}, {name: r, through: []}]}", "twice"),
+        "{" + ONE + ", robots: [{name: r, gateways: []}, {name: r, gateways: []}]}", "twice"),
     "gateway twice": ("{gateways: [{name: a, endpoint: h:1}, {name: a, endpoint: h:2}]}", "twice"),
-    "listed twice": ("{" + ONE + ", through: [a, a]}", "twice"),
-    "no list": ("{" + ONE + ", through: a}", "must be a list"),
+    "listed twice": ("{" + ONE + ", default_gateways: [a, a]}", "twice"),
+    "no list": ("{" + ONE + ", default_gateways: a}", "must be a list"),
     "no endpoint": ("{gateways: [{name: a}]}", "is missing"),
     "bad endpoint": ("{gateways: [{name: a, endpoint: here}]}", "not `host:port`"),
     "bad name": ("{gateways: [{name: a b, endpoint: h:1}]}", "is not a name"),
-    "no gateways": ("{through: []}", "is missing"),
+    "no gateways": ("{default_gateways: []}", "is missing"),
     "unknown key": ("{" + ONE + ", robot: x}", "unknown key"),
 }  # fmt: skip
 

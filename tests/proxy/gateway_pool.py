@@ -19,7 +19,7 @@ from fogft.model import membership, names
 from fogft.model.certificate_holder import Role
 from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Member, Membership, ReplicaId
-from fogft.model.topology import Gateway, Topology
+from fogft.model.topology import Gateway, RobotRoute, Topology
 from tests.link.namespaces import inside
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
 from tests.ports import free_port
@@ -103,7 +103,7 @@ class GatewayPool:
         """Tell everybody the topology: gateway -> endpoint and what it goes through."""
         self.topology = Topology(
             tuple(Gateway(n, at, tuple(ups), generations) for n, (at, ups) in gateways.items()),
-            {name: tuple(through) for name, through in robots.items()},
+            tuple(RobotRoute(name, tuple(through)) for name, through in robots.items()),
         )
         self.publish()
 
@@ -126,7 +126,7 @@ class GatewayPool:
         members = self.folder / f"{stem}-members.json"
         self._files.append(members)
         path.write_text(
-            f'pool: p\npool_uid: "{POOL_UID}"\n{role}: {stem}\nmembership: {members.name}\n'
+            f'pool: p\npool_uid: "{POOL_UID}"\nrobot: {stem}\nmembership: {members.name}\n'
             f"status: {stem}-status.json\nlease: lease.json\nlock: {stem}.lock\n"
             f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, "
             f"key: {files.key}}}\nservices: [{self._service}]\n{extra}"

@@ -57,7 +57,7 @@ class Scene:
     def _door(self, name: str) -> str:
         """Return keys of a configuration; a busy machine shall make nobody suspected."""
         door = f"dial_in: {self.doors[name]}\ndial_in_listen: {self.doors[name]}\n"
-        return f"{door}health: {{suspect_after_s: 20.0}}\n"
+        return f"{door}suspect_after_s: 20.0\n"
 
     def counted(self, event: str) -> int:
         """Return what the gateway has counted at its port."""

@@ -14,7 +14,7 @@ import pytest
 
 from fogft.model import names
 from fogft.model.replica import Member, Membership, ReplicaId
-from fogft.model.topology import Gateway, Topology
+from fogft.model.topology import Gateway, RobotRoute, Topology
 from fogft.records import cache
 from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
@@ -38,7 +38,7 @@ class Scene:
         self.rendezvous = Rendezvous(pool.authority, "a")
         self.manager = Party(manager_files(pool.authority), self.rendezvous.endpoint)
         at, door = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
-        topology = Topology((Gateway("edge", at, (), (1,)),), {"ada": ("edge",)})
+        topology = Topology((Gateway("edge", at, (), (1,)),), (RobotRoute("ada", ("edge",)),))
         admitted = Membership("p", POOL_UID, 2, 1, (Member(ID, ""),), topology=topology)
         say = self.manager.client.publish
         say(RecordKind.ADMISSION, "", 2, admission_content(admitted), sequence=1)

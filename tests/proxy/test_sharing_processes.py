@@ -18,7 +18,7 @@ environment.prepare(os.environ)
 NODE = ROOT / "tests/proxy/nodes/gated_node.py"
 SERVICES = (
     "[{name: /work, type: std_srvs/srv/SetBool, timeout_s: 120.0, cancel: /work_cancel,"
-    " on_timeout: fallback, fallback: {service: /work_onboard, while_none_ready: true}}]"
+    " on_timeout: fallback, fallback_service: {name: /work_onboard, while_none_ready: true}}]"
 )
 SET_BOOL = "std_srvs/srv/SetBool"
 

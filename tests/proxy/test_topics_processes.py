@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from fogft.model.topic import Origin, TopicSpec
-from fogft.poolfile import service_form
-from fogft.poolfile.topics import action_services, action_topics
+from fogft.model.topic import ActionSpec, Origin, TopicSpec
+from fogft.poolfile.actions import action_services, action_topics
+from fogft.poolfile.plain import to_plain
 from fogft.ros import environment
 from tests.needs import needs
 from tests.proxy.by_hand import Parts, Replica, Robot
@@ -22,20 +22,21 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(240), needs("test_msgs")]
 environment.prepare(os.environ)
 FIBONACCI = "test_msgs/action/Fibonacci"
 STRING = "std_msgs/msg/String"
+COUNT = ActionSpec("/count", FIBONACCI, 30.0, 100.0)
 PASSED = (
     TopicSpec("/words", STRING, Origin.ROBOT, depth=100),
     TopicSpec("/map", STRING, Origin.ROBOT, depth=1, latched=True),
     TopicSpec("/echo", STRING, Origin.REPLICAS, depth=100),
-    *action_topics("/count", FIBONACCI),
+    *action_topics(COUNT),
 )
-SERVICES = action_services("/count", FIBONACCI, 30.0, 100.0)
-EXTRA = f"topics: {json.dumps([topic.to_plain() for topic in PASSED])}\n"
+SERVICES = action_services(COUNT)
+EXTRA = f"topics: {json.dumps([to_plain(topic) for topic in PASSED])}\n"
 NODE = Path(__file__).parent / "nodes" / "acting_node.py"
 
 
 @pytest.fixture
 def parts(tmp_path: Path, ros_domains: Callable[[], int]) -> Iterator[Parts]:
-    services = json.dumps([service_form.to_plain(service) for service in SERVICES])
+    services = json.dumps([to_plain(service) for service in SERVICES])
     made = Parts(tmp_path, ros_domains, services=services, node=NODE)
     yield made
     made.close()

@@ -47,7 +47,7 @@ def two(net: Namespaces) -> TwoCables:
 @pytest.mark.parametrize("fault", ["stall", "remove"])
 def test_an_uplink_that_goes_costs_no_request(tmp_path, two, policy, fault):
     """Requests are under way the whole time, first on one uplink, then on the other."""
-    pool = GatewayPool(tmp_path, timeout_s=30.0, services=f", uplinks: {policy}")
+    pool = GatewayPool(tmp_path, timeout_s=30.0, services=f", uplink_policy: {policy}")
     try:
         pool.replica(0, where=two.replica, host=REPLICA, delay_s=0.05)
         interfaces = ", ".join(near for near, _ in two.cables)
@@ -78,8 +78,8 @@ def test_an_uplink_that_goes_costs_no_request(tmp_path, two, policy, fault):
 
 
 def test_copies_through_both_cables_are_run_once(tmp_path, two):
-    """With `uplinks: all`, one cable held up, and one taken away: each request ran once."""
-    pool = GatewayPool(tmp_path, timeout_s=60.0, services=", uplinks: all")
+    """With `uplink_policy: all`, one cable held up, and one taken away: each request ran once."""
+    pool = GatewayPool(tmp_path, timeout_s=60.0, services=", uplink_policy: all")
     server = pool.server_proxy(0, where=two.replica, host=REPLICA, delay_s=0.05)
     try:
         interfaces = ", ".join(near for near, _ in two.cables)

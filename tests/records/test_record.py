@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model import names
-from fogft.model.endpoint import is_endpoint
+from fogft.model.names import is_endpoint
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import (
     BODY_LIMIT,

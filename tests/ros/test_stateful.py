@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import RosError
-from fogft.poolfile.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
+from fogft.model.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
 from fogft.ros.state_bytes import StateBytes, check_state
 from fogft.ros.stateful import AttributeState, StateServices
 

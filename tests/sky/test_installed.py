@@ -339,6 +339,6 @@ def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, An
 def test_the_clouds_that_a_pool_file_can_name_are_skypilots():
     import sky
 
-    from fogft.model.clouds import NO_VM_CLOUDS, VM_CLOUDS
+    from fogft.model.names import NO_VM_CLOUDS, VM_CLOUDS
 
     assert set(sky.CLOUD_REGISTRY) == {*VM_CLOUDS, *NO_VM_CLOUDS} - {"k8s"}

@@ -89,7 +89,7 @@ class World(GatewayPool):
     """
 
     def __init__(self, folder: Path, cables: Cables | None, uplinks: str) -> None:
-        super().__init__(folder, timeout_s=60.0, services=f", uplinks: {uplinks}")
+        super().__init__(folder, timeout_s=60.0, services=f", uplink_policy: {uplinks}")
         self.host = ADDRESS if cables is not None else "127.0.0.1"
         self.delays_s = (0.002, 0.01, 0.02)
         self.cables = cables

@@ -16,7 +16,7 @@ from typing import Any
 
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
 from fogft.errors import SpecError
-from fogft.model.clouds import VM_CLOUDS
+from fogft.model.names import VM_CLOUDS
 from fogft.model.replica import Offer, Placement
 from fogft.poolfile.tree import nearest, shown
 

@@ -19,7 +19,7 @@ from fogft import template_files
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming
 from fogft.errors import CloudError, FogftError, SpecError
-from fogft.model.clouds import NO_VM_CLOUDS
+from fogft.model.names import NO_VM_CLOUDS
 from fogft.model.replica import Placement
 
 LINK_PORT = 7447

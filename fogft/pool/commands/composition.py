@@ -95,7 +95,7 @@ def cloud_named_by(spec: PoolSpec, source: str, file: Path) -> str:
     Raises:
         SpecError: They name a cloud that does not exist, or real clouds and the local one.
     """
-    from fogft.model.clouds import NO_VM_CLOUDS, VM_CLOUDS
+    from fogft.model.names import NO_VM_CLOUDS, VM_CLOUDS
     from fogft.poolfile import named_clouds
 
     known = {LOCAL: LOCAL, **dict.fromkeys((*VM_CLOUDS, *NO_VM_CLOUDS), SKY)}

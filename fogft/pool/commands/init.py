@@ -7,6 +7,7 @@ and a file that is already there is never overwritten unless that was asked for.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import tempfile
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from fogft import template_files
 from fogft.errors import FogftError
+from fogft.poolfile import schema
 from fogft.poolfile.tree import nearest
 
 DEFAULT_EXAMPLE = "planner"
@@ -29,8 +31,8 @@ def examples() -> dict[str, str]:
     """
     found = {}
     for pool in sorted(template_files.folder().glob(f"*/{POOL_FILE}")):
-        first = pool.read_text(encoding="utf-8").partition("\n")[0]
-        found[pool.parent.name] = first.removeprefix("#").strip()
+        comments = pool.read_text(encoding="utf-8").split("\n", 3)
+        found[pool.parent.name] = comments[2].removeprefix("#").strip()
     return found
 
 
@@ -57,10 +59,16 @@ def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Pa
     try:
         _check_room(target, names, force)
         _copy(source, target, names)
+        write_schema(target / schema.FILE)
     except OSError as error:
         what = f"`{error.filename or target}` cannot be written: {error.strerror}"
         raise FogftError(what, "choose another folder with `--into DIR`") from error
-    return [target / relative for relative in names]
+    return [*(target / relative for relative in names), target / schema.FILE]
+
+
+def write_schema(path: Path) -> None:
+    """Write the JSON Schema that the first line of a pool file names, for editors."""
+    path.write_text(json.dumps(schema.pool_schema(), indent=2) + "\n", encoding="utf-8")
 
 
 def _files(source: Path) -> Iterator[Path]:

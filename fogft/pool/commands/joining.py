@@ -21,13 +21,13 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from fogft import disk, template_files
+from fogft import disk
 from fogft.errors import CredentialError, FogftError
 from fogft.model.certificate_holder import Holder, Role
 from fogft.model.credentials import CredentialPaths
-from fogft.model.endpoint import is_endpoint
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.membership import Found, to_dict
+from fogft.model.names import is_endpoint
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.pool.credentials import bundle, claiming
@@ -139,13 +139,10 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
         id = ReplicaId(identity.uid, int(holder.name), holder.generation)
         files["replica.yaml"] = configuration.replica_config(identity, spec, id)
     elif holder.role is Role.RENDEZVOUS:
-        files["rendezvous.yaml"] = template_files.render(
-            "rendezvous.yaml", {"pool_uid": identity.uid}
-        )
+        files["rendezvous.yaml"] = configuration.rendezvous_config(identity)
     else:
-        file = f"{_COMMANDS.get(holder.role, 'proxy')}.yaml"
-        files[file] = configuration.proxy_config(
-            PoolPaths(Path()), identity, spec, robot=holder.name, stem=stem, file=file
+        files[f"{_COMMANDS.get(holder.role, 'proxy')}.yaml"] = configuration.proxy_config(
+            PoolPaths(Path()), identity, spec, name=holder.name, role=holder.role
         )
         membership = store.membership()
         if membership is not None:

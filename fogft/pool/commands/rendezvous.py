@@ -11,17 +11,14 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
 from fogft.metrics.scrape import Scrape
-from fogft.model.credentials import CredentialPaths
-from fogft.model.names import POOL_UID_PATTERN
+from fogft.model.proxy_config import RendezvousConfig
 from fogft.pool.manager.metrics import of_rendezvous
+from fogft.poolfile import config_file
 from fogft.process import ENDING_SIGNALS, start_log
 from fogft.records import cache
 from fogft.records.exchange import Exchange
@@ -31,26 +28,7 @@ from fogft.records.signing import Verifier
 
 log = logging.getLogger(__name__)
 
-DEFAULT_LISTEN = "0.0.0.0:7450"
 _SAVE_EVERY_S = 0.5
-
-
-@dataclass(frozen=True)
-class RendezvousConfig:
-    """All that `fogft rendezvous` needs to know.
-
-    Attributes:
-        records: File that the records are kept in.
-        status: File for what was counted; None for nowhere.
-        metrics: ``host:port`` to answer Prometheus at; empty for none.
-    """
-
-    pool_uid: str
-    listen: str
-    credentials: CredentialPaths
-    records: Path
-    status: Path | None = None
-    metrics: str = ""
 
 
 def read_config(
@@ -61,29 +39,7 @@ def read_config(
     Raises:
         StateError: It cannot be read, or a key is missing or of the wrong type.
     """
-    import yaml
-
-    hint = "compare it with `templates/rendezvous.yaml`"
-    try:
-        raw: Mapping[str, Any] = yaml.safe_load(path.read_text())
-        base = path.resolve().parent
-        uid, ours = raw["pool_uid"], raw["credentials"]
-        if not isinstance(uid, str) or not POOL_UID_PATTERN.fullmatch(uid):
-            raise ValueError(f"{uid!r:.40} is not a pool's uid: quote 16 hexadecimal digits")
-        return RendezvousConfig(
-            pool_uid=uid,
-            listen=listen or str(raw.get("listen") or DEFAULT_LISTEN),
-            credentials=CredentialPaths(
-                *(base / str(ours[name]) for name in ("ca", "certificate", "key"))
-            ),
-            records=base / str(raw.get("records") or "records.json"),
-            status=base / str(raw["status"]) if raw.get("status") else None,
-            metrics=str(raw.get("metrics") or "") if metrics is None else metrics,
-        )
-    except KeyError as error:
-        raise StateError(f"`{path}`: key {error} is missing", hint) from error
-    except Exception as error:  # PyYAML passes on what its constructors raise
-        raise StateError(f"`{path}` cannot be used: {error}", hint) from error
+    return config_file.read(RendezvousConfig, path, {"listen": listen, "metrics": metrics})
 
 
 def run(config: RendezvousConfig) -> None:

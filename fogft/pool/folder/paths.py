@@ -124,7 +124,7 @@ class PoolPaths:
 
     @property
     def proxy_config(self) -> Path:
-        """The client proxy's configuration, rendered from `templates/proxy.yaml`."""
+        """The client proxy's configuration."""
         return self.folder / "proxy.yaml"
 
     @property

@@ -1,7 +1,6 @@
 """What the manager writes for the proxies: their configurations and certificates.
 
-Owns: the values in `templates/proxy.yaml` and `templates/replica.yaml`, and who gets which
-certificate.
+Owns: the values in `proxy.yaml` and `replica.yaml`, and who gets which certificate.
 Not here: reading them (`fogft.proxy.config`) and signing (`credentials`).
 """
 
@@ -11,15 +10,18 @@ import datetime
 import re
 import socket
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fogft import disk, template_files
+from fogft import disk
 from fogft.cloud.port import Launch
 from fogft.errors import CredentialError
 from fogft.model import certificate_holder
-from fogft.model.certificate_holder import Holder, holder_of
+from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.credentials import CredentialPaths
 from fogft.model.groups import FIRST_BY_HAND, replica_hash, services_at, task_at
+from fogft.model.proxy_config import ClientProxyConfig, RendezvousConfig, ServerProxyConfig
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning.planner import PlannedLaunch
@@ -27,14 +29,25 @@ from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
-from fogft.poolfile import workspace
-from fogft.poolfile.service_form import REPLICA_KEYS, to_plain
+from fogft.poolfile import config_file, workspace
 
 # A dead manager renews nothing and must stop no traffic.
 CERTIFICATE_DAYS = 365.0
 # What a certificate lasts beyond the end of a pool that has one.
 MARGIN_DAYS = 30.0
 RENEW_BEFORE = datetime.timedelta(days=60)
+_CLIENT_HEADING = (
+    "A client proxy, or a gateway. It is read again whenever it changes. Paths are relative to\n"
+    "this file's folder; what is not set here has its default."
+)
+_RENDEZVOUS_HEADING = (
+    "A rendezvous, for `fogft rendezvous --config`. It needs a port that robots and replicas can\n"
+    "reach, and carries no requests. Paths are relative to this file's folder."
+)
+_REPLICA_HEADING = (
+    "The server proxy of one replica. Options of `fogft serve` override it. Paths are relative to\n"
+    "this file's folder; what is not set here has its default."
+)
 
 
 def certificate_days(spec: PoolSpec) -> float:
@@ -68,9 +81,8 @@ def proxy_config(
     identity: Identity,
     spec: PoolSpec,
     *,
-    robot: str = "",
-    stem: str = "robot",
-    file: str = "proxy.yaml",
+    name: str = "",
+    role: Role = Role.ROBOT,
 ) -> str:
     """Return a client proxy's configuration, or a gateway's.
 
@@ -78,42 +90,38 @@ def proxy_config(
         paths: How its files are called; where they are does not matter.
         identity: The pool.
         spec: Its services.
-        robot: The robot's name; empty for this machine's.
-        stem: How its certificate and key are called.
-        file: The template.
+        name: The robot's or gateway's name; empty for this machine's robot.
+        role: Which of the two it is.
     """
-    return template_files.render(
-        file,
-        {
-            "pool": identity.name,
-            "pool_uid": identity.uid,
-            "robot": robot or robot_name(),
-            "membership": paths.membership.name,
-            "status": paths.proxy_status.name,
-            "lease": paths.lease.name,
-            "lock": paths.proxy_lock.name,
-            "ca": f"{paths.credentials.name}/ca.crt",
-            "certificate": f"{paths.credentials.name}/{stem}.crt",
-            "key": f"{paths.credentials.name}/{stem}.key",
-            "services": [to_plain(service) for service in spec.proxied],
-            "suspect_after_s": spec.health.suspect_after_s,
-            "rendezvous": list(spec.rendezvous),
-            "records": paths.records.name,
-            # A gateway's replicas hear of revocations from a rendezvous.
-            **(
-                {
-                    "revocations": paths.revocations.name,
-                    "rmw": spec.rmw.robot.value,
-                    "topics": [topic.to_plain() for topic in spec.topics],
-                }
-                if file == "proxy.yaml"
-                else {}
-            ),
-            "dial_in": "" if robot else spec.dial_in,  # that is where this machine is
-            "uplinks": [] if robot else list(spec.uplinks),  # and these are its own
-            "metrics": "" if robot else spec.metrics.proxy,
-        },
+    folder, stem = Path(paths.credentials.name), role.value
+    config = ClientProxyConfig(
+        pool=identity.name,
+        pool_uid=identity.uid,
+        robot=name or robot_name(),
+        membership=Path(paths.membership.name),
+        status=Path(paths.proxy_status.name),
+        lease=Path(paths.lease.name),
+        lock=Path(paths.proxy_lock.name),
+        credentials=CredentialPaths(
+            folder / "ca.crt", folder / f"{stem}.crt", folder / f"{stem}.key"
+        ),
+        services=spec.proxied,
+        suspect_after_s=spec.health.suspect_after_s,
+        rendezvous=spec.rendezvous,
+        records=Path(paths.records.name),
     )
+    if role is Role.ROBOT:  # a gateway's replicas hear of revocations from a rendezvous
+        config = replace(
+            config,
+            revocations=Path(paths.revocations.name),
+            rmw=spec.rmw.robot,
+            topics=spec.topics,
+        )
+    if not name:  # what belongs to this machine
+        config = replace(
+            config, dial_in=spec.dial_in, uplinks=spec.uplinks, metrics=spec.metrics.proxy
+        )
+    return config_file.document(config, _CLIENT_HEADING)
 
 
 def certify_robot(
@@ -145,7 +153,7 @@ def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder
         StateError: They cannot be written; the old ones stay.
     """
     holder, issued = Ledger(paths.credentials).issue_next(
-        certificate_holder.Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
+        Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
     )
     authority.write(issued, paths.credentials, "robot")
     return holder
@@ -185,25 +193,32 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
     envs: dict[str, Any] = dict(spec.task.get("envs") or {})
     if services != spec.services:  # `run` need not start the others
         envs.setdefault("FOGFT_SERVICES", ",".join(service.name for service in services))
-    return template_files.render(
-        "replica.yaml",
-        {
-            "pool": identity.name,
-            "pool_uid": identity.uid,
-            "slot": id.slot,
-            "generation": id.generation,
-            "services": [to_plain(service, REPLICA_KEYS) for service in services],
-            "topics": [topic.to_plain() for topic in spec.topics],
-            "run": str(spec.task.get("run") or ""),
-            "envs": {str(k): "" if v is None else str(v) for k, v in envs.items()},
-            "orphan_after_s": spec.health.orphan_after_s,
-            "rendezvous": list(spec.rendezvous),
-            "dial_out": [spec.dial_in] if spec.dial_in else [],
-            # Those that the manager launches may share an address; others have one of their own.
-            "metrics": spec.metrics.of_replica(id.slot if id.slot < FIRST_BY_HAND else 0),
-            "rmw": spec.rmw.replica.value,
-        },
+    config = ServerProxyConfig(
+        pool=identity.name,
+        pool_uid=identity.uid,
+        slot=id.slot,
+        generation=id.generation,
+        services=services,
+        run=str(spec.task.get("run") or ""),
+        credentials=CredentialPaths(Path("ca.crt"), Path("replica.crt"), Path("replica.key")),
+        envs={str(k): "" if v is None else str(v) for k, v in envs.items()},
+        orphan_after_s=spec.orphan_after_s,
+        rendezvous=spec.rendezvous,
+        records=Path("records.json"),
+        dial_out=(spec.dial_in,) if spec.dial_in else (),
+        # Those that the manager launches may share an address; others have one of their own.
+        metrics=spec.metrics.of_replica(id.slot if id.slot < FIRST_BY_HAND else 0),
+        topics=spec.topics,
+        rmw=spec.rmw.replica,
     )
+    return config_file.document(config, _REPLICA_HEADING)
+
+
+def rendezvous_config(identity: Identity) -> str:
+    """Return a rendezvous's configuration."""
+    paths = (Path(name) for name in ("ca.crt", "rendezvous.crt", "rendezvous.key"))
+    config = RendezvousConfig(identity.uid, CredentialPaths(*paths), status=Path("status.json"))
+    return config_file.document(config, _RENDEZVOUS_HEADING)
 
 
 def absolute(task: Mapping[str, Any], base: Path) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def known(store: PoolStore) -> Known:
             for r in sorted(history.open(), key=lambda r: (r.slot, r.generation))
         )
         clouds = frozenset(place.split("/")[0] for place in history.locations if place)
-        return Known(pool, running, clouds, store.spec().health.orphan_after_s)
+        return Known(pool, running, clouds, store.spec().orphan_after_s)
     except FogftError:
         return Known(pool)
 

@@ -16,11 +16,12 @@ from fogft.cloud import notice
 from fogft.link.zenoh import runtime
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
+from fogft.model.proxy_config import ServerProxyConfig
 from fogft.model.type_definition import Definition
 from fogft.process import start_log, stop_on_signal
 from fogft.proxy import middleware, start
 from fogft.proxy.announcing import Presence
-from fogft.proxy.config import ServerProxyConfig, read_server
+from fogft.proxy.config import read_server
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.ros import environment, memory_tuning

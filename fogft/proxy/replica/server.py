@@ -27,9 +27,9 @@ from fogft.model import names
 from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import Part, ServiceSpec
+from fogft.model.state import StateSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
-from fogft.poolfile.state import StateSpec
 from fogft.proxy.replica.goals_once import GoalsOnce
 from fogft.proxy.replica.interruption import CANCEL_TYPE
 from fogft.proxy.replica.offering import Offering

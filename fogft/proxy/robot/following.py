@@ -21,8 +21,8 @@ from fogft.disk import Watched
 from fogft.link.dial_out.robot import DialIn
 from fogft.model.certificate_holder import Holder, Role, holder_of
 from fogft.model.membership import from_dict, is_newer
+from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import Member, Membership
-from fogft.proxy.config import ClientProxyConfig
 from fogft.records import roster
 from fogft.records.client import Known, RendezvousClient
 from fogft.records.record import RecordKind

@@ -24,10 +24,11 @@ from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.model import names
 from fogft.model.middleware import Speaks
+from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.spec import Part, ServiceSpec
 from fogft.process import start_log, stop_on_signal
 from fogft.proxy import middleware, start
-from fogft.proxy.config import ClientProxyConfig, read_client
+from fogft.proxy.config import read_client
 from fogft.proxy.order_mark import MarkFile
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy

@@ -40,8 +40,9 @@ def identity(tmp: Path) -> Identity:
 
 
 def spec(**task: object) -> PoolSpec:
-    health = HealthSpec(suspect_after_s=3.5, orphan_after_s=120.0)
-    return PoolSpec("pool", SERVICES, health=health, task={"run": "exec serve", **task})
+    health = HealthSpec(suspect_after_s=3.5)
+    whole = {"run": "exec serve", **task}
+    return PoolSpec("pool", SERVICES, health=health, orphan_after_s=120.0, task=whole)
 
 
 def test_each_side_is_told_how_it_speaks_ros(paths: PoolPaths) -> None:
@@ -61,7 +62,7 @@ def planned() -> PlannedLaunch:
 
 
 def test_the_client_proxy_reads_what_was_written(paths: PoolPaths) -> None:
-    """Every key survives the template, and paths lead to the pool's files."""
+    """Every key survives, and paths lead to the pool's files."""
     assert configuration.write_proxy_config(paths, identity(paths.folder), spec())
     config = read_client(paths.proxy_config)
     assert (config.pool, config.pool_uid, config.services) == ("pool", UID, SERVICES)
@@ -78,7 +79,7 @@ def test_where_each_process_answers_prometheus_is_passed_on(paths: PoolPaths) ->
     configuration.write_proxy_config(paths, identity(paths.folder), asked)
     assert read_client(paths.proxy_config).metrics == "h:1"
     assert read_client(paths.proxy_config, "h:9").metrics == "h:9"
-    other = configuration.proxy_config(paths, identity(paths.folder), asked, robot="other")
+    other = configuration.proxy_config(paths, identity(paths.folder), asked, name="other")
     (paths.folder / "other.yaml").write_text(other)
     assert read_client(paths.folder / "other.yaml").metrics == ""
     id = ReplicaId(UID, 3, 1)

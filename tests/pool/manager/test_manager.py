@@ -83,10 +83,10 @@ def test_scale_and_file_change_reach_a_running_manager(scene: Scene) -> None:
     scene.wait(lambda: scene.whole(1))
     scene.store.write_intent(intents.scale(scene.store.intent(), scene.store.spec(), 2))
     scene.wait(lambda: scene.whole(3))
-    assert 'timeout_s": 5.0' in scene.paths.proxy_config.read_text()
+    assert "timeout_s: 5.0" in scene.paths.proxy_config.read_text()
     scene.write(replicas=2, timeout_s=7.0)
     scene.wait(lambda: scene.whole(2))
-    scene.wait(lambda: 'timeout_s": 7.0' in scene.paths.proxy_config.read_text())
+    scene.wait(lambda: "timeout_s: 7.0" in scene.paths.proxy_config.read_text())
 
 
 def test_dead_proxy_is_started_again(scene: Scene) -> None:

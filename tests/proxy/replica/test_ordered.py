@@ -8,7 +8,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
-from fogft.poolfile.state import StateService, StateSpec
+from fogft.model.state import StateService, StateSpec
 from fogft.proxy.order_mark import MarkFile
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.robot.ordered_dispatcher import OrderedDispatcher

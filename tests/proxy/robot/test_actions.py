@@ -6,12 +6,13 @@ from typing import Any
 
 import pytest
 
-from fogft.poolfile.topics import action_services
+from fogft.model.topic import ActionSpec
+from fogft.poolfile.actions import action_services
 from fogft.proxy.robot.actions import Actions
 from fogft.topics.goals import cancel_request, goal_of
 from tests.proxy.fakes import Clock, FakeLink
 
-GOAL, CANCEL, RESULT = action_services("/count", "p/action/T", 5.0, 60.0)
+GOAL, CANCEL, RESULT = action_services(ActionSpec("/count", "p/action/T", 5.0, 60.0))
 HEADER = b"\0\1\0\0"
 ID = b"i" * 16
 ACCEPTED, REFUSED = HEADER + b"\1", HEADER + b"\0"

@@ -29,7 +29,7 @@ lease: lease.json
 lock: proxy.lock
 credentials: {{ca: ca.crt, certificate: robot.crt, key: robot.key}}
 services: [{{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 2.0}}]
-health: {{suspect_after_s: 2.0}}
+suspect_after_s: 2.0
 domain_id: 3
 """
 REPLICA = f"""\
@@ -118,7 +118,7 @@ def test_a_damaged_lease_is_no_error(tmp_path_factory, content):
 )
 def test_a_value_that_would_break_a_link_later_is_an_error_now(tmp_path, key, wrong):
     (tmp_path / "proxy.yaml").write_text(CLIENT.replace(key, wrong))
-    with pytest.raises(FogftError, match="is not usable"):
+    with pytest.raises(FogftError, match=r"proxy\.yaml:\d+: .*" + key.partition(":")[0]):
         read_client(tmp_path / "proxy.yaml")
 
 
@@ -142,8 +142,9 @@ def test_where_notices_come_from(tmp_path, line, source):
 @pytest.mark.parametrize("line", ["notice: no", "notice: 'file:'", "notice: ibm", "notice: []"])
 def test_an_unknown_source_of_notices_is_an_error(tmp_path, line):
     (tmp_path / "replica.yaml").write_text(f"{REPLICA}{line}\n")
-    with pytest.raises(FogftError, match="file:PATH"):
+    with pytest.raises(FogftError, match=r"replica\.yaml:\d+: notice: ") as caught:
         read_server(tmp_path / "replica.yaml")
+    assert "file:PATH" in caught.value.hint
 
 
 def test_a_file_that_stays_bad_is_logged_once(tmp_path, caplog):

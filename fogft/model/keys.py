@@ -1,0 +1,239 @@
+"""All that is to be said of a key of the pool file, said once, beside the value that it sets. Pure.
+
+A field of a specification's dataclass is made by `key`: what may stand there, its unit, its
+default and its help. The reader of the pool file, the JSON Schema, the page `docs/pool-file.md`,
+the ROS parameters and the proxies' configuration files all come from that.
+
+    class HealthSpec:
+        suspect_after_s: float = key(Number(3600, "seconds"), "Mark a replica ...", default=2.0)
+
+Owns: the forms that a value may have, and what a dataclass says of its keys.
+Not here: reading them (`fogft.poolfile.reader`), what does not go with what
+(`fogft.poolfile.rules`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+DAY_S = 86_400.0
+LONGEST_S = 1e7  # what a request's header can carry
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number above 0, or from 0 on, up to a limit."""
+
+    most: float
+    unit: str = ""
+    from_zero: bool = False
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A whole number between two limits."""
+
+    least: int
+    most: int
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Flag:
+    """True or false."""
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """One of an enumeration's values; `hidden` ones stand only in the proxies' configurations."""
+
+    of: type[Enum]
+    hidden: tuple[Enum, ...] = ()
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text of some form.
+
+    Attributes:
+        what: What it must be, such as ``a service name``.
+        hint: What to do where it is not.
+        check: Returns the text as it is kept. Raises ValueError with what is wrong.
+        suggest: Returns what was probably meant; empty for nothing.
+    """
+
+    what: str
+    hint: str
+    check: Callable[[str], str] = str
+    suggest: Callable[[str], str] = lambda text: ""
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A list of different texts."""
+
+    of: Text
+    most: int
+    least: int = 1
+
+
+@dataclass(frozen=True)
+class Table:
+    """A map from texts to numbers; kept as pairs where `as_pairs` says so."""
+
+    of: Number
+    name: Text
+    as_pairs: bool = False
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map whose keys are a dataclass's.
+
+    Attributes:
+        of: The dataclass.
+        hint: How it is written.
+        short: Keys that a plain value in place of the map stands for.
+        off: Whether `false` in its place means None.
+    """
+
+    of: type
+    hint: str = ""
+    short: tuple[str, ...] = ()
+    off: bool = False
+
+
+@dataclass(frozen=True)
+class Maps:
+    """A list of such maps, each with a name of its own."""
+
+    of: type
+    hint: str
+    most: int = 1000
+
+
+@dataclass(frozen=True)
+class Free:
+    """A map that is passed on as it is."""
+
+    hint: str
+
+
+@dataclass(frozen=True)
+class Special:
+    """What no other form describes.
+
+    Attributes:
+        what: What may stand there, for people.
+        read: Returns the value of what stands there. Raises ValueError; a hint may follow ``; ``.
+        plain: The way back.
+        schema: As a JSON Schema has it.
+    """
+
+    what: str
+    read: Callable[[Any], Any]
+    plain: Callable[[Any], Any]
+    schema: dict[str, Any]
+
+
+def _path(written: Any) -> Path:
+    if not isinstance(written, str) or not written or "\0" in written:
+        raise ValueError(f"must be a path, not {written!r:.40}")
+    return Path(written)
+
+
+PATH = Special("a path, relative to the file's folder", _path, str, {"type": "string"})
+
+Form = Number | Whole | Flag | OneOf | Text | Listed | Table | Map | Maps | Free | Special
+
+
+@dataclass(frozen=True)
+class Key:
+    """What is said of one key.
+
+    Attributes:
+        form: What may stand there.
+        help: What it does, for people.
+        name: The key, where the field is called otherwise.
+        usual: The default in words, where the value says nothing to people.
+        advanced: Whether it stands under `advanced`.
+        internal: Whether only the proxies' configurations have it.
+        parameter: Whether it is a ROS parameter of the client proxy.
+        on_replica: Whether a replica needs it too.
+    """
+
+    form: Form
+    help: str
+    name: str = ""
+    usual: str = ""
+    advanced: bool = False
+    internal: bool = False
+    parameter: bool = False
+    on_replica: bool = False
+
+
+class Entry(NamedTuple):
+    """One key of a dataclass.
+
+    Attributes:
+        path: The field's name; of a field within another field, both.
+    """
+
+    path: tuple[str, ...]
+    name: str
+    key: Key
+    default: Any
+
+    @property
+    def required(self) -> bool:
+        """Whether it must be there."""
+        return self.default is MISSING
+
+
+def key(
+    form: Form,
+    help: str,
+    *,
+    default: Any = MISSING,
+    default_factory: Any = MISSING,
+    **more: Any,
+) -> Any:
+    """Return a dataclass's field that is a key of the pool file; `more` is the rest of `Key`."""
+    said = {"key": Key(form, help, **more)}
+    if default_factory is not MISSING:
+        return field(default_factory=default_factory, metadata=said)
+    if default is not MISSING:
+        return field(default=default, metadata=said)
+    return field(metadata=said)
+
+
+_KNOWN: dict[type, tuple[Entry, ...]] = {}
+
+
+def within(of: type) -> Any:
+    """Return a field that holds a dataclass whose keys stand among this one's."""
+    return field(default_factory=of, metadata={"within": of})
+
+
+def keys_of(cls: type) -> tuple[Entry, ...]:
+    """Return the keys of a dataclass, in order."""
+    if cls not in _KNOWN:
+        _KNOWN[cls] = tuple(_entries(cls))
+    return _KNOWN[cls]
+
+
+def _entries(cls: type) -> Iterator[Entry]:
+    for one in dataclasses.fields(cls):
+        said: Key | None = one.metadata.get("key")
+        if said is not None:
+            default = one.default
+            if one.default_factory is not MISSING:
+                default = one.default_factory()
+            yield Entry((one.name,), said.name or one.name, said, default)
+        for below in keys_of(one.metadata["within"]) if "within" in one.metadata else ():
+            yield below._replace(path=(one.name, *below.path))

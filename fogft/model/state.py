@@ -1,0 +1,58 @@
+"""By which two services a service's state is taken and given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fogft.model.keys import Map, Text, key
+from fogft.model.ros_names import field_path, service_name, service_type, suggested_service_type
+
+SNAPSHOT_TYPE = "nav_msgs/srv/GetMap"
+RESTORE_TYPE = "nav_msgs/srv/SetMap"
+FIELD = "map.data"
+_HINT = "write `state: {snapshot: /svc/get_state, restore: /svc/set_state}`"
+_END_HINT = "write `{name: ..., type: ..., field: ...}`"
+
+
+@dataclass(frozen=True)
+class StateService:
+    """A service that carries a state."""
+
+    name: str = key(
+        Text("a service name", "write a name such as `/svc/get_state`", service_name),
+        "Name of the service.",
+        on_replica=True,
+    )
+    type: str = key(
+        Text("a service type", _END_HINT, service_type, suggested_service_type),
+        "Its type.",
+        default="",
+        usual=f"`{SNAPSHOT_TYPE}`, `{RESTORE_TYPE}`",
+        on_replica=True,
+    )
+    field: str = key(
+        Text("the path of a field", f"write a path such as `field: {FIELD}`", field_path),
+        "The text or byte field that holds the state: of the response for a snapshot, of the "
+        "request for a restore.",
+        default="",
+        usual=f"`{FIELD}`",
+        on_replica=True,
+    )
+
+
+@dataclass(frozen=True)
+class StateSpec:
+    """How a service's state is taken and given."""
+
+    snapshot: StateService = key(
+        Map(StateService, _HINT, short=("name",)),
+        "The service that returns the whole state, called between two requests. A name alone "
+        f"stands for one of type `{SNAPSHOT_TYPE}` with the state in `{FIELD}`.",
+        on_replica=True,
+    )
+    restore: StateService = key(
+        Map(StateService, _HINT, short=("name",)),
+        "The service that replaces the whole state. A name alone stands for one of type "
+        f"`{RESTORE_TYPE}`.",
+        on_replica=True,
+    )

@@ -1,0 +1,68 @@
+"""A process's configuration file: written and read by the table that describes it.
+
+Owns: YAML on disk, paths relative to the file. Not here: what it holds
+(`fogft.model.proxy_config`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from fogft.errors import SpecError, StateError
+from fogft.poolfile import yaml_tree
+from fogft.poolfile.plain import to_plain
+from fogft.poolfile.reader import Reader
+from fogft.poolfile.tree import Node, Section, tree
+
+T = TypeVar("T")
+_HINT = "it is written by `fogft up` or `fogft join`: run that again"
+
+
+def document(config: Any, heading: str) -> str:
+    """Return a configuration as YAML, below a comment."""
+    import yaml
+
+    comment = "".join(f"# {line}\n" for line in heading.splitlines())
+    return comment + yaml.safe_dump(to_plain(config), sort_keys=False, width=100)
+
+
+def read(cls: type[T], path: Path, override: Mapping[str, Any] | None = None) -> T:
+    """Return a configuration; paths in it are absolute then.
+
+    Args:
+        cls: Its dataclass.
+        path: The file.
+        override: Keys that replace the file's; those that are None do not.
+
+    Raises:
+        StateError: It cannot be read, or a key is missing or of the wrong type.
+    """
+    try:
+        root = yaml_tree.tree(path.read_text(), str(path))
+        given = {k: v for k, v in (override or {}).items() if v is not None}
+        if isinstance(root.value, Mapping):
+            kept = {k: child for k, child in root.value.items() if child.value is not None}
+            over = {key: tree(value) for key, value in given.items()}
+            root = Node({**kept, **over}, root.line, root.key_line)
+        made = Reader({}, internal=True).map(cls, Section(str(path), "", root))
+    except SpecError as error:
+        raise StateError(error.message, error.hint or _HINT) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise StateError(f"`{path}` cannot be read: {error}", _HINT) from error
+    resolved: T = _resolved(made, path.resolve().parent)
+    return resolved
+
+
+def _resolved(value: Any, base: Path) -> Any:
+    """Return a dataclass whose paths no longer depend on where a process runs."""
+    changed: dict[str, Any] = {}
+    for one in fields(value):
+        held = getattr(value, one.name)
+        if isinstance(held, Path):
+            changed[one.name] = base / held
+        elif is_dataclass(held) and not isinstance(held, type):
+            changed[one.name] = _resolved(held, base)
+    return replace(value, **changed) if changed else value

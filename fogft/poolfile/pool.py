@@ -1,0 +1,204 @@
+"""Judge a pool file and turn it into a `PoolSpec`. Pure: the tree and the type check come in.
+
+A pool file is a SkyPilot task with a `fogft` section. Ours is checked to the last key; of
+SkyPilot's keys only the names are, and what a pool cannot do. The rest passes untouched.
+
+Owns: rules about the whole pool, and what only this machine can tell.
+Not here: YAML (`yaml_tree`), single maps (`reader`, `rules`), prices and regions (the cloud
+judges `resources`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import PurePath
+from typing import Any
+
+from fogft.model.choices import MAX_REPLICAS, GroupSpec
+from fogft.model.groups import MAX_GROUPS
+from fogft.model.middleware import Speaks
+from fogft.model.names import POOL_NAME_PATTERN
+from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.model.state import StateSpec
+from fogft.poolfile import rules
+from fogft.poolfile.actions import action_services, action_topics
+from fogft.poolfile.reader import Reader
+from fogft.poolfile.task import check_task
+from fogft.poolfile.tree import Node, Section, plain, shown
+
+# What only this machine can tell. Each returns what is wrong, None if nothing is; what to
+# do about it may follow after "; ".
+TypeCheck = Callable[[str], str | None]  # of a service or message type
+FieldCheck = Callable[[str, str], str | None]  # of a service type and a boolean response field
+StateCheck = Callable[[StateSpec], str | None]  # of a service's `state`
+ToleranceCheck = Callable[[str, Mapping[str, float]], str | None]  # of a type, by field
+FolderCheck = Callable[[str], str | None]  # of `workdir`
+
+
+def pool_spec(
+    root: Node,
+    file: str,
+    *,
+    check_types: TypeCheck | None = None,
+    check_fields: FieldCheck | None = None,
+    check_states: StateCheck | None = None,
+    check_tolerances: ToleranceCheck | None = None,
+    check_workdir: FolderCheck | None = None,
+) -> PoolSpec:
+    """Return what a pool file asks for.
+
+    Args:
+        root: The file's tree.
+        file: Its name as the user wrote it: begins every message, and its stem is the
+            pool's name where the file gives none.
+        check_types: Says why a type of a service or message cannot be loaded here. Asked last,
+            once for each, when all else is right.
+        check_fields: Says why a type's response has no boolean field of that name.
+        check_states: Says why a service's state cannot travel by the services that `state` names.
+        check_tolerances: Says why a type's responses cannot be compared with such tolerances.
+        check_workdir: Says why a `workdir` cannot be used here.
+
+    Raises:
+        SpecError: The first mistake found; ``file:line: key: what is wrong``.
+    """
+    top = Section(file, "", root, "write a SkyPilot task with a `fogft` section")
+    check_task(top)
+    ours = top.section("fogft", "write `fogft:` with `services:` below it")
+    task = {key: plain(node) for key, node in top.children.items() if key != "fogft"}
+
+    def whole(section: Section, made: PoolSpec) -> PoolSpec:
+        return _whole(section, replace(made, name=_name(top), task=task))
+
+    spec: PoolSpec = Reader({**rules.RULES, PoolSpec: whole}).map(PoolSpec, ours)
+    workdir = spec.task.get("workdir")
+    if isinstance(workdir, str) and check_workdir is not None:
+        _judge(top, "workdir", check_workdir(workdir))
+    sections = ours.sections("services", "") if "services" in ours.children else ()
+    for section, service in zip(sections, spec.services, strict=False):
+        _check_quorum(section, service, spec)
+    for section, service in zip(sections, spec.services, strict=False):
+        passes_through = spec.rmw.robot is Speaks.ZENOH and not service.needs_type
+        if check_types is not None and not passes_through:
+            _judge(section, "type", check_types(service.type))
+        if service.ok_field and check_fields is not None:
+            _judge(section, "ok_field", check_fields(service.type, service.ok_field))
+        if service.tolerance and check_tolerances is not None:
+            reason = check_tolerances(service.type, dict(service.tolerance))
+            _judge(section, "tolerance", reason)
+        if service.state is not None and check_states is not None:
+            _judge(section, "state", check_states(service.state))
+    for key, end in (("topics", ""), ("actions", "_SendGoal")):
+        if key in ours.children and check_types is not None:
+            for section in ours.sections(key, ""):
+                _judge(section, "type", check_types(section.text("type", "") + end))
+    return spec
+
+
+def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
+    """Return the pool with its groups, its number and its actions, if they go together."""
+    groups = _groups(ours, made)
+    # A target finds its own number; the file's is then the fewest.
+    if "replicas" not in ours.children:
+        usual = sum(g.replicas for g in groups) or (1 if made.availability else made.replicas)
+        made = replace(made, replicas=usual)
+    if ours.has("on_demand"):
+        most = MAX_REPLICAS if made.availability else made.replicas
+        rules.on_demand(ours.section("on_demand"), made.on_demand, most)
+    parts = [(action_services(a), action_topics(a)) for a in made.actions]
+    spec = replace(
+        made,
+        groups=groups,
+        services=(*made.services, *(one for services, _ in parts for one in services)),
+        topics=(*made.topics, *(one for _, topics in parts for one in topics)),
+    )
+    _check_topology(ours, made.services, spec)
+    if spec.topics and Speaks.ZENOH in (spec.rmw.robot, spec.rmw.replica):
+        what = "does not go with `rmw: zenoh`: services only pass there"
+        raise ours.error(_topics_key(ours), what, "remove one of the two")
+    return spec
+
+
+def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
+    if not made.groups:
+        return ()
+    for key, instead in (
+        ("replicas", "each group has its own `replicas`"),
+        ("on_demand", "each group has its own `on_demand`"),
+    ):
+        if key in ours.children:
+            raise ours.error(key, "cannot stand beside `groups`", instead, at_key=True)
+    shared: Any = made.task.get("resources") or {}
+    for section, group in zip(ours.sections("groups", ""), made.groups, strict=True):
+        rules.on_demand(section.section("on_demand"), group.on_demand, group.replicas)
+    if len(made.groups) > MAX_GROUPS:
+        raise ours.error("groups", f"are {len(made.groups)}, and at most {MAX_GROUPS} can be had")
+    total = sum(group.replicas for group in made.groups)
+    if total > MAX_REPLICAS:
+        raise ours.error("groups", f"ask for {total} replicas; at most {MAX_REPLICAS} can be had")
+    return tuple(replace(g, resources={**shared, **g.resources}) for g in made.groups)
+
+
+def _check_topology(ours: Section, services: tuple[ServiceSpec, ...], spec: PoolSpec) -> None:
+    if not spec.topology:
+        return
+    for service in services:
+        key = "state" if service.state is not None else "quorum" if service.quorum > 1 else ""
+        if key:
+            raise ours.error(
+                "topology",
+                f"does not go with service `{service.name}`, which has `{key}`",
+                "put that service into a pool of its own: the robot must ask each replica itself",
+            )
+    if not spec.rendezvous:
+        raise ours.error(
+            "topology",
+            "needs a `rendezvous`: gateways learn there where replicas are",
+            "add one, such as `rendezvous: [meet.example.org:7450]`",
+        )
+    if spec.topics:
+        what = "does not go with `topology`: gateways pass services only"
+        raise ours.error(_topics_key(ours), what, "remove one of the two")
+
+
+def _topics_key(ours: Section) -> str:
+    return "actions" if "actions" in ours.children else "topics"
+
+
+def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> None:
+    """Refuse a quorum that can never be reached, or at some time of the week cannot."""
+    windows = spec.schedule.windows if spec.schedule else ()
+    fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas is not None)])
+    carry = max(fewest, service.min_replicas)
+    if service.quorum > carry:
+        where = " in a window of `schedule`" if fewest < spec.replicas else ""
+        raise section.error(
+            "quorum",
+            f"is {service.quorum}, but only {carry} can be asked{where}: no answer could win",
+            f"write `replicas: {service.quorum}` or more there, or a smaller `quorum`",
+        )
+
+
+def _judge(section: Section, key: str, reason: str | None) -> None:
+    if reason is not None:
+        what, _, todo = reason.partition("; ")
+        raise section.error(key, shown(what, 300)[1:-1], shown(todo, 300)[1:-1])
+
+
+def _name(top: Section) -> str:
+    hint = "use lower-case letters, digits and dashes, at most 40, such as `{}`"
+    if "name" in top.children:
+        name = top.text("name", hint.format("perception"))
+        if POOL_NAME_PATTERN.fullmatch(name):
+            return name
+        raise top.error("name", f"{shown(name)} is not a pool name", hint.format(_slug(name)))
+    name = PurePath(top.file).stem
+    if POOL_NAME_PATTERN.fullmatch(name):
+        return name
+    what = f"is missing, and the file's own name {shown(name)} is not a pool name"
+    raise top.error("name", what, f"add `name: {_slug(name)}`")
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", name.lower())[:40].strip("-") or "perception"

@@ -1,0 +1,76 @@
+"""Keys that stand elsewhere, have another name, or are gone: what to write instead. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from fogft.model.choices import (
+    AvailabilitySpec,
+    FallbackSpec,
+    OnDemandSpec,
+    PlacementSpec,
+    ScheduleSpec,
+)
+from fogft.model.keys import keys_of
+from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
+from fogft.model.state import StateSpec
+from fogft.model.topology import Gateway, RobotRoute, Topology
+
+TASK_PLACES = ("run", "setup", "resources", "workdir", "envs")
+_AUTOSCALE = {
+    "autoscale": "is not supported yet; remove it: `fogft scale` or `schedule` say how many "
+    "replicas there are"
+}
+_DEFAULT_IS_RIGHT = "is no key any more; remove it: the default is right"
+_HINTS: dict[type, dict[str, str]] = {
+    PoolSpec: {**_AUTOSCALE},
+    ServiceSpec: {
+        **_AUTOSCALE,
+        "hedging_budget": _DEFAULT_IS_RIGHT,
+        "replicas": "is called `min_replicas` now; write that",
+        "uplinks": "is called `uplink_policy` now; write `advanced: {uplink_policy: ...}`",
+        "fallback": "is called `fallback_service` now; write `fallback_service: {name: ...}`",
+    },
+    FallbackSpec: {
+        "service": "is called `name` now; write `fallback_service: {name: ...}`",
+        "limit_s": _DEFAULT_IS_RIGHT,
+    },
+    AvailabilitySpec: {"correlation": _DEFAULT_IS_RIGHT},
+    PlacementSpec: {"price_weight": "is no key any more; set `latency_weight` in proportion"},
+    ScheduleSpec: {"prelaunch_s": _DEFAULT_IS_RIGHT},
+    StateSpec: {
+        "shared": "is no key any more: a service with `state` is for one robot; for several "
+        "robots remove `state` and let the service keep its state in a replicated store, such as "
+        "etcd; docs/state.md shows how"
+    },
+    Topology: {"through": "is called `default_gateways` now; write that"},
+    Gateway: {"through": "is called `upstream` now; write that"},
+    RobotRoute: {"through": "is called `gateways` now; write that"},
+}
+
+
+def hints(cls: type) -> Mapping[str, str]:
+    """Return what is to be said of keys that a map does not have any more, or not yet."""
+    return _HINTS.get(cls, {})
+
+
+def places(cls: type | None) -> dict[str, str]:
+    """Return where the keys are at home that do not stand in a map of this kind."""
+    here = {entry.name for entry in keys_of(cls) if not entry.key.advanced} if cls else set()
+    homes: list[tuple[list[str], str]] = [(list(TASK_PLACES), "at the top level of the file")]
+    for home, where in (
+        (PoolSpec, "under `fogft`"),
+        (ServiceSpec, "in a service, under `fogft.services`"),
+        (HealthSpec, "under `fogft.health`"),
+        (OnDemandSpec, "under `fogft.on_demand`"),
+    ):
+        homes.insert(
+            0, ([e.name for e in keys_of(home) if e.key.advanced], f"{where}, in `advanced`")
+        )
+        homes.insert(0, ([e.name for e in keys_of(home) if not e.key.advanced], where))
+    found: dict[str, str] = {}
+    for names, where in homes:
+        for name in names:
+            if name not in here and name not in ("name", "type", "fallback"):
+                found[name] = where
+    return found

@@ -1,0 +1,214 @@
+"""What does not go with what in a pool file. Pure.
+
+Each rule judges one map after its keys were read, and may return another value for it.
+
+Owns: rules within one map. Not here: the forms of single values (`fogft.model.keys`), rules
+about the whole pool (`pool`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from fogft.model import schedule, state
+from fogft.model.choices import (
+    MetricsSpec,
+    OnDemandSpec,
+    ScheduleSpec,
+    WindowSpec,
+)
+from fogft.model.names import gateway_slot
+from fogft.model.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
+from fogft.model.state import StateService, StateSpec
+from fogft.model.topic import Origin, TopicSpec
+from fogft.model.topology import Topology, find_loop
+from fogft.poolfile.tree import Section, shown
+
+DAY_END_S = 86_400
+_LAST_REPLICA_PORT = 65535 - 1000  # slots that the manager launches go up to 999
+
+
+def service(section: Section, made: ServiceSpec) -> ServiceSpec:
+    """Judge one of `services`."""
+    _stateful(section, made)
+    _with_quorum(section, made)
+    if made.cancel == made.name:
+        hint = f"write the name of its cancel service, such as `cancel: {made.name}_cancel`"
+        raise section.error("cancel", "is the service itself", hint)
+    if made.concurrency > 1 and made.cancel:
+        raise section.error(
+            "concurrency",
+            "must be 1 where there is a `cancel` service: that names no request",
+            "remove one of the two",
+        )
+    _fallback(section, made)
+    return made
+
+
+def _stateful(section: Section, made: ServiceSpec) -> None:
+    """A stateful service is asked of every replica, and its first answer is the answer."""
+    if made.state is None:
+        return
+    for key in ("ok_field", "hedging", "concurrency", "cancel", "quorum", "trace"):
+        if section.has(key) and not (key == "hedging" and made.hedging is HedgingMode.ALL):
+            what = "does not go with `state`: every replica applies every request"
+            raise section.error(key, what, "remove it")
+    for key, value in (("freshness", "latest"), ("advertise", Advertise.WHILE_READY.value)):
+        chosen = getattr(made, key)
+        if chosen is not None and chosen.value == value:
+            what = f"cannot be `{value}` for a service with `state`: its requests are kept in order"
+            raise section.error(key, what, "remove it")
+    if made.on_timeout is OnTimeout.FALLBACK:
+        what = "cannot be `fallback` for a service with `state`: it knows none of it"
+        raise section.error("on_timeout", what, "write `silent` or `empty`")
+
+
+def _with_quorum(section: Section, made: ServiceSpec) -> None:
+    if made.tolerance and not section.has("quorum"):
+        what = "has no meaning here: answers are compared only with a `quorum`"
+        raise section.error("tolerance", what, "write `quorum: 2`, or remove it")
+    for key in ("ok_field", "hedging", "cancel") if section.has("quorum") else ():
+        if section.has(key) and not (key == "hedging" and made.hedging is HedgingMode.ALL):
+            what = "does not go with `quorum`: every replica is asked, and every answer counts"
+            raise section.error(key, what, "remove it")
+
+
+def _fallback(section: Section, made: ServiceSpec) -> None:
+    """`on_timeout: fallback` needs a fallback service, and nothing else may have one."""
+    key, other = "fallback_service", made.fallback
+    example = f"such as `{key}: {{name: {made.name}_onboard}}`"
+    if made.on_timeout is not OnTimeout.FALLBACK:
+        if other is not None:
+            what = "is not used: `on_timeout` is not `fallback`"
+            raise section.error(key, what, "write `on_timeout: fallback`, or remove it")
+        return
+    if other is None:
+        hint = f"name a service of the same type on the robot, {example}"
+        raise section.error(key, "is missing", hint)
+    below = section.section(key)
+    if other.service == made.name:
+        hint = f"write the name of a service on the robot, {example}"
+        raise below.error("name", "is the service itself", hint)
+    if other.after_s is not None and other.after_s >= made.timeout_s:
+        raise below.error(
+            "after_s",
+            f"must be below `timeout_s`, which is {made.timeout_s:g}",
+            "make it shorter, or remove it: at the deadline the fallback is asked anyway",
+        )
+
+
+def state_services(section: Section, made: StateSpec) -> StateSpec:
+    """Judge `state`, and give its services the types that a name alone stands for."""
+    return StateSpec(
+        _state_service(section, "snapshot", made.snapshot, state.SNAPSHOT_TYPE),
+        _state_service(section, "restore", made.restore, state.RESTORE_TYPE),
+    )
+
+
+def _state_service(section: Section, key: str, made: StateService, usual: str) -> StateService:
+    if bool(made.type) != bool(made.field):
+        missing = "field" if made.type else "type"
+        hint = f"write `{key}: {{name: ..., type: ..., field: ...}}`"
+        what = "is missing: type and field belong together"
+        raise section.section(key).error(missing, what, hint)
+    return made if made.type else replace(made, type=usual, field=state.FIELD)
+
+
+def topic(section: Section, made: TopicSpec) -> TopicSpec:
+    """Judge one of `topics`."""
+    if made.origin is Origin.ROBOT and section.has("select"):
+        what = "has no meaning here: what the robot publishes comes from one place"
+        raise section.error("select", what, "remove it")
+    return made
+
+
+def metrics(section: Section, made: MetricsSpec) -> MetricsSpec:
+    """Judge `metrics`."""
+    seen: set[str] = set()
+    for key, endpoint in vars(made).items():
+        if not endpoint:
+            continue
+        if endpoint in seen:
+            raise section.error(key, f"`{endpoint}` stands here twice", "give each its own port")
+        seen.add(endpoint)
+    if made.replica and int(made.replica.rpartition(":")[2]) > _LAST_REPLICA_PORT:
+        what = "leaves no room: replica SLOT has this port plus SLOT, which would be above 65535"
+        raise section.error("replica", what, f"write a port up to {_LAST_REPLICA_PORT}")
+    return made
+
+
+def schedule_zone(section: Section, made: ScheduleSpec) -> ScheduleSpec:
+    """Judge `schedule`."""
+    try:
+        schedule.zone(made.time_zone)
+    except ValueError:
+        raise section.error(
+            "time_zone",
+            f"there is no time zone {shown(made.time_zone)} on this machine",
+            "write a name of the IANA database, such as `America/Los_Angeles`, or `UTC`; the "
+            "Debian package `tzdata` holds the database",
+        ) from None
+    return made
+
+
+def window(section: Section, made: WindowSpec) -> WindowSpec:
+    """Judge one of a schedule's `windows`."""
+    if made.replicas is None and made.max_usd_per_hour is None:
+        raise section.error("replicas", "is missing, and so is `max_usd_per_hour`", "write one")
+    if made.begins_s == DAY_END_S:
+        raise section.error("from", "must be before 24:00", "write `from: 0:00`")
+    if made.begins_s == made.ends_s:
+        raise section.error("to", "must not be the same as `from`", "leave both out for all day")
+    return replace(made, ends_s=made.ends_s or DAY_END_S)
+
+
+def on_demand(section: Section, made: OnDemandSpec, replicas: int) -> None:
+    """Judge `on_demand` among so many replicas."""
+    if made.base > replicas:
+        what = f"must not be above the {replicas} replicas that there are, and is {made.base}"
+        raise section.error("base", what, "write fewer, or ask for more replicas")
+
+
+def topology(section: Section, made: Topology) -> Topology:
+    """Judge `topology`: names that are known, no loop of gateways."""
+    if not made.gateways:
+        hint = "write a list, such as `gateways: [{name: edge, endpoint: edge.example.org:7470}]`"
+        raise section.error("gateways", "is missing", hint)
+    known = [gateway.name for gateway in made.gateways]
+    below = section.sections("gateways", "")
+    slots: dict[int, str] = {}
+    for one, gateway in zip(below, made.gateways, strict=True):
+        other = slots.setdefault(gateway_slot(gateway.name), gateway.name)
+        if other != gateway.name:
+            what = f"`{gateway.name}` has the same number as `{other}`, which is made from the name"
+            raise one.error("name", what, "use another name")
+        _check_known(one, "upstream", gateway.through, known)
+    loop = find_loop({gateway.name: gateway.through for gateway in made.gateways})
+    if loop:
+        what = f"the gateways form a loop: {' -> '.join(loop)}"
+        raise section.error("gateways", what, f"remove `{loop[1]}` from `upstream` of `{loop[0]}`")
+    robots = section.sections("robots", "") if made.routes else ()
+    for one, route in zip(robots, made.routes, strict=True):
+        _check_known(one, "gateways", route.gateways, known)
+    _check_known(section, "default_gateways", made.through, known)
+    return made
+
+
+def _check_known(section: Section, key: str, names: Sequence[str], known: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            hint = "known here: " + ", ".join(f"`{one}`" for one in known)
+            raise section.error(key, f"there is no gateway {shown(name)}", hint)
+
+
+RULES: dict[type, Callable[[Section, Any], Any]] = {
+    ServiceSpec: service,
+    StateSpec: state_services,
+    TopicSpec: topic,
+    MetricsSpec: metrics,
+    ScheduleSpec: schedule_zone,
+    WindowSpec: window,
+    Topology: topology,
+}
