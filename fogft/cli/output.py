@@ -16,6 +16,7 @@ import select
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import IO, TYPE_CHECKING, Any
 
 from fogft.errors import FogftError
@@ -49,13 +50,9 @@ def show(*parts: RenderableType, stream: IO[str] | None = None) -> None:
         parts: What to write, one below the other.
         stream: Where; stdout if not given.
     """
-    # With a height: of a dumb terminal rich else takes both to be small.
-    console = _console(stream or sys.stdout, width=_UNLIMITED, height=25)
-    with console.capture() as captured:
-        console.print(*parts, sep="\n")
-    for line in captured.get().splitlines():
-        console.file.write(line.rstrip() + "\n")
-    console.file.flush()
+    stream = stream or sys.stdout
+    stream.write(_drawn(stream, *parts) + "\n")
+    stream.flush()
 
 
 def table(
@@ -160,13 +157,19 @@ def width(stream: IO[str]) -> int:
 
 @contextmanager
 def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
-    """Yield a function that shows something on a terminal in place of what it showed before."""
-    from rich.live import Live
+    """Yield a function that shows something on a terminal in place of what it showed before.
 
-    with Live(
-        console=_console(stream), auto_refresh=False, vertical_overflow="crop"
-    ) as live:  # fmt: skip
-        yield lambda shown: live.update(shown, refresh=True)
+    Lines that are too long are cut at their ends: rich would shorten the numbers in a table.
+    """
+    from rich.live import Live
+    from rich.text import Text
+
+    def show_in(live: Live, shown: RenderableType) -> None:
+        lines = Text.from_ansi(_drawn(stream, shown), no_wrap=True, overflow="ellipsis")
+        live.update(lines, refresh=True)
+
+    with Live(console=_console(stream), auto_refresh=False, vertical_overflow="crop") as live:
+        yield partial(show_in, live)
 
 
 def stdout_closed() -> bool:
@@ -184,6 +187,15 @@ def silence_stdout() -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.close(nowhere)
+
+
+def _drawn(stream: IO[str], *parts: RenderableType) -> str:
+    """Return lines for a stream, with its colours, as wide as they are."""
+    # With a height: of a dumb terminal rich else takes both to be small.
+    console = _console(stream, width=_UNLIMITED, height=25)
+    with console.capture() as captured:
+        console.print(*parts, sep="\n")
+    return "\n".join(line.rstrip() for line in captured.get().splitlines())
 
 
 def _tagged(tag: str, style: str, text: str) -> None:

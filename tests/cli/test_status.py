@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import pty
 import re
+import signal
+import struct
 import subprocess
 import sys
+import termios
 from dataclasses import fields, replace
 
 import pytest
@@ -162,6 +166,31 @@ def on_a_terminal(home, **environ: str) -> str:
         pass
     os.close(leader)
     return sent.decode()
+
+
+def test_a_narrow_terminal_is_redrawn_with_lines_cut_at_their_ends(home):
+    """No column is shortened: half a number would be another number."""
+    paths = lay_down(home)
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 25, 60, 0, 0))
+    environ = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+    watch = [sys.executable, "-m", "fogft", "status", "--watch"]
+    sent = b""
+    with disk.locked(paths.manager_lock):
+        with subprocess.Popen(
+            watch, stdout=follower, stderr=subprocess.PIPE, env={**environ, "TERM": "xterm"}
+        ) as process:
+            while sent.count(b"planner") < 2:
+                sent += os.read(leader, 65536)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 130
+    os.close(follower)
+    os.close(leader)
+    screen = re.sub(r"\033\[[0-9;?]*[a-zA-Z]", "", sent.decode()).splitlines()
+    row = next(line for line in screen if line.startswith("0.1 "))
+    assert row.startswith("0.1      ready     local/us-west-2/a     0.021  up ")
+    assert len(row) <= 60
+    assert row.endswith("…")
 
 
 def test_a_terminal_gets_colour_unless_it_wants_none(home):
