@@ -20,7 +20,7 @@ from fogft.model.replica import ReplicaId
 _LATENCIES_KEPT = 2000
 # Upper bounds of the histogram's buckets, seconds: from a local call to a planner that thinks.
 BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
-_COUNTED = (
+OUTCOMES_COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
     *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
     *("request_bytes", "response_bytes"),
@@ -43,7 +43,7 @@ class Outcomes:
     """
 
     def __init__(self) -> None:
-        self.count = dict.fromkeys(_COUNTED, 0)
+        self.count = dict.fromkeys(OUTCOMES_COUNTED, 0)
         self.refused: dict[str, int] = {}
         self._won: dict[ReplicaId, int] = {}
         self._well: dict[ReplicaId, int] = {}

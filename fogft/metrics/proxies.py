@@ -1,144 +1,203 @@
-"""What the proxies tell Prometheus, made of what they report. Pure.
+"""What the proxies tell Prometheus, made of what they report.
 
-Owns: names and labels of the metrics. Not here: counting (`outcomes`, `responder`), the text
-(`metrics.exposition`), serving it (`fogft.metrics.scrape`).
+Owns: names and labels of the metrics. Not here: counting (`outcomes`, `responder`), serving it
+(`fogft.metrics.scrape`). docs/metrics.md lists them all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fogft.metrics.exposition import COUNTER, GAUGE, HISTOGRAM, Family, Sample, histogram, of
+from fogft.metrics.families import counter, gauge, histogram
 from fogft.metrics.outcomes import BUCKETS_S
+
+if TYPE_CHECKING:
+    from prometheus_client import Metric
 
 # How requests end. `pending` is the rest.
 OUTCOMES = ("answered", "fallback", "empty", "silent", "turned_away", "cancelled")
 _COUNTS = {
     "received": ("fogft_requests_total", "Requests that callers sent."),
-    "sent": ("fogft_copies_total", "Copies of requests that were sent to replicas."),
-    "late": ("fogft_late_answers_total", "Answers that came too late to be used."),
+    "sent": ("fogft_attempts_total", "Copies of requests that were sent to replicas."),
+    "late": ("fogft_late_responses_total", "Responses that came too late to be used."),
     "request_bytes": ("fogft_request_bytes_total", "Bytes of all requests that callers sent."),
-    "response_bytes": ("fogft_response_bytes_total", "Bytes of the first answers of replicas."),
-    "rejected": ("fogft_rejected_answers_total", "Responses whose ok_field was false."),
+    "response_bytes": ("fogft_response_bytes_total", "Bytes of the first responses."),
+    "rejected": ("fogft_rejected_responses_total", "Responses whose ok_field was false."),
     "undelivered": ("fogft_undelivered_responses_total", "Responses that ROS did not take."),
-    "fallback_failed": ("fogft_fallback_failed_total", "Calls of a fallback that gave nothing."),
+    "fallback_failed": ("fogft_fallback_failures_total", "Fallback calls without a response."),
 }
 _LINK_GAUGES = {
-    "silent_for_s": ("fogft_link_silent_seconds", "Since a probe is unanswered."),
+    "silent_for_s": ("fogft_link_silent_seconds", "Time since the oldest unanswered probe."),
     "rtt_s": ("fogft_link_round_trip_seconds", "Round trip of the last probe."),
-    "in_flight": ("fogft_link_requests_in_flight", "Requests under way to a replica."),
+    "in_flight": ("fogft_link_requests_in_flight", "Requests sent to a replica and not answered."),
 }
 _LINK_COUNTS = {
-    "reopened": (
-        "fogft_link_reopened_total",
-        "Connections to a replica that had to be opened anew.",
-    ),
+    "reopened": ("fogft_link_reconnects_total", "Connections to a replica that were opened again."),
     "restarts": ("fogft_replica_restarts_total", "Restarts of a replica's command."),
 }
-_WORK_GAUGES = {"held": ("fogft_requests_held", "Requests that are held and not yet answered.")}
+_WORK_GAUGES = {"held": ("fogft_requests_held", "Requests held and not yet answered.")}
 _WORK_COUNTS = {
-    "ran": ("fogft_requests_run_total", "Requests that were passed on to a service."),
+    "ran": ("fogft_requests_run_total", "Requests passed on to a service."),
     "ran_s": ("fogft_request_run_seconds_total", "Time that services took for them."),
     "saved": ("fogft_requests_saved_total", "Requests dropped unbegun: answered elsewhere."),
-    "interrupted": ("fogft_requests_interrupted_total", "Requests at work that were told to stop."),
-    "wasted": ("fogft_requests_wasted_total", "Requests that were run for nobody."),
+    "interrupted": ("fogft_requests_interrupted_total", "Requests at work that were cancelled."),
+    "wasted": ("fogft_requests_wasted_total", "Requests run although answered elsewhere."),
     "wasted_s": ("fogft_request_wasted_seconds_total", "Time that those took."),
 }
 
 
-def of_client(report: Mapping[str, Any]) -> list[Family]:
-    """Return the metrics of a client proxy or a gateway from its report."""
+def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
+    """Yield the metrics of a client proxy or a gateway from its report."""
     services, links = report["services"], report["links"]
-    return [
-        *_requests(services),
-        *(_of_links(links, key, GAUGE, *told) for key, told in _LINK_GAUGES.items()),
-        *(_of_links(links, key, COUNTER, *told) for key, told in _LINK_COUNTS.items()),
-        of("fogft_link_up", GAUGE, "Whether a replica answers probes.",
-           (Sample(link["state"] == "up", {"replica": _who(link)}) for link in links)),
-        of("fogft_link_ready_services", GAUGE, "Services that a replica can answer.",
-           (Sample(len(link["ready"]), {"replica": _who(link)}) for link in links)),
-        of("fogft_topic_messages_total", COUNTER, "Messages of topics, and what became of them.", (
-            Sample(count, {"topic": topic, "event": event})
+    yield from _requests(services)
+    for kind, table in ((gauge, _LINK_GAUGES), (counter, _LINK_COUNTS)):
+        for key, (name, help) in table.items():
+            known = (link for link in links if link.get(key) is not None)
+            yield kind(name, help, ((link[key], _slot(link)) for link in known))
+    yield gauge(
+        "fogft_link_up",
+        "Whether a replica answers probes.",
+        ((link["state"] == "up", _slot(link)) for link in links),
+    )
+    yield gauge(
+        "fogft_link_ready_services",
+        "Services that a replica can answer.",
+        ((len(link["ready"]), _slot(link)) for link in links),
+    )
+    yield counter(
+        "fogft_topic_messages_total",
+        "Messages of topics, and what became of them.",
+        (
+            (count, {"topic": topic, "event": event})
             for topic, counts in report.get("topics", {}).items()
-            for event, count in counts.items() if event != "trouble"
-        )),
-        of("fogft_uplink_suspected", GAUGE, "Whether all links have fallen silent together.",
-           [Sample(report["uplink_suspected"])]),
-    ]  # fmt: skip
+            for event, count in counts.items()
+            if event != "trouble"
+        ),
+    )
+    yield gauge(
+        "fogft_uplink_suspected",
+        "Whether all links have fallen silent together.",
+        [(report["uplink_suspected"], {})],
+    )
 
 
-def _requests(services: Mapping[str, Mapping[str, Any]]) -> Iterator[Family]:
+def _requests(services: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     for key, (name, help) in _COUNTS.items():
-        yield of(name, COUNTER, help, (
-            Sample(count[key], {"service": s}) for s, count in services.items() if key in count
-        ))  # fmt: skip
-    yield of("fogft_outcomes_total", COUNTER, "How requests ended.", (
-        Sample(count[outcome], {"service": s, "outcome": outcome})
-        for s, count in services.items() for outcome in OUTCOMES if outcome in count
-    ))  # fmt: skip
-    yield of("fogft_answers_total", COUNTER, "Requests that a replica answered first.", (
-        Sample(won, {"service": s, "replica": replica})
-        for s, count in services.items() for replica, won in count.get("won", {}).items()
-    ))  # fmt: skip
-    yield of("fogft_refusals_total", COUNTER, "Copies that replicas refused, by reason.", (
-        Sample(refused, {"service": s, "reason": reason})
-        for s, count in services.items() for reason, refused in count.get("refused", {}).items()
-    ))  # fmt: skip
-    yield of("fogft_pending_requests", GAUGE, "Requests without an answer yet.", (
-        Sample(count["pending"], {"service": s}) for s, count in services.items()
-        if "pending" in count
-    ))  # fmt: skip
-    yield of("fogft_request_seconds", HISTOGRAM, "From a request to its first answer.", (
-        sample for s, count in services.items() if "buckets" in count
-        for sample in histogram(BUCKETS_S, count["buckets"], count["took_s"], {"service": s})
-    ))  # fmt: skip
+        known = {s: count[key] for s, count in services.items() if key in count}
+        yield counter(name, help, ((value, {"service": s}) for s, value in known.items()))
+    yield counter(
+        "fogft_outcomes_total",
+        "How requests ended.",
+        (
+            (count[outcome], {"service": s, "outcome": outcome})
+            for s, count in services.items()
+            for outcome in OUTCOMES
+            if outcome in count
+        ),
+    )
+    yield counter(
+        "fogft_first_responses_total",
+        "Requests that a replica answered first.",
+        (
+            (won, {"service": s, "slot": slot})
+            for s, count in services.items()
+            for slot, won in _by_slot(count.get("won", {})).items()
+        ),
+    )
+    yield _refusals(
+        (refused, {"service": s, "reason": reason})
+        for s, count in services.items()
+        for reason, refused in count.get("refused", {}).items()
+    )
+    yield gauge(
+        "fogft_pending_requests",
+        "Requests without a response yet.",
+        ((c["pending"], {"service": s}) for s, c in services.items() if "pending" in c),
+    )
+    yield histogram(
+        "fogft_request_duration_seconds",
+        "Time from a request to its first response.",
+        BUCKETS_S,
+        (
+            (count["buckets"], count["took_s"], {"service": s})
+            for s, count in services.items()
+            if "buckets" in count
+        ),
+    )
 
 
-def _of_links(links: list[Mapping[str, Any]], key: str, kind: str, name: str, help: str) -> Family:
-    known = (link for link in links if link.get(key) is not None)
-    return of(name, kind, help, (Sample(link[key], {"replica": _who(link)}) for link in known))
+def _refusals(values: Iterator[tuple[float, dict[str, str]]]) -> Metric:
+    return counter("fogft_refusals_total", "Copies of requests that were refused.", values)
 
 
-def _who(link: Mapping[str, Any]) -> str:
-    return f"{link['slot']}.{link['generation']}"
+def _by_slot(by_replica: Mapping[str, int]) -> dict[str, int]:
+    """Return counts by slot, of all its generations together."""
+    found: dict[str, int] = {}
+    for replica, count in by_replica.items():
+        slot = replica.partition(".")[0]
+        found[slot] = found.get(slot, 0) + count
+    return found
 
 
-def of_server(report: Mapping[str, Any]) -> list[Family]:
-    """Return the metrics of a server proxy from its report."""
+def _slot(link: Mapping[str, Any]) -> dict[str, str]:
+    return {"slot": str(link["slot"])}
+
+
+def of_server(report: Mapping[str, Any]) -> Iterator[Metric]:
+    """Yield the metrics of a server proxy from its report."""
     work: Mapping[str, float] = report["work"]
-    return [
-        *(of(name, GAUGE, help, [Sample(work[key])]) for key, (name, help) in _WORK_GAUGES.items()),
-        *(of(name, COUNTER, help, [Sample(work[k])]) for k, (name, help) in _WORK_COUNTS.items()),
-        of("fogft_refusals_total", COUNTER, "Requests that were refused, by reason.",
-           (Sample(count, {"reason": reason}) for reason, count in report["refused"].items())),
-        of("fogft_concurrency_limit", GAUGE, "Requests that a service is given at once.",
-           (Sample(limit, {"service": name}) for name, limit in report["limits"].items())),
-        of("fogft_service_ready", GAUGE, "Whether a service can answer.",
-           (Sample(ready, {"service": name}) for name, ready in report["services"].items())),
-        of("fogft_draining", GAUGE, "Whether the machine will be taken.",
-           [Sample(report["draining"])]),
-        of("fogft_replica_restarts_total", COUNTER, "Restarts of the command.",
-           [Sample(report["restarts"])]),
-        counted("fogft_wire_events_total", "Events at the listening port.", report["wire"]),
-    ]  # fmt: skip
+    for kind, table in ((gauge, _WORK_GAUGES), (counter, _WORK_COUNTS)):
+        for key, (name, help) in table.items():
+            yield kind(name, help, [(work[key], {})])
+    yield _refusals((count, {"reason": reason}) for reason, count in report["refused"].items())
+    yield gauge(
+        "fogft_concurrency_limit",
+        "Requests that a service is given at once.",
+        ((limit, {"service": name}) for name, limit in report["limits"].items()),
+    )
+    yield gauge(
+        "fogft_service_ready",
+        "Whether a service can answer.",
+        ((ready, {"service": name}) for name, ready in report["services"].items()),
+    )
+    yield gauge(
+        "fogft_replica_draining",
+        "Whether the replica is about to end.",
+        [(report["draining"], {})],
+    )
+    yield counter(
+        "fogft_replica_restarts_total", "Restarts of the command.", [(report["restarts"], {})]
+    )
+    yield _listener(report["wire"])
 
 
-def of_gateway(report: Mapping[str, Any]) -> list[Family]:
-    """Return the metrics of a gateway from its report."""
+def of_gateway(report: Mapping[str, Any]) -> Iterator[Metric]:
+    """Yield the metrics of a gateway from its report."""
     forwarded = report["forwarded"]
-    return [
-        *of_client(report),
-        of("fogft_gateway_held", GAUGE, "Robots' requests under way.",
-           [Sample(forwarded["in_flight"])]),
-        counted("fogft_gateway_requests_total", "Robots' requests.",
-                {key: forwarded[key] for key in ("passed", "joined")}),
-        of("fogft_gateway_refusals_total", COUNTER, "Robots' requests refused, by reason.",
-           (Sample(count, {"reason": reason}) for reason, count in forwarded["refused"].items())),
-        counted("fogft_wire_events_total", "Events at the listening port.", report["listener"]),
-    ]  # fmt: skip
+    yield from of_client(report)
+    yield gauge(
+        "fogft_gateway_requests_in_flight",
+        "Robots' requests being forwarded.",
+        [(forwarded["in_flight"], {})],
+    )
+    yield by_event(
+        "fogft_gateway_requests_total",
+        "Robots' requests.",
+        {key: forwarded[key] for key in ("passed", "joined")},
+    )
+    yield counter(
+        "fogft_gateway_refusals_total",
+        "Robots' requests refused, by reason.",
+        ((count, {"reason": reason}) for reason, count in forwarded["refused"].items()),
+    )
+    yield _listener(report["listener"])
 
 
-def counted(name: str, help: str, counts: Mapping[str, float]) -> Family:
-    """Return a family of counters by event."""
-    return of(name, COUNTER, help, (Sample(n, {"event": event}) for event, n in counts.items()))
+def _listener(counts: Mapping[str, float]) -> Metric:
+    return by_event("fogft_listener_events_total", "Events at the listening port.", counts)
+
+
+def by_event(name: str, help: str, counts: Mapping[str, float]) -> Metric:
+    """Return counters by event."""
+    return counter(name, help, ((n, {"event": str(event)}) for event, n in counts.items()))

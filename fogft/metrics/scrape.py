@@ -1,10 +1,9 @@
-"""Serve metrics to Prometheus: plain HTTP, ``GET /metrics`` and nothing else.
+"""Serve metrics to Prometheus: ``GET /metrics`` over plain HTTP, answered by `prometheus-client`.
 
 Few threads, short limits: a scraper that is slow or hostile costs one of them for a moment.
 Whatever goes wrong here harms nothing else in the process.
 
-Owns: the port. Not here: what is measured (`metrics.proxies`, `pool.manager.metrics`), its text
-(`metrics.exposition`).
+Owns: the port. Not here: what is measured (`metrics.proxies`, `pool.manager.metrics`).
 """
 
 from __future__ import annotations
@@ -13,17 +12,20 @@ import logging
 import threading
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fogft.metrics import exposition
-from fogft.metrics.exposition import Family
+from fogft.metrics.families import Labels, text
+
+if TYPE_CHECKING:
+    from prometheus_client import Metric
 
 log = logging.getLogger(__name__)
 
+_CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _LIMIT_S = 5.0
 _AT_ONCE = 4
 
-Measure = Callable[[], Iterable[Family]]
+Measure = Callable[[], "Iterable[Metric]"]
 
 
 class Scrape:
@@ -31,10 +33,11 @@ class Scrape:
 
     Args:
         measure: Returns what there is to tell; called for each request, on another thread.
+        labels: Of every sample: the pool, and of a replica its slot.
     """
 
-    def __init__(self, measure: Measure) -> None:
-        self._measure = measure
+    def __init__(self, measure: Measure, labels: Labels) -> None:
+        self._tell = lambda: text(measure(), labels)
         self._wanted = ""
         self._server: _Server | None = None
 
@@ -59,7 +62,7 @@ class Scrape:
             return
         host, _, port = endpoint.rpartition(":")
         try:
-            self._server = _Server((host.strip("[]"), int(port)), self._measure)
+            self._server = _Server((host.strip("[]"), int(port)), self._tell)
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))
             return
@@ -81,9 +84,9 @@ class _Server(ThreadingHTTPServer):
     block_on_close = False
     request_queue_size = 16
 
-    def __init__(self, address: tuple[str, int], measure: Measure) -> None:
+    def __init__(self, address: tuple[str, int], tell: Callable[[], str]) -> None:
         super().__init__(address, _Request)
-        self.measure = measure
+        self.tell = tell
         self.room = threading.BoundedSemaphore(_AT_ONCE)
 
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -112,13 +115,13 @@ class _Request(BaseHTTPRequestHandler):
             self.send_error(404)
             return
         try:
-            body = exposition.text(self.server.measure()).encode()
+            body = self.server.tell().encode()
         except Exception:
             log.exception("metrics_not_measured")
             self.send_error(500)
             return
         self.send_response(200)
-        self.send_header("Content-Type", exposition.CONTENT_TYPE)
+        self.send_header("Content-Type", _CONTENT_TYPE)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)

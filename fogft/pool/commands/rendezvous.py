@@ -76,7 +76,9 @@ class _Rendezvous:
             loop.add_signal_handler(number, stop.set)
         self._server.bind()
         log.info("rendezvous_listening endpoint=%s pid=%d", self._server.endpoint, os.getpid())
-        scrape = Scrape(lambda: of_rendezvous(self._server.report()))
+        scrape = Scrape(
+            lambda: of_rendezvous(self._server.report()), {"pool_uid": self._config.pool_uid}
+        )
         scrape.at(self._config.metrics)
         serving = loop.create_task(self._server.serve())
         try:

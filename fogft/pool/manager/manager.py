@@ -89,7 +89,7 @@ class Manager:
         self._digest: object = None
         self._trouble: list[str] = []
         self._told: status.PoolStatus | None = None
-        self._scrape = Scrape(lambda: of_pool(self._told))
+        self._scrape = Scrape(lambda: of_pool(self._told), {"pool": self._identity.name})
         self._metrics = metrics
         self._replicas: Sequence[status.ReplicaStatus] = ()
         self._reconciler = Reconciler(

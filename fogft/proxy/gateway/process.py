@@ -92,7 +92,9 @@ class _Gateway:
         self._holder = self._own_holder()
         self._certificate = Watched(client.credentials.certificate)
         self._certificate.changed()
-        self._scrape = Scrape(lambda: proxies.of_gateway(self._told()))
+        self._scrape = Scrape(
+            lambda: proxies.of_gateway(self._told()), {"pool": config.client.pool}
+        )
 
     def _own_holder(self) -> Holder:
         ours = self._config.client.credentials

@@ -72,7 +72,9 @@ def run(
     proxy = _make(config)
     watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
     presence: Presence | None = None
-    scrape = Scrape(lambda: proxies.of_server(proxy.report()))
+    scrape = Scrape(
+        lambda: proxies.of_server(proxy.report()), {"pool": config.pool, "slot": str(config.slot)}
+    )
     try:
         proxy.start()
         scrape.at(config.metrics)

@@ -132,7 +132,7 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
     proxy.serve(seen.follow(config.services))
     proxy.pass_topics(config.topics, cast(RosTopics, joined.node))
     following = Following(config)
-    scrape = Scrape(lambda: proxies.of_client(proxy.report()))
+    scrape = Scrape(lambda: proxies.of_client(proxy.report()), {"pool": config.pool})
     scrape.at(config.metrics)
     log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fogft.metrics import proxies
-from fogft.metrics.exposition import text
+from fogft.metrics.families import text
 from fogft.model.spec import ServiceSpec
 from fogft.proxy.gateway.gateway import Forwarder, NoRos
 from fogft.proxy.robot.client import ClientProxy
@@ -31,16 +31,16 @@ def test_every_outcome_of_a_service_is_told():
     clock.now += 5.0
     one.tick()
     report = {"services": {"/s": one.report()}, "links": [], "uplink_suspected": False}
-    said = text(proxies.of_client(report)).splitlines()
-    assert 'fogft_requests_total{service="/s"} 2' in said
-    assert 'fogft_outcomes_total{service="/s",outcome="answered"} 1' in said
-    assert 'fogft_outcomes_total{service="/s",outcome="silent"} 1' in said
-    assert 'fogft_outcomes_total{service="/s",outcome="fallback"} 0' in said
-    assert 'fogft_answers_total{service="/s",replica="0.1"} 1' in said
-    assert 'fogft_refusals_total{service="/s",reason="crashed"} 1' in said
-    assert 'fogft_request_seconds_bucket{service="/s",le="0.1"} 0' in said
-    assert 'fogft_request_seconds_bucket{service="/s",le="0.25"} 1' in said
-    assert 'fogft_request_seconds_count{service="/s"} 1' in said
+    said = text(proxies.of_client(report), {}).splitlines()
+    assert 'fogft_requests_total{service="/s"} 2.0' in said
+    assert 'fogft_outcomes_total{outcome="answered",service="/s"} 1.0' in said
+    assert 'fogft_outcomes_total{outcome="silent",service="/s"} 1.0' in said
+    assert 'fogft_outcomes_total{outcome="fallback",service="/s"} 0.0' in said
+    assert 'fogft_first_responses_total{service="/s",slot="0"} 1.0' in said
+    assert 'fogft_refusals_total{reason="crashed",service="/s"} 1.0' in said
+    assert 'fogft_request_duration_seconds_bucket{le="0.1",service="/s"} 0.0' in said
+    assert 'fogft_request_duration_seconds_bucket{le="0.25",service="/s"} 1.0' in said
+    assert 'fogft_request_duration_seconds_count{service="/s"} 1.0' in said
 
 
 def test_a_gateway_tells_of_its_robots_too():
@@ -48,7 +48,7 @@ def test_a_gateway_tells_of_its_robots_too():
     proxy = ClientProxy(UID, NoRos(), FakeDialer(), lambda *_: dispatcher(clock)[0], clock=clock)
     proxy.serve([ServiceSpec("/s", "t")])
     told = {**proxy.report(), "forwarded": Forwarder().report(), "listener": {"requests": 3}}
-    said = text(proxies.of_gateway(told)).splitlines()
-    assert 'fogft_gateway_requests_total{event="passed"} 0' in said
-    assert 'fogft_wire_events_total{event="requests"} 3' in said
-    assert 'fogft_pending_requests{service="/s"} 0' in said
+    said = text(proxies.of_gateway(told), {}).splitlines()
+    assert 'fogft_gateway_requests_total{event="passed"} 0.0' in said
+    assert 'fogft_listener_events_total{event="requests"} 3.0' in said
+    assert 'fogft_pending_requests{service="/s"} 0.0' in said

@@ -9,15 +9,17 @@ from collections.abc import Iterator
 
 import pytest
 
-from fogft.metrics.exposition import GAUGE, Sample, of
+from fogft.metrics.families import gauge
 from fogft.metrics.scrape import Scrape
 
-ONE = [of("fogft_x", GAUGE, "x", [Sample(1)])]
+
+def one():
+    return [gauge("fogft_x", "x", [(1, {})])]
 
 
 @pytest.fixture
 def scrape() -> Iterator[Scrape]:
-    made = Scrape(lambda: ONE)
+    made = Scrape(one, {"pool": "p"})
     yield made
     made.close()
 
@@ -31,7 +33,7 @@ def test_a_scraper_gets_the_text(scrape):
     scrape.at("127.0.0.1:0")
     kind, said = get(scrape.endpoint)
     assert kind.startswith("text/plain; version=0.0.4")
-    assert said.endswith("fogft_x 1\n")
+    assert said.endswith('fogft_x{pool="p"} 1.0\n')
 
 
 def test_nothing_else_is_there(scrape):
@@ -62,7 +64,7 @@ def test_a_port_that_is_taken_is_logged_and_nothing_is_raised(scrape, caplog):
 
 
 def test_what_cannot_be_measured_is_an_error_of_that_request_only(caplog):
-    measured = iter([RuntimeError("broken"), ONE])
+    measured = iter([RuntimeError("broken"), one()])
 
     def measure():
         found = next(measured)
@@ -70,7 +72,7 @@ def test_what_cannot_be_measured_is_an_error_of_that_request_only(caplog):
             raise found
         return found
 
-    scrape = Scrape(measure)
+    scrape = Scrape(measure, {})
     scrape.at("127.0.0.1:0")
     try:
         with pytest.raises(urllib.error.HTTPError, match="500"):
