@@ -153,8 +153,9 @@ class OnDemandSpec:
     )
     fallback: bool = key(
         Flag(),
-        "Whether an on-demand machine stands in while no spot machine can be had, within "
-        "`max_usd_per_hour`. When spot is back it is replaced, the new one first.",
+        "Whether on-demand machines stand in while too few spot ones are ready, ordered beside the "
+        "search for spot, within `max_usd_per_hour` and `max_surge`. No location then gets more "
+        "than half of the spot machines.",
         default=False,
     )
 

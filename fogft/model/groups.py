@@ -6,7 +6,8 @@ than the pool has gets a group of its own, `CRITICAL`, whose replicas carry such
 alone.
 
 Slots tell the groups apart, so nothing else has to be remembered: group k has the slots
-from ``k * BLOCK`` on, `CRITICAL` the last block. From `FIRST_BY_HAND` on they are free for
+from ``k * BLOCK`` on, `CRITICAL` the last block; the upper half of a block, from `STAND_INS` on,
+is for on-demand machines that stand in for spot ones. From `FIRST_BY_HAND` on they are free for
 replicas that people start themselves.
 
 Owns: groups, their slots, and how a number of replicas is shared among them.
@@ -25,6 +26,7 @@ from fogft.model.spec import PoolSpec, ServiceSpec
 BLOCK = 100
 MAX_GROUPS = 8
 CRITICAL_BLOCK = 9
+STAND_INS = 50
 CRITICAL = "critical"
 # The manager launches all slots below; replicas that people start by hand stay out of its way.
 FIRST_BY_HAND = (CRITICAL_BLOCK + 1) * BLOCK
@@ -55,9 +57,19 @@ class Group:
         """Its lowest slot."""
         return self.block * BLOCK
 
+    @property
+    def first_stand_in(self) -> int:
+        """The lowest slot of its on-demand machines that stand in for spot ones."""
+        return self.first_slot + STAND_INS
+
     def owns(self, slot: int) -> bool:
         """Whether a slot is one of its own."""
         return slot // BLOCK == self.block
+
+
+def is_stand_in(slot: int) -> bool:
+    """Whether a slot is that of an on-demand machine that stands in for a spot one."""
+    return slot % BLOCK >= STAND_INS
 
 
 def groups_of(spec: PoolSpec) -> tuple[Group, ...]:

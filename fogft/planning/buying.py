@@ -1,7 +1,7 @@
 """Turn needs into launches, within surge, budget and what is offered. Pure.
 
 Where a group mixes spot and on-demand, its first `base` replicas are on demand and the rest
-spot; while no spot machine can be had, an on-demand one may stand in for it.
+spot, besides on-demand ones that stand in (`fallback`).
 
 Owns: which market a launch is bought on, and what is said when it cannot be.
 Not here: the order among offers (`placement`) and what is needed (`needs`).
@@ -9,12 +9,14 @@ Not here: the order among offers (`placement`) and what is needed (`needs`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
-from fogft.model.groups import Group
+from fogft.model.groups import Group, is_stand_in
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
@@ -30,6 +32,7 @@ from fogft.planning.observed.backoff import (
     rested_longest,
     resting,
 )
+from fogft.planning.observed.hazard import UNKNOWN, hazards, penalty
 from fogft.planning.observed.health import Verdict
 from fogft.planning.observed.history import History
 from fogft.planning.placement import Choice, Market
@@ -54,6 +57,7 @@ class Buyer:
     Args:
         groups: The pool's, as they are sized.
         cap: On the price of all machines together; None for none.
+        standing_in: On-demand machines that serve until spot ones do.
     """
 
     spec: PoolSpec
@@ -63,13 +67,14 @@ class Buyer:
     census: Census
     groups: Sequence[Group]
     cap: float | None
+    standing_in: Sequence[Standing] = ()
     launches: list[PlannedLaunch] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     sacrificed: list[tuple[Standing, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._catalogue = catalogue(self.observed.offers)
-        self._markets: dict[tuple[str, bool | None, bool], Market] = {}
+        self._markets: dict[tuple[object, ...], Market] = {}
         self._whole: dict[tuple[str, bool | None], Market] = {}
         self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
         wrong = self._catalogue.impossible
@@ -103,6 +108,8 @@ class Buyer:
     def buy(self, need: Need, room: int) -> bool:
         """Plan one launch; False (and a note) when nothing more can be launched now."""
         if len(self.launches) >= room:
+            if need.stands_in:
+                return False
             verb = "replace" if need.replaces else "launch"
             self.notes.append(
                 f"waiting to {verb} slot {need.slot}: `max_surge` allows no more machines now"
@@ -124,26 +131,58 @@ class Buyer:
         Args:
             at_leisure: For one that need not be launched: nothing that refused lately is in it.
         """
-        key = (group.offers, spot, at_leisure)
+        full = self._full(group) if spot else frozenset()
+        key = (group.offers, spot, at_leisure, full)
         if key not in self._markets:
             resting = self._resting
             if at_leisure:
                 resting = {**disappointing(self.history, self.observed.now), **resting}
-            self._markets[key] = self._market(group, spot, resting)
+            self._markets[key] = self._market(group, spot, resting, full)
         return self._markets[key]
 
-    def _market(self, group: Group, spot: bool | None, resting: Mapping[str, Backoff]) -> Market:
+    def _market(
+        self,
+        group: Group,
+        spot: bool | None,
+        resting: Mapping[str, Backoff],
+        full: Collection[str] = (),
+    ) -> Market:
         return Market(
             self._listing(group, spot),
             resting=resting,
             avoid=(*self._avoided, *(s.location for s in self.census.lost)),
+            full=full,
+            hazards=self.hazards,
         )
+
+    def _full(self, group: Group) -> frozenset[str]:
+        """Return the locations that hold half of a group already, where on-demand can stand in."""
+        if not group.on_demand.fallback or len(self._listing(group, True).supplies) < 2:
+            return frozenset()
+        stay = (*self.census.good, *self.census.replaced)
+        here = [s.judged.machine.placement for s in stay if home(self.groups, s.slot) is group]
+        here += [x.offer.placement for x in self.launches if home(self.groups, x.slot) is group]
+        count = Counter(place.location for place in here if place.spot)
+        most = max(1, math.ceil(group.replicas / 2))
+        return frozenset(location for location, held in count.items() if held >= most)
+
+    @cached_property
+    def hazards(self) -> Mapping[str, float]:
+        """Location -> losses of spot machines per hour."""
+        return hazards(self.history, self.observed.now)
+
+    def score(self, placement: Placement, usd_per_hour: float) -> float:
+        """Return the score of a place: price, distance and losses. Lower is better."""
+        found = self.scale.score_of(usd_per_hour, self.scale.latency(placement))
+        if placement.spot:
+            found += penalty(self.hazards.get(placement.location, UNKNOWN)) - penalty(UNKNOWN)
+        return found
 
     def whole_market(self, group: Group, spot: bool | None) -> Market:
         """Return what is sold to a group where nothing rests and nothing is avoided."""
         key = (group.offers, spot)
         if key not in self._whole:
-            self._whole[key] = Market(self._listing(group, spot))
+            self._whole[key] = Market(self._listing(group, spot), hazards=self.hazards)
         return self._whole[key]
 
     def _listing(self, group: Group, spot: bool | None) -> Listing:
@@ -151,13 +190,16 @@ class Buyer:
 
     def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
         """Return the market of what rests longest, where all rests; None to wait for another."""
-        coming = self.launches or any(not s.ever_ready for s in self.census.good)
+        coming = self.launches or any(
+            not s.ever_ready for s in self.census.good if s not in self.standing_in
+        )
         if coming or EVERYWHERE in self._resting:
             return None
         supply = rested_longest(self.market(group, spot).resting.items(), self.observed.now)
         if supply is None:
             return None
-        return self._market(group, spot, {k: v for k, v in self._resting.items() if k != supply})
+        resting = {k: v for k, v in self._resting.items() if k != supply}
+        return self._market(group, spot, resting, self._full(group) if spot else ())
 
     def kind(self, group: Group, without: Standing | None) -> bool | None:
         """Return whether a group's next machine is spot (True); None where it does not matter.
@@ -169,10 +211,14 @@ class Buyer:
         if not group.on_demand.base and not group.on_demand.fallback:
             return None
         stay = [s for s in (*self.census.good, *self.census.replaced) if s is not without]
-        placed = [
-            s.judged.machine.placement for s in stay if home(self.groups, s.slot) is group
-        ] + [x.offer.placement for x in self.launches if home(self.groups, x.slot) is group]
-        return sum(not place.spot for place in placed) >= group.on_demand.base
+        placed = [(s.slot, s.judged.machine.placement) for s in stay]
+        placed += [(launch.slot, launch.offer.placement) for launch in self.launches]
+        on_demand = sum(
+            not place.spot
+            for slot, place in placed
+            if home(self.groups, slot) is group and not is_stand_in(slot)
+        )
+        return on_demand >= group.on_demand.base
 
     def places(self, without: Standing | None) -> list[Placement]:
         """Return where our replicas are and will be."""
@@ -191,16 +237,10 @@ class Buyer:
         if old is not None and not old.why.startswith(_NOT_THE_PLACES_FAULT):
             avoid.add(old.location)
         taken = self.places(old)
-        spot = self.kind(need.group, old)
+        spot = False if need.stands_in else self.kind(need.group, old)
         moves = old is not None and old.why.startswith("moves")
         market = self.market(need.group, spot, at_leisure=moves)
         found = market.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
-        if found.offer is None and spot and need.group.on_demand.fallback:
-            stand_in = self.market(need.group, False).choose(
-                taken, avoid=avoid, budget_usd_per_hour=budget
-            )
-            if stand_in.offer is not None:
-                return stand_in, f"{need.reason}; on demand, for no spot: {found.why_not}"
         last = None if found.offer or moves else self._in_spite(need.group, spot)
         if last is not None:
             choice = last.choose(taken, avoid=avoid, budget_usd_per_hour=budget)

@@ -11,8 +11,8 @@ Not here: why a replica should go (`planner`, `health`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.planning.observed.health import Health, Judged, Verdict
@@ -119,6 +119,12 @@ class Census:
         yield from self.aborted
         yield from self.ending
 
+    def without(self, others: Collection[Standing]) -> Census:
+        """Return the same without some of those that work."""
+        good = [s for s in self.good if s not in others]
+        replaced = [s for s in self.replaced if s not in others]
+        return replace(self, good=good, replaced=replaced)
+
     def of(self, is_member: Callable[[int], bool]) -> Census:
         """Return the part of it whose slots are members."""
         return Census(
@@ -177,20 +183,25 @@ def choose_endings(
     dear_first: bool = False,
     held: Collection[ReplicaId] = (),
     first: Standing | None = None,
+    standing_in: Sequence[Standing] = (),
+    spare: int = 0,
 ) -> Endings:
     """Choose who ends of those that are lost, replaced or too many.
 
     Args:
+        standing_in: On-demand machines that serve for others, and are not in the census.
+        spare: So many of those that stand in are no longer needed.
         held: Outdated ones that stay until a newcomer has proved itself.
         first: One that makes room for its successor: it ends although it is missed.
         dear_first: The pool is over its cap: of those that are too many the dearest go first.
     """
     surplus = len(census.good) + len(census.replaced) - wanted
-    if surplus <= 0 and not census.lost and first is None:
+    unwanted = [s for s in standing_in if s.reason]
+    if surplus <= 0 and not census.lost and first is None and not unwanted and spare <= 0:
         return Endings()
-    chooser = _Chooser(wanted, census, now, drain_limit_s)
+    chooser = _Chooser(wanted, (*census.good, *census.replaced, *standing_in), now, drain_limit_s)
     if health.uplink_suspected or not health.links_known:
-        if surplus > 0 or census.lost:
+        if surplus > 0 or census.lost or unwanted or spare > 0:
             chooser.out.notes.append("nothing is ended while no replica can be heard")
         return chooser.out
     for standing in census.lost:
@@ -198,8 +209,25 @@ def choose_endings(
     if len(census.good) > wanted:
         expendable = _by_expendability(census.good, dear_first=dear_first)
         chooser.end_some(expendable, len(census.good) - wanted, "not wanted")
-    if not census.replaced:
-        return chooser.out
+    if census.replaced:
+        _end_replaced(chooser, wanted, census, held, first)
+    if unwanted:
+        chooser.end_some(unwanted, len(unwanted), "replaced")
+        spare -= len(unwanted)
+    if spare > 0:
+        kept = [s for s in standing_in if not s.reason]
+        kept.sort(key=lambda s: (s.ever_ready, s.marked_at, -s.usd_per_hour, -s.slot))
+        chooser.end_some(kept, spare, "enough spot machines are ready")
+    return chooser.out
+
+
+def _end_replaced(
+    chooser: _Chooser,
+    wanted: int,
+    census: Census,
+    held: Collection[ReplicaId],
+    first: Standing | None,
+) -> None:
     left = len(census.good) + len(census.replaced) - chooser.counted_out - wanted
     ready_slots = {s.slot for s in census.good if s.judged.serving}
     if first is not None:
@@ -217,7 +245,6 @@ def choose_endings(
     ended = chooser.out.ids
     coming = sum(not s.ever_ready for s in census.good if s.id not in ended)
     chooser.end_some(replaced, left, "replaced", coming=coming)
-    return chooser.out
 
 
 def _by_expendability(standings: Iterable[Standing], *, dear_first: bool) -> list[Standing]:
@@ -243,13 +270,15 @@ def _by_expendability(standings: Iterable[Standing], *, dear_first: bool) -> lis
 
 
 class _Chooser:
-    def __init__(self, wanted: int, census: Census, now: float, drain_limit_s: float) -> None:
+    def __init__(
+        self, wanted: int, working: Iterable[Standing], now: float, drain_limit_s: float
+    ) -> None:
         self.out = Endings()
         self.counted_out = 0
         self._wanted = wanted
         self._now = now
         self._drain_limit_s = drain_limit_s
-        self._pillars = {s.id for s in (*census.good, *census.replaced) if s.judged.serving}
+        self._pillars = {s.id for s in working if s.judged.serving}
 
     def end_lost(self, standing: Standing, history: History) -> None:
         """A lost one ends once it is replaced, or at once when it cannot serve."""

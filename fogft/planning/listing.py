@@ -20,7 +20,7 @@ from typing import NamedTuple
 from fogft.model.replica import Offer, Placement, supply
 from fogft.model.scoring import Scale
 
-_WITHOUT_OFFER = itemgetter(slice(0, 7))
+without_offer = itemgetter(slice(0, 7))
 
 
 class Row(NamedTuple):
@@ -139,7 +139,7 @@ def _listing(offers: Sequence[Offer], excluded: Collection[str], scale: Scale) -
         allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
     if not allowed:
         return Listing((), "every offered location is excluded")
-    return Listing(tuple(sorted(_rows(allowed, scale), key=_WITHOUT_OFFER)))
+    return Listing(tuple(sorted(_rows(allowed, scale), key=without_offer)))
 
 
 def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:

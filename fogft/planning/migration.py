@@ -3,15 +3,14 @@
 Only a pool that is whole and quiet moves anything, one replica at a time, the new one first.
 A replica moves when
 
-* spot machines can be had again, and it is an on-demand one that stood in for one; or
+* it is on demand and should be spot, or the other way round; or
 * its new place would leave the pool better spread over clouds, regions or zones; or
 * the spread stays as it is, and its score falls by `gain`.
 
-It has then been ready for `stay_s` (a stand-in: `RETURN_AFTER_S`), and the new place is
-neither at rest nor avoided, nor has it refused within an hour; a stand-in's only must not be at
-rest. To move back, the scores must swing by twice the gain: so while prices waver within it
-nobody returns to where he was, and with steady offers every move lowers the crowding or the sum
-of the scores, so that moves come to an end.
+It has then been ready for `stay_s`, and the new place is neither at rest nor avoided, nor has it
+refused within an hour. To move back, the scores must swing by twice the gain: so while prices
+waver within it nobody returns to where he was, and with steady offers every move lowers the
+crowding or the sum of the scores, so that moves come to an end.
 
 Owns: who moves, and why.
 Not here: carrying it out, which is a replacement like any other (`needs`, `buying`).
@@ -30,8 +29,6 @@ from fogft.planning.listing import catalogue
 from fogft.planning.needs import home
 from fogft.planning.observed.health import Health
 from fogft.planning.placement import Choice, Crowd, crowding, domains
-
-RETURN_AFTER_S = 600.0
 
 
 def is_quiet(census: Census, health: Health) -> bool:
@@ -65,7 +62,14 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
     if spec.migration is None:
         return frozenset()
     machines = [standing.judged.machine for standing in buyer.census.good]
-    question = buyer.groups, machines, buyer.budget, {**observed.rtt_s}, buyer.intent.excluded
+    question = (
+        buyer.groups,
+        machines,
+        buyer.budget,
+        {**observed.rtt_s},
+        buyer.intent.excluded,
+        buyer.hazards,
+    )
     offers, asked, answer = spec.derived.get("restless", ((), None, frozenset()))
     if offers is not observed.offers or asked != question:
         answer = frozenset(s.id for s in buyer.census.good if _would_move(buyer, s))
@@ -74,20 +78,8 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
     return found
 
 
-def has_stand_ins(buyer: Buyer) -> bool:
-    """Whether there are on-demand machines that are to make way for spot ones."""
-    return any(
-        not standing.judged.machine.placement.spot
-        and buyer.kind(home(buyer.groups, standing.slot), standing)
-        for standing in buyer.census.good
-    )
-
-
 def _would_move(buyer: Buyer, standing: Standing) -> bool:
-    placement = standing.judged.machine.placement
     kind = buyer.kind(home(buyer.groups, standing.slot), standing)
-    if kind is not None and kind != placement.spot:
-        return False
     market = buyer.whole_market(home(buyer.groups, standing.slot), kind)
     count = crowding(buyer.places(standing))
     choice = market.choose(count, budget_usd_per_hour=buyer.budget)
@@ -99,22 +91,8 @@ def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | N
 
     The pool is quiet. The one that gains most goes first.
     """
-    found = [*_returns(buyer, now), *_moves(buyer, now, restless)]
+    found = _moves(buyer, now, restless)
     return min(found, key=lambda move: (move.urgency, move.standing.id), default=None)
-
-
-def _returns(buyer: Buyer, now: float) -> Iterator[Move]:
-    """Yield the stand-ins whose spot machines can be had again."""
-    for standing in buyer.census.good:
-        if standing.judged.machine.placement.spot or not _stayed(standing, RETURN_AFTER_S, now):
-            continue
-        group = home(buyer.groups, standing.slot)
-        if not buyer.kind(group, standing):  # on demand by right, or it does not matter
-            continue
-        choice = _best(buyer, standing, crowding(buyer.places(standing)))
-        if choice.offer is not None and not choice.rank[0]:
-            why = f"spot can be had again at {choice.offer.placement.location}"
-            yield Move(standing, why, (-1.0,))
 
 
 def _moves(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Iterator[Move]:
@@ -124,10 +102,6 @@ def _moves(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Iterato
         return
     for standing in buyer.census.good:
         if standing.id not in restless or not _stayed(standing, rules.stay_s, now):
-            continue
-        placement = standing.judged.machine.placement
-        kind = buyer.kind(home(buyer.groups, standing.slot), standing)
-        if kind is not None and kind != placement.spot:  # `_returns` decides about those
             continue
         count = crowding(buyer.places(standing))
         choice = _best(buyer, standing, count, at_leisure=True)
@@ -142,11 +116,15 @@ def _is_better(buyer: Buyer, standing: Standing, choice: Choice, count: Crowd) -
     offer, (avoided, *there) = choice.offer, choice.rank
     if rules is None or offer is None or avoided or offer.placement == placement:
         return None
+    kind = buyer.kind(home(buyer.groups, standing.slot), standing)
+    if kind is not None and kind != placement.spot:
+        sold = "spot" if kind else "on demand"
+        return Move(standing, f"moves to {offer.placement.location}: {sold}", (-1.0,))
     here = [count[domain] for domain in domains(placement)]
     if there < here:
         why = f"moves to {offer.placement.location}: better spread"
         return Move(standing, why, (0.0, *there))
-    better = gain(_score(buyer, standing), buyer.scale.score(offer))
+    better = gain(_score(buyer, standing), buyer.score(offer.placement, offer.usd_per_hour))
     if there == here and better >= rules.gain:
         why = f"moves to {offer.placement.location}: {better:.0%} better"
         return Move(standing, why, (1.0, -better))
@@ -164,7 +142,7 @@ def _score(buyer: Buyer, standing: Standing) -> float:
     machine = standing.judged.machine
     today = catalogue(buyer.observed.offers).cheapest
     price = today.get(machine.placement, machine.usd_per_hour)
-    return buyer.scale.score_of(price, buyer.scale.latency(machine.placement))
+    return buyer.score(machine.placement, price)
 
 
 def _stayed(standing: Standing, stay_s: float, now: float) -> bool:

@@ -7,10 +7,10 @@ Not here: where they go and whether they can be paid (`buying`).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
-from fogft.model.groups import CRITICAL, Group
+from fogft.model.groups import CRITICAL, Group, is_stand_in
 from fogft.planning.endings import Census, Standing
 from fogft.planning.observed.history import History
 
@@ -20,12 +20,14 @@ class Need(NamedTuple):
 
     Attributes:
         replaces: Whom it replaces; None to fill an empty slot.
+        stands_in: An on-demand machine is to serve until a spot one does.
     """
 
     slot: int
     reason: str
     group: Group
     replaces: Standing | None = None
+    stands_in: bool = False
 
 
 def home(groups: Sequence[Group], slot: int) -> Group:
@@ -86,7 +88,11 @@ def _replacement(groups: Sequence[Group], counts: Sequence[int], census: Census)
 def _missing(group: Group, wanted: int, census: Census, history: History) -> Iterator[Need]:
     missing = wanted - len(census.good) - len(census.replaced)
     used = {s.slot for s in (*census.good, *census.replaced)}
-    vacant = [s for s in census.lost if s.slot not in used and group.owns(s.slot)]
+    vacant = [
+        s
+        for s in census.lost
+        if s.slot not in used and group.owns(s.slot) and not is_stand_in(s.slot)
+    ]
     lost_slots = {s.slot for s in vacant}
     for standing in vacant:
         if missing > 0 and standing.slot not in used:
@@ -99,6 +105,12 @@ def _missing(group: Group, wanted: int, census: Census, history: History) -> Ite
         slot = _lowest_free(group, used)
         used.add(slot)
         yield Need(slot, _vacancy(slot, history), group)
+
+
+def stand_in(group: Group, used: Collection[int]) -> Need:
+    """Return the launch of an on-demand machine that serves until a spot one does."""
+    slot = next(slot for slot in itertools.count(group.first_stand_in) if slot not in used)
+    return Need(slot, "stands in until enough spot machines are ready", group, stands_in=True)
 
 
 def _lowest_free(group: Group, used: set[int]) -> int:

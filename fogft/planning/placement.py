@@ -18,8 +18,9 @@ from typing import NamedTuple
 
 from fogft.model.replica import Offer, Placement
 from fogft.model.scoring import Scale
-from fogft.planning.listing import Listing, Row, catalogue
+from fogft.planning.listing import Listing, Row, catalogue, without_offer
 from fogft.planning.observed.backoff import EVERYWHERE, Backoff
+from fogft.planning.observed.hazard import UNKNOWN, penalty
 
 EPSILON_USD = 1e-9
 
@@ -68,6 +69,8 @@ class Market:
         listing: What is sold, in order.
         resting: Supplies in backoff, see `Placement.supply`.
         avoid: Locations to use only when no other is left: one was lost there lately.
+        full: Locations that hold as many replicas as may be lost at once.
+        hazards: Location -> losses per hour, as far as known.
 
     Attributes:
         resting: The supplies that it would have, where all that it sells rests; else empty.
@@ -79,12 +82,21 @@ class Market:
         *,
         resting: Mapping[str, Backoff] | None = None,
         avoid: Collection[str] = (),
+        full: Collection[str] = (),
+        hazards: Mapping[str, float] | None = None,
     ) -> None:
         rests = resting or {}
         self._avoid = frozenset(avoid)
         self._nothing = listing.trouble
         self.resting: Mapping[str, Backoff] = {}
         self.rows, self._clouds = listing.rows, listing.clouds
+        if hazards:
+            self.rows = _weighed(self.rows, hazards)
+        if full:
+            self.rows = tuple([row for row in self.rows if row.location not in full])
+            self._clouds = frozenset([row.cloud for row in self.rows])
+            if not self.rows and not self._nothing:
+                self._nothing = "a location must not hold more of the replicas"
         asleep = listing.supplies.intersection(rests) if rests else frozenset()
         if asleep:
             self.rows = tuple([row for row in self.rows if row.supply not in asleep])
@@ -140,6 +152,20 @@ class Market:
                 f"leaves ${max(budget_usd_per_hour or 0.0, 0.0):.3f}/h",
             )
         return Choice(best.offer, rank=best_rank)
+
+
+def _weighed(rows: Sequence[Row], hazards: Mapping[str, float]) -> tuple[Row, ...]:
+    """Return rows in the order of their scores, losses counted in."""
+    unknown = penalty(UNKNOWN)
+    known = [
+        row._replace(score=row.score + penalty(hazards[row.location]) - unknown)
+        for row in rows
+        if row.spot and row.location in hazards
+    ]
+    if not known:
+        return tuple(rows)
+    rest = [row for row in rows if not row.spot or row.location not in hazards]
+    return tuple(sorted([*rest, *known], key=without_offer))
 
 
 def choose(

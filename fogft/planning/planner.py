@@ -16,14 +16,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+from fogft.model.groups import Group
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, ReplicaId
 from fogft.model.spec import PoolSpec
-from fogft.planning import migration, rollout
+from fogft.planning import fallback, migration, rollout
 from fogft.planning.buying import Buyer, PlannedLaunch
 from fogft.planning.classification import take_census
 from fogft.planning.endings import Census, Endings, Standing, choose_endings
-from fogft.planning.needs import Need, home, needed_launches, part
+from fogft.planning.needs import Need, home, needed_launches, part, stand_in
 from fogft.planning.observed.health import Health, judge
 from fogft.planning.observed.history import History
 from fogft.planning.placement import EPSILON_USD
@@ -157,15 +158,26 @@ def plan_once(
     census = take_census(spec, intent, observed, health=health, size=sized)
     counts, excess = _within_cap(sized, census)
     wanted = sum(counts)
-    buyer = Buyer(spec, intent, observed, history, census, sized.groups, sized.max_usd_per_hour)
-    settling = bool(census.replaced) and rollout.is_settling(census, observed.now)
-    needs = needed_launches(sized.groups, counts, census, history, settling=settling)
-    may_move = not needs and len(census.good) == wanted and spec.max_surge > 0
+    standing_in = fallback.stand_ins(census)
+    others = census.without(standing_in) if standing_in else census
+    buyer = Buyer(
+        spec,
+        intent,
+        observed,
+        history,
+        census,
+        sized.groups,
+        sized.max_usd_per_hour,
+        standing_in=standing_in,
+    )
+    settling = bool(others.replaced) and rollout.is_settling(others, observed.now)
+    needs = needed_launches(sized.groups, counts, others, history, settling=settling)
+    may_move = not needs and not standing_in and len(census.good) == wanted and spec.max_surge > 0
     may_move = may_move and migration.is_quiet(census, health)
-    waits = may_move and migration.has_stand_ins(buyer)
+    waits = False
     restless = migration.restless(buyer) if may_move else frozenset()
     moves = False
-    if waits or restless:
+    if restless:
         found = migration.mover(buyer, observed.now, restless)
         moves = found is not None
         if found is not None:
@@ -174,21 +186,29 @@ def plan_once(
             needs = needed_launches(sized.groups, counts, census, history)
     room = wanted + spec.max_surge - census.live
     first: Standing | None = None
+    begun = [need.slot for need in needs if not history.generation(need.slot)]
+    short = _stand_ins_missing(sized.groups, counts, others, standing_in, begun)
+    kept_free = bool(short) and not standing_in and room > 1  # one of them stands in
     for need in needs:
-        if not buyer.buy(need, room=room):
+        if not buyer.buy(need, room=room - kept_free):
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
             waits = True
             break
+    begun = [launch.slot for launch in buyer.launches if launch.generation == 1]
+    for need in _stand_ins_missing(sized.groups, counts, others, standing_in, begun):
+        buyer.buy(need, room=room)
     held: Sequence[ReplicaId] = ()
     if settling:
-        held = [s.id for s in census.replaced if rollout.is_outdated(s) and not s.draining_since]
+        held = [s.id for s in others.replaced if rollout.is_outdated(s) and not s.draining_since]
     endings = Endings()
     for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
+        here = part(others, sized.groups, group)
+        mine = [s for s in standing_in if home(sized.groups, s.slot) is group]
         makes_room = first is not None and home(sized.groups, first.slot) is group
         endings.add(
             choose_endings(
                 count,
-                part(census, sized.groups, group),
+                here,
                 health,
                 history,
                 now=observed.now,
@@ -196,6 +216,8 @@ def plan_once(
                 dear_first=bool(excess),
                 held=held,
                 first=first if makes_room else None,
+                standing_in=mine,
+                spare=fallback.spare(count, here, mine, observed.now),
             )
         )
     ends = [PlannedEnd(s.id, s.why) for s in (*census.failed, *census.aborted)]
@@ -218,6 +240,28 @@ def plan_once(
         waits=waits,
         restless=restless,
     )
+
+
+def _stand_ins_missing(
+    groups: Sequence[Group],
+    counts: Sequence[int],
+    others: Census,
+    standing_in: Sequence[Standing],
+    begun: Sequence[int],
+) -> list[Need]:
+    """Return the stand-ins called for, where some slots get their first machine now."""
+    needs: list[Need] = []
+    used = {s.slot for s in (*others.everyone(), *standing_in)}
+    for group, count in zip(groups, counts, strict=True):
+        if not group.on_demand.fallback:
+            continue
+        here = [s for s in standing_in if home(groups, s.slot) is group and not s.reason]
+        lacking = fallback.missing(count, part(others, groups, group), here)
+        for _ in range(lacking - sum(home(groups, slot) is group for slot in begun)):
+            need = stand_in(group, used)
+            used.add(need.slot)
+            needs.append(need)
+    return needs
 
 
 def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Standing | None:

@@ -1,16 +1,18 @@
 """What fogft is compared with: fixed policies, on the same machines and prices.
 
-None of them acts on a preemption notice. Each sees a lost machine and hears a refusal as
-soon as fogft does, and is not charged for what it needs besides its replicas.
+Each sees a notice, a lost machine and a refusal as soon as fogft does, and is not charged for
+what it needs besides its replicas. A machine with a notice is replaced, and serves until it ends.
 
-Owns: replicas that stay where they are, and SkyServe's policy.
+Owns: replicas that stay where they are, a naive policy, round robin, SkyServe's and SpotHedge's.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Protocol
 
 from fogft.cloud.port import Launch
 from fogft.errors import NoCapacity
@@ -62,9 +64,14 @@ class Fleet:
         return [(id, self.ordered.pop(id)) for id in gone]
 
     def ready(self, id: ReplicaId) -> bool:
-        """Whether a machine serves."""
+        """Whether a machine serves, and has no notice."""
         vm = self.world.vms.get(id)
-        return vm is not None and vm.ready
+        return vm is not None and vm.ready and not vm.noticed
+
+    def leaving(self, id: ReplicaId) -> bool:
+        """Whether a machine has a notice."""
+        vm = self.world.vms.get(id)
+        return vm is not None and vm.noticed
 
 
 class Static:
@@ -89,13 +96,17 @@ class Static:
         self._due[slot] = self._fleet.world.now + RETRY_S
 
 
-class SkyServe:
-    """SkyServe's spot placer, with or without its on-demand fallback.
+class Search:
+    """Spot machines wherever a rule finds room, and on-demand ones while too few are ready.
 
-    A location is active until a replica is lost or refused there, and again once one becomes
-    ready; when fewer than two are active, all are. A launch goes to the cheapest active
-    location with the fewest replicas. For each spot replica that is not ready an on-demand
-    one runs in its place. After a refusal in every location it waits a minute.
+    After a refusal in every location it waits a minute.
+
+    Args:
+        spot: What the rule chooses among.
+        on_demand: What runs for each replica that no ready spot machine serves; None for nothing.
+        replicas: How many should be ready.
+        rule: Says where next.
+        extra: So many spot machines are kept besides.
     """
 
     def __init__(
@@ -105,32 +116,49 @@ class SkyServe:
         on_demand: Offer | None,
         replicas: int,
         wanted: Target,
+        *,
+        rule: Callable[[Sequence[Offer]], Rule],
+        extra: int = 0,
     ) -> None:
         self.wanted = wanted
         self._fleet = Fleet(world)
-        self._spot = spot
+        self._rule = rule(spot)
+        self._locations = len({o.placement.location for o in spot})
         self._on_demand = on_demand
         self._replicas = replicas
-        self._preempted: set[str] = set()
+        self._spots = replicas + extra
         self._seen_ready: set[ReplicaId] = set()
+        self._left: set[ReplicaId] = set()
         self._refused_in_a_row = 0
         self._spot_from = world.now
 
     def tick(self, now: float) -> float:
         """Order and end what the policy says."""
-        fleet = self._fleet
-        for _, offer in fleet.missed():
-            self._mark(offer)
-        spot = [id for id, offer in fleet.ordered.items() if offer.placement.spot]
-        for id in spot:
+        fleet, rule = self._fleet, self._rule
+        for id, offer in fleet.missed():
+            if offer.placement.spot and id not in self._left:
+                rule.lost(offer)
+        kept = []
+        for id, offer in fleet.ordered.items():
+            if not offer.placement.spot:
+                continue
+            if fleet.leaving(id):
+                if id not in self._left:
+                    self._left.add(id)
+                    rule.lost(offer)
+                continue
+            kept.append(id)
             if id not in self._seen_ready and fleet.ready(id):
                 self._seen_ready.add(id)
-                self._preempted.discard(fleet.ordered[id].placement.location)
-        if self._spot and now >= self._spot_from:
-            for slot in range(len(spot), self._replicas):
-                offer = self._place()
+                self._refused_in_a_row = 0
+                rule.ready(offer)
+        if now >= self._spot_from:
+            taken = [fleet.ordered[id] for id in kept]
+            for slot in range(len(kept), self._spots):
+                offer = rule.place(taken)
+                taken.append(offer)
                 fleet.order(slot, offer, partial(self._refused, offer))
-        self._fall_back(self._replicas - sum(map(fleet.ready, spot)))
+        self._fall_back(self._replicas - sum(map(fleet.ready, kept)))
         return self._spot_from if self._spot_from > now else NEVER
 
     def _fall_back(self, wanted: int) -> None:
@@ -144,23 +172,97 @@ class SkyServe:
         for id in running[: max(len(running) - max(wanted, 0), 0)]:
             fleet.end(id)
 
-    def _place(self) -> Offer:
-        used = Counter(o.placement.location for o in self._fleet.ordered.values())
-        active = [o for o in self._spot if o.placement.location not in self._preempted]
+    def _refused(self, offer: Offer) -> None:
+        self._rule.lost(offer)
+        self._refused_in_a_row += 1
+        if self._refused_in_a_row >= self._locations:
+            self._refused_in_a_row = 0
+            self._spot_from = self._fleet.world.now + RETRY_S
+
+
+class Rule(Protocol):
+    """Where the next spot machine is ordered."""
+
+    def place(self, taken: Sequence[Offer]) -> Offer:
+        """Return the offer to order, given those in use."""
+
+    def lost(self, offer: Offer) -> None:
+        """Take into account that a location took a machine away, or had no room."""
+
+    def ready(self, offer: Offer) -> None:
+        """Take into account that a machine became ready there."""
+
+
+class InTurn:
+    """The next location of a list, wherever the others are: round robin."""
+
+    def __init__(self, spot: Sequence[Offer]) -> None:
+        self._turns = itertools.cycle(spot)
+
+    def place(self, taken: Sequence[Offer]) -> Offer:
+        """Return the next offer."""
+        return next(self._turns)
+
+    def lost(self, offer: Offer) -> None:
+        """Remember nothing."""
+
+    def ready(self, offer: Offer) -> None:
+        """Remember nothing."""
+
+
+class Naive:
+    """The cheapest location with the fewest replicas, not again where it just failed."""
+
+    def __init__(self, spot: Sequence[Offer]) -> None:
+        self._failed: dict[str, int] = {}
+        self._failures = itertools.count(1)
+        self._spot = spot
+
+    def place(self, taken: Sequence[Offer]) -> Offer:
+        """Return the offer to order: of equals the one whose failure is longest ago."""
+        used = Counter(o.placement.location for o in taken)
         return min(
-            active,
-            key=lambda o: (used[o.placement.location], o.usd_per_hour, o.placement),
+            self._spot,
+            key=lambda o: (
+                used[o.placement.location],
+                self._failed.get(o.placement.location, 0),
+                o.usd_per_hour,
+                o.placement,
+            ),
         )
 
-    def _mark(self, offer: Offer) -> None:
+    def lost(self, offer: Offer) -> None:
+        """Ask there last."""
+        self._failed[offer.placement.location] = next(self._failures)
+
+    def ready(self, offer: Offer) -> None:
+        """Remember nothing."""
+
+
+class ActiveZones:
+    """SkyServe's spot placer: the cheapest active location with the fewest replicas.
+
+    A location is active until a replica is lost or refused there, and again once one becomes
+    ready; when fewer than two are active, all are.
+    """
+
+    def __init__(self, spot: Sequence[Offer]) -> None:
+        self._spot = spot
+        self._preempted: set[str] = set()
+
+    def place(self, taken: Sequence[Offer]) -> Offer:
+        """Return the offer to order."""
+        used = Counter(o.placement.location for o in taken)
+        active = [o for o in self._spot if o.placement.location not in self._preempted]
+        return min(active, key=lambda o: (used[o.placement.location], o.usd_per_hour, o.placement))
+
+    def lost(self, offer: Offer) -> None:
+        """Let a location be inactive."""
         self._preempted.add(offer.placement.location)
         locations = {o.placement.location for o in self._spot}
         if len(locations - self._preempted) < 2:
             self._preempted.clear()
 
-    def _refused(self, offer: Offer) -> None:
-        self._mark(offer)
-        self._refused_in_a_row += 1
-        if self._refused_in_a_row >= len({o.placement.location for o in self._spot}):
-            self._refused_in_a_row = 0
-            self._spot_from = self._fleet.world.now + RETRY_S
+    def ready(self, offer: Offer) -> None:
+        """Let it be active."""
+        self._preempted.discard(offer.placement.location)

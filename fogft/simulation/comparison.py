@@ -21,7 +21,7 @@ from fogft.model.spec import PoolSpec
 from fogft.planning.placement import choose
 from fogft.planning.sizing import size
 from fogft.pool.manager.offers import ask
-from fogft.simulation.baselines import SkyServe, Static
+from fogft.simulation.baselines import ActiveZones, InTurn, Naive, Search, Static
 from fogft.simulation.generator import generate
 from fogft.simulation.managed import Managed
 from fogft.simulation.market import FindOffers, Market
@@ -174,10 +174,14 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
     if spots:
         places = static_places(spots, replicas)
         found[f"static, any of {len(places)}"] = lambda world: Static(world, places, target)
-        skyserve = partial(SkyServe, spot=spots, replicas=replicas, wanted=target)
-        found["SkyServe, spot only"] = partial(skyserve, on_demand=None)
+        search = partial(Search, spot=spots, replicas=replicas, wanted=target)
+        found["SkyServe, spot only"] = partial(search, on_demand=None, rule=ActiveZones)
         if reserved:
-            found["SkyServe, fallback"] = partial(skyserve, on_demand=reserved[0])
+            search = partial(search, on_demand=reserved[0])
+            found["SkyServe, fallback"] = partial(search, rule=ActiveZones)
+            found["SpotHedge"] = partial(search, rule=ActiveZones, extra=1)
+            found["naive"] = partial(search, rule=Naive)
+            found["round robin"] = partial(search, rule=InTurn)
     return found
 
 

@@ -11,12 +11,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fogft.model import schedule
+from fogft.model.groups import is_stand_in
 from fogft.model.intent import Intent
 from fogft.model.replica import LinkReport, LinkState, MachinePhase, Membership, ReplicaId
 from fogft.model.spec import PoolSpec
-from fogft.planning import migration
 from fogft.planning.endings import DRAIN_SETTLE_S
+from fogft.planning.fallback import SETTLED_S
 from fogft.planning.observed import backoff
+from fogft.planning.observed.hazard import EVERY_S, as_of
 from fogft.planning.observed.health import LONE_SILENCE_FACTOR
 from fogft.planning.observed.history import Event, History, compacted
 from fogft.planning.planner import DRAIN_LIMIT_S
@@ -142,7 +144,10 @@ class Managed:
         times = [backoff.next_change(history, now, waits=waits, restless=bool(restless))]
         if tick.spec.schedule is not None:
             times.append(schedule.next_change(tick.spec.schedule, now))
+        if tick.spec.migration is not None:
+            times.append(as_of(now) + EVERY_S)
         stay_s = tick.spec.migration.stay_s if tick.spec.migration else NEVER
+        stands_in = any(is_stand_in(record.slot) for record in history.open())
         for record in history.open():
             if record.draining_since is not None:
                 ends = (DRAIN_SETTLE_S, DRAIN_LIMIT_S)
@@ -152,8 +157,8 @@ class Managed:
                 continue
             if (record.slot, record.generation) in restless:
                 times.append(record.first_ready_at + stay_s)
-            if waits and record.on_demand:
-                times.append(record.first_ready_at + migration.RETURN_AFTER_S)
+            if stands_in:
+                times.append(record.first_ready_at + SETTLED_S)
         provisioning = MachinePhase.PROVISIONING
         for machine in tick.observed.machines or ():
             if machine.phase is provisioning:

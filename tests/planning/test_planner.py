@@ -9,6 +9,7 @@ import pytest
 from fogft.model import intent as intents
 from fogft.model.intent import Intent
 from fogft.model.replica import LinkState, Offer
+from fogft.planning.observed.backoff import NO_ROOM_S
 from fogft.planning.observed.history import Event, EventKind
 from tests.planning.pool_worlds import NOW, OFFERS, PLACES, World, replica, shorts, spec
 
@@ -350,7 +351,7 @@ def test_resting_location_is_skipped_and_reported() -> None:
     world = World(spec(1), events=tuple(refused))
     assert launches(world) == []
     assert "`east/one/a`: capacity" in world.plan().notes[0]
-    assert launches(replace(world, now=NOW + 5)) == ["0.2"]
+    assert launches(replace(world, now=NOW + NO_ROOM_S)) == ["0.2"]
 
 
 def test_mark_of_our_own_is_not_the_replicas_wish() -> None:

@@ -340,7 +340,7 @@ def test_a_replica_moves_to_a_much_cheaper_place_new_before_old():
     planned = world.plan()
     [launch] = planned.launches
     assert launch.offer.placement.zone == "2"
-    assert "50% better" in launch.reason
+    assert "48% better" in launch.reason  # half the price, and nothing is known of losses there
     assert not planned.draining
     for _ in range(5):
         world = elapsed(applied(world, world.plan()), 5.0)

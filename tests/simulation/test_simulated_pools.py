@@ -201,6 +201,9 @@ def test_policies_meet_the_same_markets_and_the_same_seeds_give_the_same_report(
         "static, any of 2",
         "SkyServe, spot only",
         "SkyServe, fallback",
+        "SpotHedge",
+        "naive",
+        "round robin",
     ]
     assert first != simulate(replace(wanted, seeds=(5, 6))).to_json()
 

@@ -6,9 +6,10 @@ launches that failed, and replicas that died young. After n failures in a row a 
 
     min(BASE_S * 2 ** (n - 1), LIMIT_S)
 
-seconds from the last one. A replica that becomes ready there, or FORGIVE_S without a
-failure, wipes the slate clean. A failed `setup` is the pool file's fault, not the
-location's: it is counted against `EVERYWHERE`, so a broken file does not tour the world
+seconds from the last one; NO_ROOM_S in place of BASE_S where it had no room, so that a round
+over all locations ends before the first is asked again. A replica that becomes ready there, or
+FORGIVE_S without a failure, wipes the slate clean. A failed `setup` is the pool file's fault,
+not the location's: it is counted against `EVERYWHERE`, so a broken file does not tour the world
 at the user's expense.
 
 A location where a replica was lost unasked is not at rest, but it is avoided: used only when
@@ -35,6 +36,7 @@ from fogft.planning.observed.expiring import Lasting
 from fogft.planning.observed.history import Failure, History
 
 BASE_S = 5.0
+NO_ROOM_S = 120.0
 LIMIT_S = 600.0
 FORGIVE_S = 3600.0
 EVERYWHERE = "*"
@@ -182,13 +184,14 @@ def _backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
         return None
     last = recent[-1]
     # Waiting a little does not help where the account is full.
-    until = last.at + (LIMIT_S if last.cause == "quota" else rest_s(len(recent)))
+    until = last.at + (LIMIT_S if last.cause == "quota" else rest_s(len(recent), last.cause))
     return None if now >= until else Backoff(until, len(recent), last.cause, since=last.at)
 
 
-def rest_s(failures: int) -> float:
+def rest_s(failures: int, cause: str = "") -> float:
     """Return how long so many failures in a row make a location rest, in seconds."""
-    return min(BASE_S * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
+    base_s = NO_ROOM_S if cause == "capacity" else BASE_S
+    return min(base_s * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
 
 
 class _Avoidance(NamedTuple):
@@ -263,6 +266,6 @@ def _everywhere_changes(history: History, setup: Sequence[Failure], now: float) 
 def _shortened(lately: Iterable[Failure], rest: Backoff) -> Sequence[float]:
     """Return when failures are forgiven by which a rest may end early."""
     forgiven = [f.at + FORGIVE_S for f in lately if f.at + FORGIVE_S < rest.until]
-    if rest_s(rest.failures - len(forgiven)) < rest.until - rest.since:
+    if rest_s(rest.failures - len(forgiven), rest.cause) < rest.until - rest.since:
         return forgiven
     return ()

@@ -12,7 +12,7 @@ Not here: the file they are stored in (`fogft.pool.folder.store`) and what to ma
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from operator import itemgetter
@@ -162,6 +162,8 @@ class History:
         self._failures: dict[str, list[Failure]] = {}
         self._proven_at: dict[str, float] = {}
         self._losses: dict[str, list[float]] = {}
+        self._lives: dict[str, tuple[Record, ...]] = {}  # of spot machines, by location
+        self._of_lives: dict[str, tuple[float, float]] = {}  # what follows from them, as of when
         self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
         self.version = 0  # of all facts: counts events
         # What follows from failures and proofs of each supply, and from losses at each location.
@@ -184,6 +186,9 @@ class History:
             record = Record(event.slot, event.generation, event.at, event.location)
             record.on_demand = event.on_demand
             self._records[key] = record
+            if not record.on_demand:
+                kept = self._lives.get(record.location, ())
+                self._lives[record.location] = (*kept, record)
         if event.kind is EventKind.LAUNCH:  # a second one: it was thought gone, and is listed
             record.closed, record.ending = None, False
         else:
@@ -206,7 +211,7 @@ class History:
         }
         self._losses = {p: [at + by_s for at in losses] for p, losses in self._losses.items()}
         self._proven_at = {supply: at + by_s for supply, at in self._proven_at.items()}
-        self._of_supplies, self._of_losses = {}, {}
+        self._of_supplies, self._of_losses, self._of_lives = {}, {}, {}
 
     def by_clock(self, instant: float) -> float:
         """Return a time that was written down as the clock tells it now, if it was set since."""
@@ -219,6 +224,7 @@ class History:
         later = History()
         later._records, later._open = dict(self._records), dict(self._open)
         later._generations = dict(self._generations)
+        later._lives, later._of_lives = dict(self._lives), dict(self._of_lives)
         # Launches and marks change none of these.
         later._failures, later._proven_at = self._failures, self._proven_at
         later._losses, later._served = self._losses, self._served
@@ -259,8 +265,12 @@ class History:
 
     def _close(self, record: Record, event: Event) -> None:
         kind = event.kind
+        self._of_lives.pop(record.location, None)
         if kind is EventKind.REFUSED:
             self._fail(record, event)
+            if record.location in self._lives:
+                kept = self._lives[record.location]
+                self._lives[record.location] = tuple([r for r in kept if r is not record])
         elif kind is EventKind.GONE:
             if died_young(record, event):
                 self._fail(record, event)
@@ -334,6 +344,21 @@ class History:
     ) -> S:
         """Return what follows from the losses at each location; likewise."""
         return self._follows(self._of_losses, self._losses, work_out, sum_up, now)
+
+    def of_lives(
+        self, work_out: Callable[[Sequence[Record], float], float], at: float
+    ) -> Mapping[str, float]:
+        """Return what follows from the spot machines that lived at each location, as of a time.
+
+        Args:
+            work_out: Pure, and always the same. It is asked again for another time, and after a
+                machine has ended there.
+            at: Seconds since the epoch.
+        """
+        for location, lives in self._lives.items():
+            if lives and self._of_lives.get(location, (None, 0.0))[0] != at:
+                self._of_lives[location] = at, work_out(lives, at)
+        return {place: self._of_lives[place][1] for place, lives in self._lives.items() if lives}
 
     def _follows(
         self,

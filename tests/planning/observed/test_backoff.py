@@ -12,6 +12,7 @@ from fogft.planning.observed.backoff import (
     EVERYWHERE,
     FORGIVE_S,
     LIMIT_S,
+    NO_ROOM_S,
     avoided,
     backoff,
     disappointing,
@@ -39,12 +40,13 @@ def test_rest_is_bounded_and_forgiven(times: list[float], now: float) -> None:
     assert backoff([Failure(at, "capacity") for at in times], max(times) + FORGIVE_S) is None
 
 
-@given(st.integers(1, 40))
-def test_rest_doubles_up_to_the_limit(count: int) -> None:
-    """n failures in a row rest for BASE_S * 2 ** (n - 1), at most LIMIT_S."""
-    rest = backoff([Failure(float(i), "capacity") for i in range(count)], float(count))
+@given(st.integers(1, 40), st.sampled_from(["error", "capacity"]))
+def test_rest_doubles_up_to_the_limit(count: int, cause: str) -> None:
+    """n failures in a row rest for a base times 2 ** (n - 1), at most LIMIT_S."""
+    base_s = {"error": BASE_S, "capacity": NO_ROOM_S}[cause]
+    rest = backoff([Failure(float(i), cause) for i in range(count)], count - 0.5)
     assert rest is not None
-    assert rest.until == count - 1 + min(BASE_S * 2 ** (count - 1), LIMIT_S)
+    assert rest.until == count - 1 + min(base_s * 2 ** (count - 1), LIMIT_S)
     assert rest.failures == count
 
 
@@ -143,9 +145,11 @@ def test_who_waits_looks_again_when_a_place_is_no_longer_avoided() -> None:
 
 
 def test_who_waits_looks_again_when_a_rest_ends_or_all_rest_for_long_enough() -> None:
-    """Whichever comes first: with eight refusals in a row it is the minute."""
+    """Whichever comes first: a rest for want of room is longer than the minute."""
     events = [e for n in range(1, 9) for e in refused(n, n)]
-    few, many = History(events[:2]), History(events)
+    launch = Event(0, EventKind.LAUNCH, 0, 1, PLACE)
+    few = History([launch, Event(1, EventKind.FAILED, 0, 1, "", "error")])
+    many = History(events)
     assert next_change(few, 2, waits=True, restless=False) == 1 + BASE_S
     assert next_change(many, 9, waits=True, restless=False) == 8 + EAGER_S
     assert next_change(many, 9, waits=False, restless=True) == 8 + FORGIVE_S

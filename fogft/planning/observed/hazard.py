@@ -1,0 +1,63 @@
+"""How often spot machines were lost at each location, learned from this pool's own past. Pure.
+
+The rate is (PRIOR_LOSSES + losses) / (PRIOR_S + seconds lived there), what is longer ago
+counting for less: by half after HALF_LIFE_S. So a location that nobody was in has the
+prior's rate, one loss tells something and ten tell much, and in time all is forgiven.
+
+It is worked out as of the last multiple of EVERY_S, losses since included, so that it does not
+depend on who asks when.
+
+Owns: the rate and what it is worth in a score.
+Not here: refusals and the rest after them (`backoff`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from fogft.planning.observed.history import EventKind, History, Record
+
+PRIOR_LOSSES = 1.0
+PRIOR_S = 4 * 3600.0
+HALF_LIFE_S = 24 * 3600.0
+EVERY_S = 1800.0
+# What a loss costs, in hours of the machine lost: its successor boots while another one, mostly a
+# dearer one, serves, and while it does one more loss is an outage.
+LOSS_COSTS_H = 1.0
+_DECAY = math.log(2.0) / HALF_LIFE_S
+
+
+def hazards(history: History, now: float) -> Mapping[str, float]:
+    """Return the losses per hour at each location where a spot machine has lived."""
+    return history.of_lives(hazard, as_of(now))
+
+
+def as_of(now: float) -> float:
+    """Return the time as of which rates are worked out."""
+    return now // EVERY_S * EVERY_S
+
+
+def hazard(lives: Iterable[Record], at: float) -> float:
+    """Return the losses per hour of a location, by its spot machines, as of a time."""
+    losses, lived_s = PRIOR_LOSSES, PRIOR_S
+    for record in lives:
+        ended = record.closed is not None
+        end = min(record.closed_at, at) if ended else at
+        if end > record.launched_at:
+            lived_s += (_weight(at - end) - _weight(at - record.launched_at)) / _DECAY
+        if record.closed is EventKind.GONE:
+            losses += _weight(max(at - record.closed_at, 0.0))
+    return losses / lived_s * 3600.0
+
+
+def _weight(age_s: float) -> float:
+    return math.exp(-_DECAY * age_s)
+
+
+def penalty(per_hour: float) -> float:
+    """Return what a rate adds to a score: the logarithm of what it makes an hour dearer by."""
+    return math.log1p(LOSS_COSTS_H * per_hour)
+
+
+UNKNOWN = PRIOR_LOSSES / PRIOR_S * 3600.0

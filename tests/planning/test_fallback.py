@@ -1,0 +1,111 @@
+"""On-demand machines beside the search for spot ones: ordered when readiness is short."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from fogft.model.choices import OnDemandSpec
+from fogft.model.groups import STAND_INS
+from fogft.model.replica import Offer, Placement
+from fogft.planning.fallback import SETTLED_S
+from fogft.planning.observed.history import Event, EventKind
+from tests.planning.pool_worlds import NOW, PLACES, World, replica, spec
+
+SPOT = tuple(Offer(place, 0.1) for place in PLACES)
+ON_DEMAND = tuple(Offer(replace(place, spot=False), 0.3) for place in PLACES)
+MIXED = spec(2, on_demand=OnDemandSpec(0, fallback=True))
+
+
+def world(*parts, of=MIXED, offers=(*SPOT, *ON_DEMAND)) -> World:
+    return World(of, offers=offers).having(*parts)
+
+
+def stand_in(**others):
+    """An on-demand replica in a slot of its own."""
+    return replica(STAND_INS, at=replace(PLACES[3], spot=False), price=0.3, of=MIXED, **others)
+
+
+def spot(slot: int, generation: int = 1, **others):
+    return replica(slot, generation, of=MIXED, **others)
+
+
+def ordered(world: World) -> list[tuple[int, bool]]:
+    return [(launch.slot, launch.offer.placement.spot) for launch in world.plan().launches]
+
+
+def test_a_pool_that_starts_orders_spot_machines_alone():
+    assert ordered(world()) == [(0, True), (1, True)]
+
+
+def test_at_a_notice_a_stand_in_is_ordered_beside_another_spot_machine():
+    assert ordered(world(spot(0), spot(1, state="noticed"))) == [(1, True), (STAND_INS, False)]
+
+
+def test_after_a_refusal_a_stand_in_is_ordered_beside_the_next_try():
+    refused = (
+        Event(NOW - 2, EventKind.LAUNCH, 1, 1, PLACES[1].location),
+        Event(NOW - 1, EventKind.REFUSED, 1, 1, detail="capacity: none"),
+    )
+    asked = replace(world(spot(0)), events=(*world(spot(0)).events, *refused))
+    assert ordered(asked) == [(1, True), (STAND_INS, False)]
+
+
+def test_a_stand_in_is_kept_within_cap_and_surge():
+    noticed = spot(0), spot(1, state="noticed")
+    capped = replace(MIXED, max_usd_per_hour=0.35)
+    assert ordered(world(*noticed, of=capped)) == [(1, True)]
+    assert ordered(world(*noticed, of=replace(MIXED, max_surge=0))) == [(1, True)]
+
+
+def test_a_stand_in_stays_while_its_spot_machine_boots_and_is_not_ordered_twice():
+    booting = spot(1, 2, state="provisioning")
+    planned = world(spot(0), booting, stand_in()).plan()
+    assert not planned.launches
+    assert not planned.draining
+    assert not planned.terminations
+
+
+@pytest.mark.parametrize(("ready_for_s", "goes"), [(SETTLED_S - 5, False), (SETTLED_S + 5, True)])
+def test_a_stand_in_goes_once_enough_spot_machines_have_been_ready_for_a_while(ready_for_s, goes):
+    planned = world(spot(0, age_s=9000.0), spot(1, 2, age_s=ready_for_s + 1), stand_in()).plan()
+    assert [id.slot for id in planned.draining] == [STAND_INS] * goes
+
+
+def test_spot_machines_are_looked_for_while_stand_ins_serve():
+    assert ordered(world(spot(0), stand_in())) == [(1, True)]
+
+
+def test_on_demand_stands_in_rather_than_a_second_spot_machine_in_one_location():
+    """Only one location has room: half of the pool is there already."""
+    room = (SPOT[0], SPOT[1], *ON_DEMAND)
+    full = (
+        Event(NOW - 2, EventKind.LAUNCH, 1, 1, PLACES[1].location),
+        Event(NOW - 1, EventKind.REFUSED, 1, 1, detail="capacity: none"),
+    )
+    first = replica(0, at=PLACES[0], of=MIXED)
+    asked = world(first, offers=room)
+    asked = replace(asked, events=(*asked.events, *full))
+    assert ordered(asked) == [(STAND_INS, False)]
+    alone = replace(asked, offers=(SPOT[0], *ON_DEMAND))  # nothing else is sold
+    assert (1, True) in ordered(alone)
+
+
+def test_where_spot_machines_were_lost_less_often_the_next_one_goes():
+    """Three losses outweigh a tenth of the price, until they are forgotten."""
+    places = [Placement("c", "r", zone, "m") for zone in ("a", "b")]
+    events = [
+        event
+        for n in range(3)
+        for event in (
+            Event(NOW - 9000 + 1200 * n, EventKind.LAUNCH, 7, n + 1, "c/r/a"),
+            Event(NOW - 8900 + 1200 * n, EventKind.READY, 7, n + 1),
+            Event(NOW - 7900 + 1200 * n, EventKind.GONE, 7, n + 1),
+        )
+    ]
+    offers = Offer(places[0], 0.1), Offer(places[1], 0.11)
+    seen = World(spec(1), offers=offers, events=tuple(events), now=NOW + 3600)
+    assert [x.offer.placement.zone for x in seen.plan().launches] == ["b"]
+    later = replace(seen, now=NOW + 30 * 86_400)
+    assert [x.offer.placement.zone for x in later.plan().launches] == ["a"]
