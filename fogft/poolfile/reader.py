@@ -69,6 +69,8 @@ class Reader:
         """Return the dataclasses that a list of maps describes, each with a name of its own."""
         found: list[Any] = []
         lines: dict[str, int] = {}
+        if self._internal and section.children[key].value == ():
+            return ()
         sections = section.sections(key, form.hint)
         if len(sections) > form.most:
             raise section.error(key, f"has {len(sections)} entries", f"list {form.most} at most")

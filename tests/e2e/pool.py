@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from fogft.pool.commands import status as seen
 from fogft.pool.folder.paths import PoolPaths
 
@@ -163,12 +165,9 @@ class Machine:
         self.process: subprocess.Popen[bytes] | None = None
 
     def configure(self, **values: str) -> None:
-        """Change keys of its configuration that stand at the beginning of a line."""
-        lines = self.config.read_text().splitlines()
-        for key, value in values.items():
-            (at,) = [n for n, line in enumerate(lines) if line.startswith(f"{key}:")]
-            lines[at] = f"{key}: {value}"
-        self.config.write_text("\n".join(lines) + "\n")
+        """Set keys of its configuration."""
+        config = {**yaml.safe_load(self.config.read_text()), **values}
+        self.config.write_text(yaml.safe_dump(config))
 
     def start(self) -> None:
         """Start what the bundle was for."""

@@ -45,7 +45,7 @@ class Scene:
         dialer = self.dialer = UplinkDialer(inner)
         dialer.use(
             [f"if{i}" for i in range(uplinks)],
-            [ServiceSpec("/s", "t/srv/T", uplinks=UplinkPolicy(policy))],
+            [ServiceSpec("/s", "t/srv/T", uplink_policy=UplinkPolicy(policy))],
         )
         self.link = dialer.dial(PEER, {"/s": "k"}, self.owner)
         self.uplinks = inner.links
@@ -93,7 +93,9 @@ def test_each_service_has_its_own_policy():
     """Over the same links at the same time."""
     scene = Scene("all")
     policies = [("/s", UplinkPolicy.ALL), ("/t", UplinkPolicy.PREFER)]
-    scene.dialer.use(["if0", "if1"], [ServiceSpec(n, "t/srv/T", uplinks=p) for n, p in policies])
+    scene.dialer.use(
+        ["if0", "if1"], [ServiceSpec(n, "t/srv/T", uplink_policy=p) for n, p in policies]
+    )
     assert scene.offer()
     assert scene.counts() == [1, 1]
     assert scene.link.offer("/t", b"t" * 16, b"payload", 5.0)

@@ -42,6 +42,11 @@ def test_whatever_a_text_holds_it_stays_one_text(tmp_path_factory, run, envs) ->
     assert read.services == CONFIG.services
 
 
+def test_services_may_be_unknown_yet(tmp_path: Path) -> None:
+    """A pool whose services are discovered starts with none."""
+    assert round_trip(replace(CONFIG, services=()), tmp_path).services == ()
+
+
 def test_paths_lead_from_the_files_own_folder(tmp_path: Path) -> None:
     read = round_trip(replace(CONFIG, records=Path("records.json")), tmp_path)
     assert read.credentials.key == tmp_path / "a.key"

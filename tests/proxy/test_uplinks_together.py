@@ -47,7 +47,7 @@ class Scene:
         self.relays = {name: ThinRelay(pool.endpoint(0)) for name in ("near", "far")}
         inner = ZenohDialer(pool.authority.robot(), robot="robot", pool_uid=POOL_UID, **given)
         self.dialer, self.owner = UplinkDialer(ByRelay(inner, self.relays)), Owner()
-        self.dialer.use(list(self.relays), [ServiceSpec(SERVICE, TYPE, uplinks=policy)])
+        self.dialer.use(list(self.relays), [ServiceSpec(SERVICE, TYPE, uplink_policy=policy)])
         self.link = self.dialer.dial(peer("replica:7447"), keys(0), self.owner)
         self._folder = folder
 

@@ -117,7 +117,6 @@ class Manager:
         log.info("manager_started pool=%s epoch=%d", self._identity.name, self._lease.epoch)
         try:
             while not stop.is_set():
-                self._lease.beat()
                 if self._work():
                     break
                 self._rest(stop)
@@ -136,8 +135,8 @@ class Manager:
             Whether the pool has ended by itself: there is nothing left to manage.
         """
         self._trouble = []
-        for path in (self._paths.manager_log, self._paths.proxy_log):
-            logfile.bound(path)
+        self._attempt(self._lease.beat)
+        self._attempt(self._bound_logs)
         self._attempt(self._keep_proxy)
         tick = self._attempt_tick()
         if tick is None:
@@ -153,6 +152,10 @@ class Manager:
                 return not self._trouble
         self._attempt(lambda: self._write_status(tick))
         return False
+
+    def _bound_logs(self) -> None:
+        for path in (self._paths.manager_log, self._paths.proxy_log):
+            logfile.bound(path)
 
     def _discover(self, tick: Tick) -> None:
         if self._discovery.look(tick.spec, tick.observed):
@@ -181,8 +184,13 @@ class Manager:
         except (PoolNotFound, PoolBusy):
             raise
         except FogftError as error:
-            log.error("manager_step_failed reason=%r", error.message)
-            self._trouble.append(error.message)
+            self._failed(error.message)
+        except OSError as error:  # no room, no descriptor, a folder that was taken away
+            self._failed(str(error))
+
+    def _failed(self, reason: str) -> None:
+        log.error("manager_step_failed reason=%r", reason)
+        self._trouble.append(reason)
 
     def _attempt_tick(self) -> Tick | None:
         ticks: list[Tick] = []
