@@ -20,7 +20,7 @@ from fogft.cli.options import AsJson, PoolOption
 from fogft.errors import CredentialError, FogftError
 
 if TYPE_CHECKING:
-    from fogft.model.certificate_holder import Holder, Role
+    from fogft.model.credentials import Holder, Role
     from fogft.pool.credentials.ledger import Entry
 
 DAY_H = 24.0
@@ -144,7 +144,7 @@ def rotate(
     taken back. Replicas are replaced, the new one first. For a robot or a gateway on another
     machine issue a new bundle, join there with it, and revoke the old generation.
     """
-    from fogft.model.certificate_holder import Role
+    from fogft.model.credentials import Role
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import rotate_replicas, rotate_robot
 
@@ -210,7 +210,7 @@ def _alone(holder: Holder) -> str:
 
 
 def _role(text: str) -> Role:
-    from fogft.model.certificate_holder import Role
+    from fogft.model.credentials import Role
 
     allowed = (Role.ROBOT, Role.REPLICA, Role.GATEWAY, Role.RENDEZVOUS)
     for role in allowed:

@@ -51,6 +51,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     """Show what a pool file would launch, why there, and what it costs. Launches nothing."""
     from fogft.cli import plan_plot, plan_text
     from fogft.pool.commands.plan import plan_file
+    from fogft.reason_words import words
     from fogft.simulation.plot import check
 
     if plot is not None:
@@ -60,7 +61,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         output.json_data(plan_text.to_json(shown))
     else:
         plan_text.show(shown, everything=everything)
-    for note in (*shown.notes, *shown.explanation.notes):
+    for note in (*shown.notes, *map(words, shown.explanation.notes)):
         output.warn(note)
     if plot is not None:
         plan_plot.draw(shown, plot)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from fogft.cli import output
 from fogft.cli.status_text import age
+from fogft.reason_words import words
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -79,7 +80,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
         },
         "traffic": {service.name: _traffic_json(shown, service) for service in shown.spec.services},
         "first_response": {"round_trips_s": plan.round_trips_s},
-        "notes": [*shown.notes, *plan.notes],
+        "notes": [*shown.notes, *map(words, plan.notes)],
     }
 
 
@@ -122,7 +123,7 @@ def _row(shown: PlanShown, one: Considered) -> list[str | Text]:
         price_source(one.offer, shown.now) or "made up",
         "?" if one.rtt_s is None else f"{one.rtt_s * 1000:.0f} ms",
         str(one.losses),
-        output.cell(one.why_not, "dim"),
+        output.cell(words(one.why_not), "dim"),
     ]
 
 
@@ -222,5 +223,5 @@ def _offer_json(shown: PlanShown, one: Considered) -> dict[str, Any]:
         "rtt_source": None if distance is None else distance.source,
         "recent_losses": one.losses,
         "slots": list(slots),
-        "why_not": one.why_not,
+        "why_not": words(one.why_not),
     }

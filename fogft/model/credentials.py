@@ -1,11 +1,82 @@
-"""Where the files of a process's credentials are. Pure: only their names, nothing is read."""
+"""Who holds a certificate, and what its role lets it do. Pure.
+
+A certificate's common name says who its holder is: ``role.name.generation.pool``, for
+instance ``robot.ada.2.0123456789abcdef``; a replica's name is its slot. TLS proves the
+name; this module says what follows from it. A revoked name is revoked for good: who gets
+in again does so under the next generation.
+
+Owns: roles, reading and making common names, and the names of the files of credentials.
+Not here: issuing (`fogft.pool.credentials.authority`).
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 from fogft.model import keys
+from fogft.model.names import POOL_UID_PATTERN
+
+# The longest role, dots, six digits and the uid take 36 of a common name's 64 characters.
+NAME_LIMIT = 28
+NAME_PATTERN = re.compile(rf"[A-Za-z0-9]([A-Za-z0-9_-]{{0,{NAME_LIMIT - 2}}}[A-Za-z0-9])?")
+GENERATION_LIMIT = 999_999
+
+
+class Role(str, Enum):
+    """What the holder of a certificate may do."""
+
+    ROBOT = "robot"  # asks
+    REPLICA = "replica"  # answers
+    GATEWAY = "gateway"  # answers robots, asks replicas
+    RENDEZVOUS = "rendezvous"  # keeps signed records; opens no link
+    MANAGER = "manager"  # signs admission, topology and revocations; opens no connection
+
+
+@dataclass(frozen=True, order=True)
+class Holder:
+    """Whom a certificate names.
+
+    Attributes:
+        name: A robot's or gateway's name; a replica's slot, as text.
+        generation: From 1; a rotation of keys or a launch of a slot makes the next one.
+    """
+
+    role: Role
+    name: str
+    generation: int
+    pool_uid: str
+
+    @property
+    def common_name(self) -> str:
+        """The certificate's common name."""
+        return f"{self.role.value}.{self.name}.{self.generation}.{self.pool_uid}"
+
+    @property
+    def short(self) -> str:
+        """Name and generation, as people see it: ``ada.2``."""
+        return f"{self.name}.{self.generation}"
+
+
+def holder_of(common_name: str) -> Holder:
+    """Read a certificate's common name.
+
+    Raises:
+        ValueError: It is none of ours.
+    """
+    role, _, rest = common_name.partition(".")
+    name, generation, uid = rest.split(".") if rest.count(".") == 2 else ("", "", "")
+    if (
+        role not in {known.value for known in Role}
+        or not NAME_PATTERN.fullmatch(name)
+        or not re.fullmatch(r"[1-9][0-9]{0,5}", generation, re.ASCII)
+        or not POOL_UID_PATTERN.fullmatch(uid)
+        or (role == Role.REPLICA.value and not re.fullmatch(r"0|[1-9][0-9]*", name, re.ASCII))
+    ):
+        raise ValueError(f"not the name of a holder: {common_name!r:.80}")
+    return Holder(Role(role), name, int(generation), uid)
 
 
 @dataclass(frozen=True)

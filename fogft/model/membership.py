@@ -18,7 +18,7 @@ from enum import Enum
 from typing import Any
 
 from fogft.errors import StateError
-from fogft.model.certificate_holder import holder_of
+from fogft.model.credentials import holder_of
 from fogft.model.names import POOL_UID_PATTERN, is_endpoint
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.model.spec import PoolSpec

@@ -14,6 +14,7 @@ from enum import Enum
 from functools import cached_property
 
 from fogft.model.names import gateway_certificate_name
+from fogft.model.reason import Reason
 from fogft.model.topology import Topology
 
 
@@ -127,9 +128,8 @@ class Machine:
         notice: A preemption notice was given: the machine ends soon.
         spec_hash: `PoolSpec.replica_hash` at its launch; another one means outdated.
         launched_at: Seconds since the epoch.
-        failure: Why the phase is FAILED: ``capacity``, ``quota``, ``credentials``,
-            ``setup``, ``timeout`` or ``error``, then ``: `` and the cloud's words (a log's
-            last lines after a line break); empty otherwise.
+        failure: Why the phase is FAILED, with the cloud's words (a log's last lines after a
+            line break); None otherwise.
         progress: What the cloud says is being done there until it serves, for people.
     """
 
@@ -141,7 +141,7 @@ class Machine:
     notice: bool = False
     usd_per_hour: float = 0.0
     spec_hash: str = ""
-    failure: str = ""
+    failure: Reason | None = None
     progress: str = ""
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fogft.errors import StateError
-from fogft.model.certificate_holder import NAME_PATTERN, Holder, Role
+from fogft.model.credentials import NAME_PATTERN, Holder, Role
 from fogft.model.keys import Listed, Maps, Text, key
 from fogft.model.names import endpoint as is_reached_at
 from fogft.model.names import is_endpoint

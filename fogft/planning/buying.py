@@ -12,12 +12,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 from fogft.model.groups import Group, is_stand_in
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
@@ -37,9 +38,6 @@ from fogft.planning.observed.health import Verdict
 from fogft.planning.observed.history import History
 from fogft.planning.placement import Choice, Market
 
-# Reasons that speak neither against the place nor for it: a replacement may go there again.
-_NOT_THE_PLACES_FAULT = ("outdated", "moves", "spot")
-
 
 class PlannedLaunch(NamedTuple):
     """Order a machine for a slot, under a generation never used before."""
@@ -47,7 +45,7 @@ class PlannedLaunch(NamedTuple):
     slot: int
     generation: int
     offer: Offer
-    reason: str
+    reason: Reason
 
 
 @dataclass
@@ -69,8 +67,8 @@ class Buyer:
     cap: float | None
     standing_in: Sequence[Standing] = ()
     launches: list[PlannedLaunch] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    sacrificed: list[tuple[Standing, str]] = field(default_factory=list)
+    notes: list[Reason] = field(default_factory=list)
+    sacrificed: list[tuple[Standing, Reason]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._catalogue = catalogue(self.observed.offers)
@@ -79,7 +77,7 @@ class Buyer:
         self.scale = Scale(self.spec.placement.weights, self.observed.rtt_s)
         wrong = self._catalogue.impossible
         if wrong:
-            self.notes.append(f"offers with impossible prices are ignored, such as `{wrong}`")
+            self.notes.append(Reason(Cause.IMPOSSIBLE_PRICE, location=wrong))
 
     @cached_property
     def _spent_before(self) -> float:
@@ -110,14 +108,12 @@ class Buyer:
         if len(self.launches) >= room:
             if need.stands_in:
                 return False
-            verb = "replace" if need.replaces else "launch"
-            self.notes.append(
-                f"waiting to {verb} slot {need.slot}: `max_surge` allows no more machines now"
-            )
+            old = need.replaces.short if need.replaces else ""
+            self.notes.append(Reason(Cause.SURGE_FULL, slot=need.slot, replica=old))
             return False
         choice, reason = self._choose(need, self.budget)
         if choice.offer is None:
-            self.notes.append(f"slot {need.slot} waits: {choice.why_not}")
+            self.notes.append(Reason(Cause.WAITS, slot=need.slot, because=because(choice.why_not)))
             if self.cap is not None:
                 self._make_room(need, self.cap)
             return False
@@ -231,20 +227,22 @@ class Buyer:
         placement = standing.judged.machine.placement
         return max(standing.usd_per_hour, self._catalogue.prices.get(placement, 0.0))
 
-    def _choose(self, need: Need, budget: float | None) -> tuple[Choice, str]:
+    def _choose(self, need: Need, budget: float | None) -> tuple[Choice, Reason]:
         old = need.replaces
         avoid = set()
-        if old is not None and not old.why.startswith(_NOT_THE_PLACES_FAULT):
+        why = old.why if old is not None else None
+        if old is not None and (why is None or why.place_at_fault):
             avoid.add(old.location)
         taken = self.places(old)
         spot = False if need.stands_in else self.kind(need.group, old)
-        moves = old is not None and old.why.startswith("moves")
+        moves = why is not None and why.is_move
         market = self.market(need.group, spot, at_leisure=moves)
         found = market.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
         last = None if found.offer or moves else self._in_spite(need.group, spot)
         if last is not None:
             choice = last.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
-            return choice, f"{need.reason}; all rest, and this location longest"
+            also = (*need.reason.because, Reason(Cause.FAILED_LONGEST_AGO))
+            return choice, replace(need.reason, because=also)
         return found, need.reason
 
     def _make_room(self, need: Need, cap: float) -> None:
@@ -256,7 +254,8 @@ class Buyer:
             if standing.verdict is not Verdict.UNRESPONSIVE:
                 continue
             if self._choose(need, left + self._price(standing))[0].offer is not None:
-                self.sacrificed.append((standing, f"{standing.why}, and the budget has no room"))
+                full = Reason(Cause.BUDGET_FULL, because=because(standing.why))
+                self.sacrificed.append((standing, full))
                 return
 
     def fits_beside(self, need: Need) -> bool:

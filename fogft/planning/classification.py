@@ -11,14 +11,15 @@ from dataclasses import replace
 
 from fogft.model.groups import BLOCK, replica_hash
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Observed
 from fogft.model.spec import PoolSpec
-from fogft.planning.endings import Census, Standing
+from fogft.planning.endings import Census, Standing, is_outdated
 from fogft.planning.needs import part
 from fogft.planning.observed.health import Health, Verdict
 from fogft.planning.sizing import Size
 
-_ORDER = {"drained": 0, "excluded": 1, "outdated": 3}
+_ORDER = {Cause.DRAINED: 0, Cause.EXCLUDED: 1, Cause.OUTDATED: 3}  # all others between
 _LOST = (Verdict.LEAVING, Verdict.UNRESPONSIVE)
 _DOUBTED = (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES)
 
@@ -52,7 +53,7 @@ def take_census(
         else:
             census.good.append(standing)
     _supersede(census, health, size)
-    census.replaced.sort(key=lambda s: (_ORDER.get(s.why.split(" ")[0], 2), s.id))
+    census.replaced.sort(key=lambda s: (_rank(s), s.id))
     census.lost.sort(key=lambda s: (s.verdict is not Verdict.LEAVING, s.id))
     return census
 
@@ -71,26 +72,33 @@ def _supersede(census: Census, health: Health, size: Size) -> None:
         old = [s for s in here.good if s.id.generation < newest[s.slot]]
         for standing in old[: max(0, surplus)]:
             census.good.remove(standing)
-            why = f"superseded by {standing.slot}.{newest[standing.slot]}"
+            why = Reason(Cause.SUPERSEDED, replica=f"{standing.slot}.{newest[standing.slot]}")
             young = _is_young(standing, health)
             goes = replace(standing, reason=why)
             (census.aborted if young else census.replaced).append(goes)
 
 
-def _unwanted(spec: PoolSpec, intent: Intent, standing: Standing, blocks: Collection[int]) -> str:
-    """Return why a working replica is to be replaced; empty when it is not."""
+def _unwanted(
+    spec: PoolSpec, intent: Intent, standing: Standing, blocks: Collection[int]
+) -> Reason | None:
+    """Return why a working replica is to be replaced; None when it is not."""
     machine, slot = standing.judged.machine, standing.slot
     if intent.drained and intent.is_drained(slot, standing.id.generation):
-        return "drained by the user"
+        return Reason(Cause.DRAINED)
     if intent.excluded and intent.is_excluded(machine.placement.location):
-        return f"excluded location {machine.placement.location}"
+        return Reason(Cause.EXCLUDED, location=machine.placement.location)
     if standing.verdict in _DOUBTED:
         return standing.judged.why
     if slot // BLOCK not in blocks:
-        return "its group is not in the pool file"
+        return Reason(Cause.NO_GROUP)
     if machine.spec_hash != replica_hash(spec, slot):
-        return "outdated by another version"
-    return ""
+        return Reason(Cause.OUTDATED)
+    return None
+
+
+def _rank(standing: Standing) -> int:
+    why = standing.why
+    return 2 if why is None else _ORDER.get(why.cause, 2)
 
 
 def _is_young(standing: Standing, health: Health) -> bool:
@@ -106,4 +114,4 @@ def _never_served(standing: Standing, health: Health) -> bool:
     known = health.links_known and not health.uplink_suspected
     link = standing.judged.link
     served = standing.ever_ready or (link is not None and bool(link.ready))
-    return known and not served and standing.reason.startswith("outdated")
+    return known and not served and is_outdated(standing)

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
+from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.planning.observed.health import Health, Judged, Verdict
 from fogft.planning.observed.history import History, Record
@@ -35,7 +36,7 @@ class Standing:
     """
 
     judged: Judged
-    reason: str = ""
+    reason: Reason | None = None
     id: ReplicaId = field(init=False)
     slot: int = field(init=False)
     record: Record | None = field(init=False)
@@ -62,7 +63,7 @@ class Standing:
         return self.judged.machine.usd_per_hour
 
     @property
-    def why(self) -> str:
+    def why(self) -> Reason | None:
         """The reason to replace it, or health's."""
         return self.reason or self.judged.why
 
@@ -88,6 +89,11 @@ class Standing:
     def marked_at(self) -> float:
         """When it was marked to go; infinity for never: who was marked first goes first."""
         return math.inf if self.draining_since is None else self.draining_since
+
+
+def is_outdated(standing: Standing) -> bool:
+    """Whether it is replaced for its version alone."""
+    return standing.reason is not None and standing.reason.cause is Cause.OUTDATED
 
 
 @dataclass
@@ -156,9 +162,9 @@ class Census:
 class Endings:
     """Who ends now, who is marked, and what is worth saying."""
 
-    now: list[tuple[Standing, str]] = field(default_factory=list)
+    now: list[tuple[Standing, Reason]] = field(default_factory=list)
     draining: list[Standing] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    notes: list[Reason] = field(default_factory=list)
 
     @property
     def ids(self) -> set[ReplicaId]:
@@ -202,22 +208,22 @@ def choose_endings(
     chooser = _Chooser(wanted, (*census.good, *census.replaced, *standing_in), now, drain_limit_s)
     if health.uplink_suspected or not health.links_known:
         if surplus > 0 or census.lost or unwanted or spare > 0:
-            chooser.out.notes.append("nothing is ended while no replica can be heard")
+            chooser.out.notes.append(Reason(Cause.NOBODY_HEARD))
         return chooser.out
     for standing in census.lost:
         chooser.end_lost(standing, history)
     if len(census.good) > wanted:
         expendable = _by_expendability(census.good, dear_first=dear_first)
-        chooser.end_some(expendable, len(census.good) - wanted, "not wanted")
+        chooser.end_some(expendable, len(census.good) - wanted, Cause.NOT_WANTED)
     if census.replaced:
         _end_replaced(chooser, wanted, census, held, first)
     if unwanted:
-        chooser.end_some(unwanted, len(unwanted), "replaced")
+        chooser.end_some(unwanted, len(unwanted), Cause.REPLACED)
         spare -= len(unwanted)
     if spare > 0:
         kept = [s for s in standing_in if not s.reason]
         kept.sort(key=lambda s: (s.ever_ready, s.marked_at, -s.usd_per_hour, -s.slot))
-        chooser.end_some(kept, spare, "enough spot machines are ready")
+        chooser.end_some(kept, spare, Cause.ENOUGH_SPOT)
     return chooser.out
 
 
@@ -244,7 +250,7 @@ def _end_replaced(
     )
     ended = chooser.out.ids
     coming = sum(not s.ever_ready for s in census.good if s.id not in ended)
-    chooser.end_some(replaced, left, "replaced", coming=coming)
+    chooser.end_some(replaced, left, Cause.REPLACED, coming=coming)
 
 
 def _by_expendability(standings: Iterable[Standing], *, dear_first: bool) -> list[Standing]:
@@ -284,7 +290,7 @@ class _Chooser:
         """A lost one ends once it is replaced, or at once when it cannot serve."""
         enough = len(self._pillars) >= self._wanted
         if enough or not standing.ever_ready or self._superseded(standing, history):
-            self._go(standing, standing.why)
+            self._go(standing, standing.why or Reason(Cause.NOT_WANTED))
 
     def _superseded(self, standing: Standing, history: History) -> bool:
         """Whether a later launch of its slot has served: its own turn is over."""
@@ -292,7 +298,7 @@ class _Chooser:
         return later and standing.verdict is Verdict.UNRESPONSIVE
 
     def end_some(
-        self, standings: Iterable[Standing], count: int, reason: str, *, coming: int = 0
+        self, standings: Iterable[Standing], count: int, cause: Cause, *, coming: int = 0
     ) -> None:
         """End up to `count`, in order, where the law allows it.
 
@@ -309,13 +315,13 @@ class _Chooser:
                 continue
             count -= 1
             self.counted_out += 1
-            self._go(standing, f"{reason}: {standing.why}" if standing.why else reason)
+            self._go(standing, Reason(cause, because=because(standing.why)))
 
     def make_room(self, standing: Standing) -> None:
         """End one before its successor exists."""
-        self._go(standing, f"replaced, old before new: {standing.why}")
+        self._go(standing, Reason(Cause.REPLACED_FIRST, because=because(standing.why)))
 
-    def _go(self, standing: Standing, why: str) -> None:
+    def _go(self, standing: Standing, why: Reason) -> None:
         self._pillars.discard(standing.id)
         if self._must_drain_first(standing):
             self.out.draining.append(standing)

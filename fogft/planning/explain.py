@@ -12,10 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 from fogft.model.choices import Assumption
 from fogft.model.groups import group_at, services_at
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec, ServiceSpec
@@ -38,14 +40,14 @@ class Considered:
 
     Attributes:
         slots: The replicas that got it; none for not chosen.
-        why_not: Why it was not chosen; empty when it was.
+        why_not: Why it was not chosen; None when it was.
         rtt_s: Round trip to its region in seconds; None for not known.
         losses: Replicas of this pool lost there in the last hours.
     """
 
     offer: Offer
     slots: tuple[int, ...]
-    why_not: str
+    why_not: Reason | None
     rtt_s: float | None
     losses: int
 
@@ -89,7 +91,7 @@ class Explanation:
     target: float | None
     cost: Cost
     single: tuple[Offer, Cost] | None
-    notes: tuple[str, ...]
+    notes: tuple[Reason, ...]
 
     @property
     def least_expected(self) -> Expected:
@@ -206,42 +208,49 @@ class _Reasons:
         slots = tuple(self._slots.get(offer, ()))
         location = offer.placement.location
         recent = [t for t in self._losses.get(location, ()) if 0 <= self._now - t < AVOID_MEMORY_S]
-        why = "" if slots else self._why_not(offer)
+        why = None if slots else self._why_not(offer)
         rtt_s = self._scale.latency(offer.placement)
         return Considered(offer, slots, why, rtt_s, len(recent))
 
-    def _why_not(self, offer: Offer) -> str:
+    def _why_not(self, offer: Offer) -> Reason:
         location = offer.placement.location
         if not is_possible(offer):
-            return f"its price, {offer.usd_per_hour:g}, cannot be"
+            return Reason(Cause.IMPOSSIBLE_PRICE, usd_per_hour=offer.usd_per_hour)
         if self._intent.is_excluded(location):
-            return "excluded by `fogft exclude`"
+            return Reason(Cause.EXCLUDED)
         rest = self._resting.get(offer.placement.supply) or self._resting.get(EVERYWHERE)
         if rest is not None:
-            return f"rests {rest.until - self._now:.0f} s more after {rest.failures} x {rest.cause}"
+            left_s, last = rest.until - self._now, Reason(rest.cause)
+            return Reason(Cause.BACKING_OFF, seconds=left_s, count=rest.failures, because=(last,))
         picks = self._picks.get(offer.group, [])
         if not picks:
-            return "nothing of its kind is launched"
-        return max((self._lost_to(offer, pick) for pick in picks), key=lambda told: told[0])[1]
+            return Reason(Cause.OTHER_KIND)
+        return max((self._lost_to(offer, pick) for pick in picks), key=itemgetter(0))[1]
 
-    def _lost_to(self, offer: Offer, pick: _Pick) -> tuple[int, str]:
+    def _lost_to(self, offer: Offer, pick: _Pick) -> tuple[int, Reason]:
         """Return how near an offer came to a chosen one (higher is nearer), and why it lost."""
         chosen = pick.launch.offer
-        who = f"slot {pick.launch.slot}"
+        slot = pick.launch.slot
         if offer.placement.spot != chosen.placement.spot:
-            mine, other = _kind(offer), _kind(chosen)
-            return 0, f"{mine}, where {who} is {other}"
+            kind = "spot" if offer.placement.spot else "on demand"
+            return 0, Reason(Cause.OTHER_MARKET, slot=slot, name=kind)
         if pick.budget is not None and offer.usd_per_hour > pick.budget + 1e-9:
-            return 1, f"over the cap: it leaves ${max(0.0, pick.budget):.3f}/h for {who}"
+            left = max(0.0, pick.budget)
+            return 1, Reason(Cause.OVER_BUDGET, slot=slot, limit_usd_per_hour=left)
         ours, theirs = self._rank(offer, pick), self._rank(chosen, pick)
         if ours[0] > theirs[0]:
             left_s = self._avoided[offer.placement.location] - self._now
-            return 2, f"avoided for {left_s / 60:.0f} min more: a replica was lost there"
+            return 2, Reason(Cause.LOST_THERE, seconds=left_s)
         for level, domain in enumerate(domains(offer.placement), 1):
             if ours[level] > theirs[level]:
                 count = pick.count[domain]
-                return 2 + level, f"spread: `{domain}` has {count} already when {who} is placed"
-        return 6, f"{self._compared(offer, chosen)} ({who})"
+                crowded = Reason(Cause.CROWDED, slot=slot, location=domain, count=count)
+                return 2 + level, crowded
+        return 6, replace(
+            self._score(Cause.WORSE_SCORE, offer),
+            slot=slot,
+            because=(self._score(Cause.CHOSEN, chosen),),
+        )
 
     def _rank(self, offer: Offer, pick: _Pick) -> tuple[int, ...]:
         place = offer.placement
@@ -250,22 +259,13 @@ class _Reasons:
             *(pick.count.get(domain, 0) for domain in domains(place)),
         )
 
-    def _compared(self, offer: Offer, chosen: Offer) -> str:
-        ours, theirs = self._scale.latency(offer.placement), self._scale.latency(chosen.placement)
-        told = []
-        if offer.usd_per_hour != chosen.usd_per_hour:
-            word = "dearer" if offer.usd_per_hour > chosen.usd_per_hour else "cheaper"
-            told.append(f"{word}: ${offer.usd_per_hour:.3f}/h, not ${chosen.usd_per_hour:.3f}/h")
-        if ours != theirs:
-            word = "farther" if _far(ours) > _far(theirs) else "nearer"
-            told.append(f"{word}: {_ms(ours)}, not {_ms(theirs)}")
-        if not told:
-            return f"as good as `{chosen.placement.location}`, and later by name"
-        mixed = {one.split(":")[0] for one in told} & _BETTER
-        return (" but " if mixed else ", ").join(told)
-
-
-_BETTER = {"cheaper", "nearer"}
+    def _score(self, cause: Cause, offer: Offer) -> Reason:
+        return Reason(
+            cause,
+            location=offer.placement.location,
+            seconds=self._scale.latency(offer.placement),
+            usd_per_hour=offer.usd_per_hour,
+        )
 
 
 @dataclass(frozen=True)
@@ -275,15 +275,3 @@ class _Pick:
     launch: PlannedLaunch
     count: Mapping[str, int]
     budget: float | None
-
-
-def _kind(offer: Offer) -> str:
-    return "spot" if offer.placement.spot else "on demand"
-
-
-def _far(rtt_s: float | None) -> float:
-    return float("inf") if rtt_s is None else rtt_s
-
-
-def _ms(rtt_s: float | None) -> str:
-    return "unknown" if rtt_s is None else f"{rtt_s * 1000:.0f} ms"

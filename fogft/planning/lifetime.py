@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import History
 
@@ -43,11 +44,11 @@ def revived(spec: PoolSpec, intent: Intent, begun_at: float, now: float) -> Inte
     return replace(intent, began_at=now) if is_over(spec, begun_at, now) else intent
 
 
-def notes(spec: PoolSpec, begun_at: float, now: float) -> list[str]:
+def notes(spec: PoolSpec, begun_at: float, now: float) -> list[Reason]:
     """Return what to say about the end: nothing, that it is near, or that it has come."""
     end = ends_at(spec, begun_at)
     if end is None or now < end - SOON_S:
         return []
     if now < end:
-        return [f"the pool ends by itself in {(end - now) / 60:.0f} min (`max_hours`)"]
-    return [f"its {spec.max_hours:g} hours (`max_hours`) are over: the pool ends by itself"]
+        return [Reason(Cause.ENDS_SOON, seconds=end - now)]
+    return [Reason(Cause.MAX_HOURS, seconds=end - begun_at)]

@@ -17,6 +17,7 @@ from functools import cached_property
 from operator import itemgetter
 from typing import NamedTuple
 
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement, supply
 from fogft.model.scoring import Scale
 
@@ -46,11 +47,11 @@ class Listing:
     """Offers of one kind, the best score first.
 
     Attributes:
-        trouble: Why there is no row; empty where there is one.
+        trouble: Why there is no row; None where there is one.
     """
 
     rows: tuple[Row, ...]
-    trouble: str = ""
+    trouble: Reason | None = None
 
     @cached_property
     def supplies(self) -> frozenset[str]:
@@ -130,15 +131,15 @@ def is_possible(offer: Offer) -> bool:
 
 def _listing(offers: Sequence[Offer], excluded: Collection[str], scale: Scale) -> Listing:
     if not offers:
-        return Listing((), "nothing is offered for these resources now")
+        return Listing((), Reason(Cause.NOTHING_OFFERED))
     possible = [o for o in offers if is_possible(o)]
     if not possible:
-        return Listing((), "every offer has an impossible price")
+        return Listing((), Reason(Cause.IMPOSSIBLE_PRICE))
     allowed = possible
     if excluded:
         allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
     if not allowed:
-        return Listing((), "every offered location is excluded")
+        return Listing((), Reason(Cause.ALL_EXCLUDED))
     return Listing(tuple(sorted(_rows(allowed, scale), key=without_offer)))
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
 from fogft.model.scoring import gain
 from fogft.planning.buying import Buyer
@@ -47,7 +48,7 @@ class Move:
     """
 
     standing: Standing
-    why: str
+    why: Reason
     urgency: tuple[float, ...]
 
 
@@ -118,15 +119,15 @@ def _is_better(buyer: Buyer, standing: Standing, choice: Choice, count: Crowd) -
         return None
     kind = buyer.kind(home(buyer.groups, standing.slot), standing)
     if kind is not None and kind != placement.spot:
-        sold = "spot" if kind else "on demand"
-        return Move(standing, f"moves to {offer.placement.location}: {sold}", (-1.0,))
+        cause = Cause.SPOT_AGAIN if kind else Cause.ON_DEMAND_AGAIN
+        return Move(standing, Reason(cause, location=offer.placement.location), (-1.0,))
     here = [count[domain] for domain in domains(placement)]
     if there < here:
-        why = f"moves to {offer.placement.location}: better spread"
+        why = Reason(Cause.BETTER_SPREAD, location=offer.placement.location)
         return Move(standing, why, (0.0, *there))
     better = gain(_score(buyer, standing), buyer.score(offer.placement, offer.usd_per_hour))
     if there == here and better >= rules.gain:
-        why = f"moves to {offer.placement.location}: {better:.0%} better"
+        why = Reason(Cause.BETTER_SCORE, location=offer.placement.location, share=better)
         return Move(standing, why, (1.0, -better))
     return None
 

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 from fogft.model.groups import CRITICAL, Group, is_stand_in
+from fogft.model.reason import Cause, Reason, because
 from fogft.planning.endings import Census, Standing
 from fogft.planning.observed.history import History
 
@@ -24,7 +25,7 @@ class Need(NamedTuple):
     """
 
     slot: int
-    reason: str
+    reason: Reason
     group: Group
     replaces: Standing | None = None
     stands_in: bool = False
@@ -81,7 +82,7 @@ def _replacement(groups: Sequence[Group], counts: Sequence[int], census: Census)
             taken = {s.slot for s in here.good}
             free = standing.slot not in taken and group.owns(standing.slot)
             slot = standing.slot if free else _lowest_free(group, used)
-            return [Need(slot, f"replaces {standing.short}: {standing.why}", group, standing)]
+            return [Need(slot, _replaces(standing), group, standing)]
     return []
 
 
@@ -98,8 +99,7 @@ def _missing(group: Group, wanted: int, census: Census, history: History) -> Ite
         if missing > 0 and standing.slot not in used:
             used.add(standing.slot)
             missing -= 1
-            reason = f"replaces {standing.short}: {standing.why}"
-            yield Need(standing.slot, reason, group, standing)
+            yield Need(standing.slot, _replaces(standing), group, standing)
     used |= lost_slots
     for _ in range(missing):
         slot = _lowest_free(group, used)
@@ -110,13 +110,19 @@ def _missing(group: Group, wanted: int, census: Census, history: History) -> Ite
 def stand_in(group: Group, used: Collection[int]) -> Need:
     """Return the launch of an on-demand machine that serves until a spot one does."""
     slot = next(slot for slot in itertools.count(group.first_stand_in) if slot not in used)
-    return Need(slot, "stands in until enough spot machines are ready", group, stands_in=True)
+    return Need(slot, Reason(Cause.STANDS_IN), group, stands_in=True)
 
 
 def _lowest_free(group: Group, used: set[int]) -> int:
     return next(slot for slot in itertools.count(group.first_slot) if slot not in used)
 
 
-def _vacancy(slot: int, history: History) -> str:
+def _replaces(standing: Standing) -> Reason:
+    return Reason(Cause.REPLACES, replica=standing.short, because=because(standing.why))
+
+
+def _vacancy(slot: int, history: History) -> Reason:
     generation = history.generation(slot)
-    return f"follows {slot}.{generation}" if generation else "fills a new slot"
+    if not generation:
+        return Reason(Cause.NEW_SLOT)
+    return Reason(Cause.FOLLOWS, replica=f"{slot}.{generation}")

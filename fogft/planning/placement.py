@@ -16,6 +16,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.model.scoring import Scale
 from fogft.planning.listing import Listing, Row, catalogue, without_offer
@@ -28,7 +29,7 @@ Rank = tuple[bool, int, int, int]
 
 
 class Choice(NamedTuple):
-    """An offer, or none and why not, in words.
+    """An offer, or none and why not.
 
     Attributes:
         rank: Of the offer: whether its location is avoided, then how many of our other
@@ -36,7 +37,7 @@ class Choice(NamedTuple):
     """
 
     offer: Offer | None
-    why_not: str = ""
+    why_not: Reason | None = None
     rank: Rank = (False, 0, 0, 0)
 
 
@@ -96,18 +97,20 @@ class Market:
             self.rows = tuple([row for row in self.rows if row.location not in full])
             self._clouds = frozenset([row.cloud for row in self.rows])
             if not self.rows and not self._nothing:
-                self._nothing = "a location must not hold more of the replicas"
+                self._nothing = Reason(Cause.LOCATION_FULL)
         asleep = listing.supplies.intersection(rests) if rests else frozenset()
         if asleep:
             self.rows = tuple([row for row in self.rows if row.supply not in asleep])
             self._clouds = frozenset([row.cloud for row in self.rows])
         if EVERYWHERE in rests:
             rest = rests[EVERYWHERE]
-            self._nothing = f"waiting after {rest.failures} failed launches ({rest.cause})"
+            self._nothing = Reason(
+                Cause.BACKING_OFF, count=rest.failures, because=(Reason(rest.cause),)
+            )
         elif asleep and not self.rows:
             self.resting = {place: rests[place] for place in sorted(asleep)}
-            causes = ", ".join(f"`{place}`: {rest.cause}" for place, rest in self.resting.items())
-            self._nothing = f"every location rests after failures ({causes})"
+            failures = (Reason(rest.cause, location=at) for at, rest in self.resting.items())
+            self._nothing = Reason(Cause.ALL_BACKING_OFF, because=tuple(failures))
 
     def choose(
         self,
@@ -146,11 +149,9 @@ class Market:
                     break
         if best is None or best_rank is None:
             cheapest = min(row.usd_per_hour for row in self.rows)
-            return Choice(
-                None,
-                f"the cheapest offer is ${cheapest:.3f}/h and `max_usd_per_hour` "
-                f"leaves ${max(budget_usd_per_hour or 0.0, 0.0):.3f}/h",
-            )
+            left = max(budget_usd_per_hour or 0.0, 0.0)
+            dear = Reason(Cause.OVER_BUDGET, usd_per_hour=cheapest, limit_usd_per_hour=left)
+            return Choice(None, dear)
         return Choice(best.offer, rank=best_rank)
 
 

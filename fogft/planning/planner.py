@@ -18,12 +18,13 @@ from typing import NamedTuple
 
 from fogft.model.groups import Group
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning import fallback, migration, rollout
 from fogft.planning.buying import Buyer, PlannedLaunch
 from fogft.planning.classification import take_census
-from fogft.planning.endings import Census, Endings, Standing, choose_endings
+from fogft.planning.endings import Census, Endings, Standing, choose_endings, is_outdated
 from fogft.planning.needs import Need, home, needed_launches, part, stand_in
 from fogft.planning.observed.health import Health, judge
 from fogft.planning.observed.history import History
@@ -42,7 +43,7 @@ class PlannedEnd(NamedTuple):
     """End a machine."""
 
     id: ReplicaId
-    reason: str
+    reason: Reason
 
 
 class Plan(NamedTuple):
@@ -50,7 +51,7 @@ class Plan(NamedTuple):
 
     Attributes:
         draining: Replicas to mark as draining in the membership; they end a little later.
-        notes: Why the pool is not yet as wanted, in sentences.
+        notes: Why the pool is not yet as wanted.
         wanted: How many replicas should be ready.
         health: What the plan was based on; None when the cloud could not tell.
         closed: It is known without trying that planning again while it is under way adds nothing.
@@ -62,7 +63,7 @@ class Plan(NamedTuple):
     launches: tuple[PlannedLaunch, ...] = ()
     terminations: tuple[PlannedEnd, ...] = ()
     draining: tuple[ReplicaId, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Reason, ...] = ()
     health: Health | None = None
     closed: bool = False
     waits: bool = False
@@ -149,10 +150,9 @@ def plan_once(
 ) -> Plan:
     if observed.machines is None:
         known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
-        return Plan(known, notes=("the cloud cannot be reached: nothing is changed",))
+        return Plan(known, notes=(Reason(Cause.CLOUD_UNREACHABLE),))
     if intent.stopping:
-        ends = [PlannedEnd(j.id, "down") for j in health.replicas if j.id not in observed.ending]
-        return Plan(0, terminations=tuple(ends), notes=("stopping",), health=health)
+        return _stopping(health, observed)
 
     sized = size(spec, intent, observed, health.running if spec.availability else 0)
     census = take_census(spec, intent, observed, health=health, size=sized)
@@ -199,7 +199,7 @@ def plan_once(
         buyer.buy(need, room=room)
     held: Sequence[ReplicaId] = ()
     if settling:
-        held = [s.id for s in others.replaced if rollout.is_outdated(s) and not s.draining_since]
+        held = [s.id for s in others.replaced if is_outdated(s) and not s.draining_since]
     endings = Endings()
     for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
         here = part(others, sized.groups, group)
@@ -220,12 +220,15 @@ def plan_once(
                 spare=fallback.spare(count, here, mine, observed.now),
             )
         )
-    ends = [PlannedEnd(s.id, s.why) for s in (*census.failed, *census.aborted)]
+    ends = [
+        PlannedEnd(s.id, s.why or Reason(Cause.NOT_WANTED))
+        for s in (*census.failed, *census.aborted)
+    ]
     ends += [PlannedEnd(s.id, why) for s, why in endings.now]
     ends += [PlannedEnd(s.id, why) for s, why in buyer.sacrificed if s.id not in endings.ids]
     notes = [*sized.notes, *excess, *buyer.notes, *endings.notes]
     if health.uplink_suspected:
-        notes.insert(0, "all links are silent together: the robot's uplink is suspected")
+        notes.insert(0, Reason(Cause.UPLINK_SUSPECTED))
     return Plan(
         wanted=wanted,
         launches=tuple(buyer.launches),
@@ -264,25 +267,28 @@ def _stand_ins_missing(
     return needs
 
 
+def _stopping(health: Health, observed: Observed) -> Plan:
+    left = [judged.id for judged in health.replicas if judged.id not in observed.ending]
+    ends = tuple(PlannedEnd(id, Reason(Cause.DOWN)) for id in left)
+    return Plan(0, terminations=ends, notes=(Reason(Cause.STOPPING),), health=health)
+
+
 def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Standing | None:
     """Return the outdated one that has to end before its successor can be launched, if it may."""
     old = need.replaces
-    if old is None or not rollout.is_outdated(old) or old not in buyer.census.replaced:
+    if old is None or not is_outdated(old) or old not in buyer.census.replaced:
         return None
     fits = buyer.fits_instead(need, old)
     if not fits or (max_surge and buyer.fits_beside(need)):
         return None
     if not rollout.may_go_first(old, buyer.census, wanted):
-        buyer.notes.append(
-            f"slot {need.slot} is not updated: there is no room for both, and no other one that "
-            "answers meanwhile; raise `max_usd_per_hour` or `max_surge`"
-        )
+        buyer.notes.append(Reason(Cause.NO_ROOM_TO_UPDATE, slot=need.slot))
         return None
-    buyer.notes.append(f"slot {need.slot}: no room for both, so old before new")
+    buyer.notes.append(Reason(Cause.OLD_BEFORE_NEW, slot=need.slot))
     return old
 
 
-def _within_cap(sized: Size, census: Census) -> tuple[Sequence[int], list[str]]:
+def _within_cap(sized: Size, census: Census) -> tuple[Sequence[int], list[Reason]]:
     """Return how many are wanted of each group: one fewer while those at hand exceed the cap.
 
     No launch exceeds the cap: this is for one that was lowered, by a schedule or in the file.
@@ -298,4 +304,4 @@ def _within_cap(sized: Size, census: Census) -> tuple[Sequence[int], list[str]]:
         return counts, []  # it shrinks already
     index = max(i for i, group in enumerate(groups) if part(census, groups, group).good)
     counts[index] = min(counts[index], len(part(census, groups, groups[index]).good) - 1)
-    return counts, [f"${cost:.3f}/h is over the cap of ${cap:g}/h: the dearest go, one by one"]
+    return counts, [Reason(Cause.OVER_CAP, usd_per_hour=cost, limit_usd_per_hour=cap)]

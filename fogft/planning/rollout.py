@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from fogft.model.groups import replica_hash
+from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkState, Machine
 from fogft.model.spec import PoolSpec
-from fogft.planning.endings import Census, Standing
+from fogft.planning.endings import Census, Standing, is_outdated
 from fogft.planning.observed.health import Health, Judged, Verdict
 from fogft.planning.observed.history import History
 
@@ -33,9 +34,8 @@ CLOUD_FAILURES = 3
 ERRORS_MIN = 5
 ERRORS_MARGIN = 0.02
 _SURE = 3.0  # standard deviations: chance alone stops about one update in a thousand
-_OUTDATED = "outdated"
-_THE_VERSIONS = ("setup", "timeout")
-_THE_CLOUDS = ("capacity", "quota", "credentials")
+_THE_VERSIONS = (Cause.SETUP, Cause.TIMEOUT)
+_THE_CLOUDS = (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS)
 
 
 class UpdateState(str, Enum):
@@ -46,6 +46,13 @@ class UpdateState(str, Enum):
     ROLLED_BACK = "rolled back"  # the pool is wholly ready with the good file
 
 
+_NOTES = {
+    UpdateState.IN_PROGRESS: Cause.UPDATING,
+    UpdateState.STOPPED: Cause.UPDATE_STOPPED,
+    UpdateState.ROLLED_BACK: Cause.ROLLED_BACK,
+}
+
+
 @dataclass(frozen=True)
 class Trial:
     """What is remembered of the file that was applied last.
@@ -53,12 +60,12 @@ class Trial:
     Attributes:
         file: Its digest: what is remembered holds for no other.
         began_at: When the manager first saw it, in seconds since the epoch.
-        fault: Why it was given up, in words; empty while it is not.
+        fault: Why it was given up; None while it is not.
     """
 
     file: str = ""
     began_at: float = 0.0
-    fault: str = ""
+    fault: Reason | None = None
 
 
 @dataclass(frozen=True)
@@ -68,25 +75,18 @@ class Update:
     Attributes:
         done: Replicas of the version that is wanted now which serve.
         of: How many are wanted.
-        fault: Why it was given up; empty while it was not.
+        fault: Why it was given up; None while it was not.
     """
 
     state: UpdateState
     done: int
     of: int
-    fault: str = ""
+    fault: Reason | None = None
 
     @property
-    def told(self) -> str:
-        """It, as a sentence."""
-        if self.state is UpdateState.IN_PROGRESS:
-            return f"update in progress: {self.done} of {self.of} replicas run the new version"
-        if self.state is UpdateState.STOPPED:
-            return (
-                f"update stopped, {self.fault}: the pool returns to the last good file, "
-                f"{self.done} of {self.of} replicas run it"
-            )
-        return f"update rolled back, {self.fault}: the pool runs the last good file"
+    def reason(self) -> Reason:
+        """It, as a note on the pool."""
+        return Reason(_NOTES[self.state], count=self.done, of=self.of, because=because(self.fault))
 
 
 def differs(spec: PoolSpec, good: PoolSpec, slots: Iterable[int]) -> bool:
@@ -100,8 +100,10 @@ def is_new(spec: PoolSpec, good: PoolSpec, machine: Machine) -> bool:
     return machine.spec_hash == wanted != replica_hash(good, machine.id.slot)
 
 
-def fault(spec: PoolSpec, good: PoolSpec, health: Health, history: History, began_at: float) -> str:
-    """Return what proves that the new version is no good, in words; empty when nothing does.
+def fault(
+    spec: PoolSpec, good: PoolSpec, health: Health, history: History, began_at: float
+) -> Reason | None:
+    """Return what proves that the new version is no good; None when nothing does.
 
     Args:
         spec: The file that is being applied.
@@ -111,45 +113,43 @@ def fault(spec: PoolSpec, good: PoolSpec, health: Health, history: History, bega
         began_at: When the update began.
     """
     if spec is good:
-        return ""
+        return None
     new = [judged for judged in health.replicas if is_new(spec, good, judged.machine)]
     old = [j for j in health.replicas if j.machine.spec_hash == replica_hash(good, j.id.slot)]
     for judged in new:
         if why := _does_not_start(judged):
-            return f"replica {judged.id.short}: {why}"
+            return Reason(Cause.REPLICA_FAILS, replica=judged.id.short, because=(why,))
     if why := _errors(new, [judged for judged in old if judged not in new]):
         return why
     if differs(spec, good, list(history.generations) or [0]):
         return _launches_fail(history, began_at)
-    return ""
+    return None
 
 
-def _does_not_start(judged: Judged) -> str:
-    cause = judged.why.split(":")[0].split(" ")[0]
-    if judged.verdict is Verdict.FAILED and cause in _THE_VERSIONS:
-        return judged.why.splitlines()[0]
+def _does_not_start(judged: Judged) -> Reason | None:
+    why = judged.why
+    if judged.verdict is Verdict.FAILED and why is not None and why.cause in _THE_VERSIONS:
+        return replace(why, words=why.words.partition("\n")[0])
     link = judged.link
     if link is None or link.state is not LinkState.UP or judged.serving:
-        return ""
+        return None
     if link.differs:
-        return link.detail or "its types are not the same on both sides"
+        return Reason(Cause.TYPES_DIFFER, words=link.detail)
     if link.restarts >= CRASH_LOOP:
-        detail = f" ({link.detail.splitlines()[0]})" if link.detail else ""
-        return f"`run` ended {link.restarts} times{detail}"
-    return ""
+        return Reason(Cause.RUN_ENDS, count=link.restarts, words=link.detail.partition("\n")[0])
+    return None
 
 
-def _errors(new: list[Judged], old: list[Judged]) -> str:
+def _errors(new: list[Judged], old: list[Judged]) -> Reason | None:
     """Return how the new version's answers are worse than the old one's, if they surely are."""
     failed, asked = _counts(new)
     old_failed, old_asked = _counts(old)
     usual = old_failed / old_asked if old_asked else 0.0
     if failed < ERRORS_MIN or at_least(failed, asked) <= usual + ERRORS_MARGIN:
-        return ""
-    return (
-        f"{failed} of {asked} requests to the new version failed, "
-        f"{old_failed} of {old_asked} to the old one"
-    )
+        return None
+    counts = ((failed, asked), (old_failed, old_asked))
+    shares = tuple(Reason(Cause.REQUESTS_FAILED, count=bad, of=all) for bad, all in counts)
+    return Reason(Cause.MORE_ERRORS, because=shares)
 
 
 def _counts(replicas: list[Judged]) -> tuple[int, int]:
@@ -167,7 +167,7 @@ def at_least(hits: int, of: int) -> float:
     return (share + square / (2 * of) - spread) / (1 + square / of)
 
 
-def _launches_fail(history: History, began_at: float) -> str:
+def _launches_fail(history: History, began_at: float) -> Reason | None:
     """Return that launches keep failing since the update began, and none has come to serve."""
     proven_at = max((history.proven_at(place) for place in history.failures), default=began_at)
     since = max(began_at, proven_at)
@@ -178,8 +178,9 @@ def _launches_fail(history: History, began_at: float) -> str:
         if failure.at > since and failure.cause not in _THE_CLOUDS
     ]
     if len(causes) < CLOUD_FAILURES:
-        return ""
-    return f"{len(causes)} launches failed ({', '.join(sorted(set(causes)))}), and none served"
+        return None
+    each = tuple(Reason(cause) for cause in sorted(set(causes)))
+    return Reason(Cause.LAUNCHES_FAIL, count=len(causes), because=each)
 
 
 def is_whole(
@@ -242,11 +243,6 @@ def describe(
 
 
 # -- what the planner asks --------------------------------------------------------------------
-
-
-def is_outdated(standing: Standing) -> bool:
-    """Whether it is replaced for its version alone."""
-    return standing.reason.startswith(_OUTDATED)
 
 
 def is_settling(census: Census, now: float) -> bool:

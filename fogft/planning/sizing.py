@@ -20,6 +20,7 @@ from typing import NamedTuple
 from fogft.model.choices import MAX_REPLICAS
 from fogft.model.groups import Group, critical_group, groups_of, shares
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer
 from fogft.model.schedule import Wish, wish
 from fogft.model.scoring import Scale
@@ -37,13 +38,13 @@ class Size(NamedTuple):
         groups: In the order of their slots; the one of critical services last.
         counts: How many of each.
         max_usd_per_hour: The cap that holds now; None for none.
-        notes: What may surprise, in sentences.
+        notes: What may surprise.
     """
 
     groups: tuple[Group, ...]
     counts: tuple[int, ...]
     max_usd_per_hour: float | None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Reason, ...] = ()
 
     @property
     def total(self) -> int:
@@ -62,11 +63,12 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
             while nothing is offered.
     """
     groups = groups_of(spec)
-    usual, notes = Wish(spec.replicas, spec.max_usd_per_hour), []
+    usual = Wish(spec.replicas, spec.max_usd_per_hour)
+    notes: list[Reason] = []
     clock = observed.now - observed.doubt_s
     now = usual if spec.schedule is None else wish(spec.schedule, clock, usual)
     if now.ahead:
-        notes.append("launching ahead of the schedule's next window")
+        notes.append(Reason(Cause.SCHEDULED_AHEAD))
     total = now.replicas
     if intent.stopping:
         total = 0
@@ -75,7 +77,7 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
     elif spec.availability and now.replicas == spec.replicas:
         found = _for_target(spec, intent, observed, now.max_usd_per_hour, running)
         total = found.count
-        notes += [found.note] if found.note else []
+        notes += because(found.note)
     counts = shares(groups, total)
     extra = critical_group(spec, total)
     if extra.replicas and total:
@@ -148,7 +150,7 @@ class Markets:
 @dataclass(frozen=True)
 class _Found:
     count: int
-    note: str = ""
+    note: Reason | None = None
 
 
 def _for_target(
@@ -172,9 +174,13 @@ def _for_target(
             return _Found(count)
     # Not below what runs: near the cap, prices that waver would make the number waver.
     count = max(1, spec.replicas, len(laid), min(running, MAX_REPLICAS))
-    why = "`max_usd_per_hour` allows no more" if len(laid) < MAX_REPLICAS else "16 is the most"
-    return _Found(
-        count,
-        f"`availability: {asked.target:g}` cannot be met: {len(laid)} replicas are expected to "
-        f"reach {best.correlated:.6g}, and {why}",
+    most = Reason(Cause.MOST_REPLICAS, count=MAX_REPLICAS)
+    why = Reason(Cause.OVER_CAP) if len(laid) < MAX_REPLICAS else most
+    note = Reason(
+        Cause.TARGET_UNMET,
+        count=len(laid),
+        share=best.correlated,
+        target=asked.target,
+        because=(why,),
     )
+    return _Found(count, note)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fogft.errors import StateError
-from fogft.model.certificate_holder import Holder, holder_of
+from fogft.model.credentials import Holder, holder_of
 from fogft.model.membership import from_parts, to_dict
 from fogft.model.names import gateway_slot, is_endpoint
 from fogft.model.replica import Member, Membership, ReplicaId

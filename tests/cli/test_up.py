@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
 
@@ -11,11 +11,12 @@ import pytest
 from fogft import disk
 from fogft.cli import main, progress
 from fogft.errors import FogftError, SpecError
-from fogft.planning.rollout import Trial
+from fogft.model.reason import Cause, Reason
 from fogft.pool.commands import composition, init, preview, startup
 from fogft.pool.commands.status import Seen, refreshed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
+from fogft.reason_words import words
 from tests.cli.pools import REPLICA, SPEC, STATUS, lay_down
 
 POOL = SPEC + "resources: {infra: local/us-west-2, use_spot: true}\n"
@@ -243,9 +244,10 @@ def test_a_file_that_was_given_up_is_not_announced_as_a_change(home, file, looks
     disk.write_whole(paths.good_spec, paths.spec.read_text())
     file.write_text(POOL.replace("_service", "_node"))
     disk.write_whole(paths.spec, file.read_text())
-    trial = Trial(digest(file.read_bytes()), 1.0, "replica 0.2: setup")
-    disk.write_json(paths.trial, asdict(trial))
-    looks(updated(file, "rolled back", trial.fault))
+    fault = Reason(Cause.REPLICA_FAILS, replica="0.2", because=(Reason(Cause.SETUP),))
+    trial = {"file": digest(file.read_bytes()), "began_at": 1.0, "fault": fault.to_plain()}
+    disk.write_json(paths.trial, trial)
+    looks(updated(file, "rolled back", words(fault)))
     assert main.run(["up", str(file)]) == 1
     said = capsys.readouterr().err
     assert "changes" not in said

@@ -15,6 +15,7 @@ import pytest
 from fogft.cloud.local import ending, processes
 from fogft.cloud.local import folder as folders
 from fogft.errors import CloudError, NoCapacity
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, ReplicaId
 from tests.cloud.waiting import wait_for
 
@@ -36,7 +37,7 @@ def test_a_machine_is_listed_runs_and_answers(local):
     assert listed.phase in (MachinePhase.PROVISIONING, MachinePhase.RUNNING)
     machine = local.wait(id, MachinePhase.RUNNING)
     assert (machine.placement.location, machine.spec_hash) == ("local/us-west-1/a", "abc")
-    assert (machine.usd_per_hour, machine.notice, machine.failure) == (0.07, False, "")
+    assert (machine.usd_per_hour, machine.notice, machine.failure) == (0.07, False, None)
     assert echo(machine.endpoint) == b"hello"
 
 
@@ -134,13 +135,13 @@ def test_setups_in_one_folder_take_turns(local, tmp_path):
     task = {"workdir": str(tmp_path), "setup": setup}
     ids = [local.launch(slot, task=task) for slot in range(3)]
     for id in ids:
-        assert local.wait(id, MachinePhase.RUNNING).failure == ""
+        assert local.wait(id, MachinePhase.RUNNING).failure is None
 
 
 def test_a_failed_setup_is_listed_with_its_last_words_until_terminated(local):
     id = local.launch(task={"setup": "echo no compiler; exit 3"})
     failed = local.wait(id, MachinePhase.FAILED)
-    assert failed.failure == "setup: ended with status 3\nno compiler"
+    assert failed.failure == Reason(Cause.SETUP, words="ended with status 3\nno compiler")
     wait_for(lambda: not processes.find(machine=str(id)))
     assert local.machine(id) == failed
     local.cloud.terminate(id)
@@ -150,13 +151,13 @@ def test_a_failed_setup_is_listed_with_its_last_words_until_terminated(local):
 def test_a_server_that_never_listens_is_a_failed_launch(local):
     id = local.launch(exit=4)
     failure = local.wait(id, MachinePhase.FAILED).failure
-    assert failure.startswith("error: serve ended with status 4\n")
-    assert "stand-in cannot go on" in failure
+    assert failure.cause is Cause.ERROR
+    assert "stand-in cannot go on" in failure.words
 
 
 def test_a_missing_workdir_is_a_failed_launch(local, tmp_path):
     id = local.launch(task={"workdir": str(tmp_path / "none")})
-    assert "workdir" in local.wait(id, MachinePhase.FAILED).failure
+    assert "workdir" in local.wait(id, MachinePhase.FAILED).failure.words
 
 
 def test_a_machine_ends_with_its_server(local):
@@ -255,7 +256,7 @@ def test_a_living_machine_with_a_damaged_record_is_listed_so_that_it_can_be_ende
     (local.folder(id) / folders.RECORD).write_text("{")
     machine = local.machine(id)
     assert machine.phase is MachinePhase.FAILED
-    assert machine.failure.startswith("error: ")
+    assert machine.failure.cause is Cause.ERROR
     local.cloud.terminate(id)
     assert processes.find(machine=str(id)) == []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import CloudUnreachable, NoCapacity, SpecError
+from fogft.model.reason import Cause
 from fogft.model.replica import MachinePhase, ReplicaId
 from tests.contract.clouds import OTHER_UID, UID, CloudUnderTest, is_unreachable
 
@@ -141,7 +142,11 @@ def test_full_location_refuses_and_launches_nothing(made: CloudUnderTest) -> Non
         assert ids(made) == []
     else:
         made.wait_until(
-            lambda: [m for m in made.cloud.machines(UID) if m.failure.startswith("capacity")]
+            lambda: [
+                m
+                for m in made.cloud.machines(UID)
+                if m.failure is not None and m.failure.cause is Cause.CAPACITY
+            ]
         )
         made.cloud.terminate(refused.id)
     made.cloud.launch(made.order(1, at=second))

@@ -18,6 +18,7 @@ from typing import Any
 
 from fogft.cloud.port import Launch
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, SpecError
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Offer, Placement, ReplicaId
 
 _BY_ID = attrgetter("id.pool_uid", "id.slot", "id.generation")
@@ -71,7 +72,7 @@ class _Vm:
             notice=notice,
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
-            failure=f"{self.fails}: as the mock was told" if phase is MachinePhase.FAILED else "",
+            failure=Reason(Cause(self.fails)) if phase is MachinePhase.FAILED else None,
         )
 
 

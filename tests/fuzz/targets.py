@@ -20,7 +20,7 @@ from fogft.link import batch_frames, compression, frame, probe_frames
 from fogft.link.frame import Greeting
 from fogft.link.port import GatewayView, Probe, ProbeAnswer
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions, NotAdmittedError
-from fogft.model import certificate_holder, membership, refusal
+from fogft.model import credentials, membership, refusal
 from fogft.model.replica import LinkState, Member, Membership, ReplicaId
 from fogft.model.type_definition import Definition
 from fogft.ordering import orders
@@ -71,7 +71,7 @@ def _signers() -> tuple[Path, Callable[[str], Signer]]:
 
     @cache
     def signer(common_name: str) -> Signer:
-        role = certificate_holder.holder_of(common_name).role
+        role = credentials.holder_of(common_name).role
         issued = authority.issue(folder, common_name, role=role)
         authority.write(issued, folder, common_name)
         return Signer(folder / f"{common_name}.crt", folder / f"{common_name}.key")
@@ -280,7 +280,7 @@ def targets() -> dict[str, Target]:
             (f"@ros2_lv/7/a/0/1/SS/%/%/n/%s/a::srv::dds_::B_/{naming.NO_HASH}/::2".encode(),),
         ),
         "common name": Target(
-            lambda data: certificate_holder.holder_of(data.decode("latin-1")),
+            lambda data: credentials.holder_of(data.decode("latin-1")),
             (ValueError,),
             (ROBOT.encode(), REPLICA.encode()),
         ),

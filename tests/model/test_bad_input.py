@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState
 from tests.planning.pool_worlds import OFFERS, World, applied, elapsed, replica, serving, spec
 
@@ -20,14 +21,14 @@ def test_impossible_prices_launch_nothing_and_are_told(price):
     wrong = tuple(replace(offer, usd_per_hour=price) for offer in OFFERS)
     planned = World(spec(2), offers=wrong).plan()
     assert not planned.launches
-    assert "offers with impossible prices are ignored, such as `east/one/a`" in planned.notes
-    assert any("every offer has an impossible price" in note for note in planned.notes)
+    assert Reason(Cause.IMPOSSIBLE_PRICE, location="east/one/a") in planned.notes
+    assert any(Reason(Cause.IMPOSSIBLE_PRICE) in note.because for note in planned.notes)
 
 
 def test_an_empty_catalogue_launches_nothing_and_is_told():
     planned = World(spec(2), offers=()).plan()
     assert not planned.launches
-    assert any("nothing is offered for these resources now" in note for note in planned.notes)
+    assert any(Reason(Cause.NOTHING_OFFERED) in note.because for note in planned.notes)
 
 
 def settled(count: int) -> World:

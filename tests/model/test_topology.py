@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import StateError
-from fogft.model.certificate_holder import Holder, Role
+from fogft.model.credentials import Holder, Role
 from fogft.model.topology import Gateway, RobotRoute, Topology, find_loop
 
 UID = "0123456789abcdef"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from hypothesis import strategies as st
 
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
     LinkReport,
     LinkState,
@@ -130,7 +131,7 @@ def replica(
         notice=state == "noticed",
         usd_per_hour=price,
         spec_hash="old" if outdated else (of or spec()).replica_hash,
-        failure="error: boom" if state == "failed" else "",
+        failure=Reason(Cause.ERROR, words="boom") if state == "failed" else None,
     )
     link_state = {"silent": LinkState.SUSPECT, "starting": LinkState.CONNECTING}
     serving = state in ("ready", "noticed")
@@ -280,7 +281,14 @@ def worlds(draw: st.DrawFn, *, links_known: bool | None = None) -> World:
     )
     failures = draw(st.lists(st.sampled_from(PLACES), max_size=3))
     past = [
-        Event(NOW - draw(st.floats(1, 4000)), kind, 9, index + 1, place.location, "capacity: full")
+        Event(
+            NOW - draw(st.floats(1, 4000)),
+            kind,
+            9,
+            index + 1,
+            place.location,
+            Reason(Cause.CAPACITY),
+        )
         for index, place in enumerate(failures)
         for kind in (EventKind.LAUNCH, EventKind.REFUSED)
     ]

@@ -8,6 +8,7 @@ import pytest
 
 from fogft.model.choices import OnDemandSpec
 from fogft.model.groups import STAND_INS
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.planning.fallback import SETTLED_S
 from fogft.planning.observed.history import Event, EventKind
@@ -46,7 +47,7 @@ def test_at_a_notice_a_stand_in_is_ordered_beside_another_spot_machine():
 def test_after_a_refusal_a_stand_in_is_ordered_beside_the_next_try():
     refused = (
         Event(NOW - 2, EventKind.LAUNCH, 1, 1, PLACES[1].location),
-        Event(NOW - 1, EventKind.REFUSED, 1, 1, detail="capacity: none"),
+        Event(NOW - 1, EventKind.REFUSED, 1, 1, reason=Reason(Cause.CAPACITY)),
     )
     asked = replace(world(spot(0)), events=(*world(spot(0)).events, *refused))
     assert ordered(asked) == [(1, True), (STAND_INS, False)]
@@ -82,7 +83,7 @@ def test_on_demand_stands_in_rather_than_a_second_spot_machine_in_one_location()
     room = (SPOT[0], SPOT[1], *ON_DEMAND)
     full = (
         Event(NOW - 2, EventKind.LAUNCH, 1, 1, PLACES[1].location),
-        Event(NOW - 1, EventKind.REFUSED, 1, 1, detail="capacity: none"),
+        Event(NOW - 1, EventKind.REFUSED, 1, 1, reason=Reason(Cause.CAPACITY)),
     )
     first = replica(0, at=PLACES[0], of=MIXED)
     asked = world(first, offers=room)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.planning import lifetime
 from fogft.planning.observed.history import Event, EventKind, History
 from tests.planning.pool_worlds import spec
@@ -51,12 +52,8 @@ def test_a_larger_limit_counts_from_the_same_beginning() -> None:
 def test_the_end_is_announced() -> None:
     """Ten minutes before, and when it has come."""
     assert lifetime.notes(TWO_HOURS, 0.0, 6599.0) == []
-    assert lifetime.notes(TWO_HOURS, 0.0, 6900.0) == [
-        "the pool ends by itself in 5 min (`max_hours`)"
-    ]
-    assert lifetime.notes(TWO_HOURS, 0.0, 7200.0) == [
-        "its 2 hours (`max_hours`) are over: the pool ends by itself"
-    ]
+    assert lifetime.notes(TWO_HOURS, 0.0, 6900.0) == [Reason(Cause.ENDS_SOON, seconds=300.0)]
+    assert lifetime.notes(TWO_HOURS, 0.0, 7200.0) == [Reason(Cause.MAX_HOURS, seconds=7200.0)]
 
 
 @given(created=moments, set_s=st.floats(-1e7, 1e7), slept_s=st.floats(0, 1e5))

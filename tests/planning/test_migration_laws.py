@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model.choices import MigrationSpec, OnDemandSpec
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer
 from fogft.planning import migration
 from fogft.planning.buying import Buyer
@@ -57,7 +58,7 @@ def quiet(draw: st.DrawFn) -> World:
         at, place = NOW - draw(st.floats(1, 4000)), draw(st.sampled_from(PLACES))
         kind = draw(st.sampled_from([EventKind.REFUSED, EventKind.GONE]))
         past.append(Event(at, EventKind.LAUNCH, 9, generation, place.location))
-        past.append(Event(at, kind, 9, generation, "", "capacity: full"))
+        past.append(Event(at, kind, 9, generation, "", Reason(Cause.CAPACITY)))
     return replace(world, events=tuple(sorted((*world.events, *past), key=lambda e: e.at)))
 
 

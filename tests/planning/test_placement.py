@@ -7,6 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.planning.observed.backoff import EVERYWHERE, Backoff
 from fogft.planning.placement import choose, crowding, domains
@@ -23,7 +24,7 @@ offers = st.lists(
     min_size=1,
     unique_by=lambda o: o.placement,
 )
-REST = Backoff(until=1.0, failures=1, cause="capacity")
+REST = Backoff(until=1.0, failures=1, cause=Cause.CAPACITY)
 
 
 @given(offers, st.lists(placements, max_size=6))
@@ -83,13 +84,18 @@ def test_each_reason_is_told_apart() -> None:
     """No offers, all excluded, all resting, too dear, and nothing anywhere."""
     place = Placement("c1", "r1", "a", "m1")
     offer = Offer(place, 0.5)
-    assert "nothing is offered" in choose([], taken=[]).why_not
-    assert "excluded" in choose([offer], taken=[], excluded=["c1"]).why_not
-    assert (
-        "`c1/r1/a`: capacity" in choose([offer], taken=[], resting={place.location: REST}).why_not
+    assert choose([], taken=[]).why_not == Reason(Cause.NOTHING_OFFERED)
+    assert choose([offer], taken=[], excluded=["c1"]).why_not == Reason(Cause.ALL_EXCLUDED)
+    full = Reason(Cause.CAPACITY, location="c1/r1/a")
+    assert choose([offer], taken=[], resting={place.location: REST}).why_not == Reason(
+        Cause.ALL_BACKING_OFF, because=(full,)
     )
-    assert "$0.500/h" in choose([offer], taken=[], budget_usd_per_hour=0.4).why_not
-    assert "failed launches" in choose([offer], taken=[], resting={EVERYWHERE: REST}).why_not
+    assert choose([offer], taken=[], budget_usd_per_hour=0.4).why_not == Reason(
+        Cause.OVER_BUDGET, usd_per_hour=0.5, limit_usd_per_hour=0.4
+    )
+    assert choose([offer], taken=[], resting={EVERYWHERE: REST}).why_not == Reason(
+        Cause.BACKING_OFF, count=1, because=(Reason(Cause.CAPACITY),)
+    )
 
 
 def test_a_prefix_of_a_name_is_not_its_location() -> None:

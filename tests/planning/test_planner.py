@@ -8,6 +8,7 @@ import pytest
 
 from fogft.model import intent as intents
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkState, Offer
 from fogft.planning.observed.backoff import NO_ROOM_S
 from fogft.planning.observed.history import Event, EventKind
@@ -60,7 +61,8 @@ def test_a_spot_price_that_has_risen_counts_against_the_budget() -> None:
     assert launches(world) == ["1.1"]
     planned = replace(world, offers=dearer).plan()
     assert planned.launches == ()
-    assert "leaves $0.050/h" in planned.notes[0]
+    [left] = planned.notes[0].because
+    assert (left.cause, left.limit_usd_per_hour) == (Cause.OVER_BUDGET, pytest.approx(0.05))
 
 
 def test_a_rebalance_is_an_early_hint() -> None:
@@ -92,7 +94,8 @@ def test_a_replica_that_disagrees_with_the_others_is_replaced_new_before_old() -
     """Voting masks it meanwhile; it is ended once its replacement serves."""
     world = World(spec(3)).having(replica(0), replica(1), replica(2, disagrees=True))
     assert (launches(world), ends(world)) == (["2.2"], [])
-    assert "differ from those of the others" in world.plan().launches[0].reason
+    [why] = world.plan().launches[0].reason.because
+    assert why.cause is Cause.DISAGREES
     ready = world.having(replica(2, 2, age_s=50))
     assert launches(ready) == []
     assert [id.short for id in ready.plan().draining] == ["2.1"]
@@ -240,7 +243,7 @@ def test_no_surge_replaces_old_before_new_and_says_so() -> None:
     world = World(spec(2, max_surge=0)).having(replica(0), replica(1, outdated=True))
     assert (launches(world), ends(world)) == ([], [])
     assert shorts(world.plan().draining) == ["1.1"]
-    assert "slot 1: no room for both, so old before new" in world.plan().notes
+    assert Reason(Cause.OLD_BEFORE_NEW, slot=1) in world.plan().notes
     drained = replica(1, outdated=True, drained_s=20.0)
     world = World(spec(2, max_surge=0)).having(replica(0), drained)
     assert ends(world) == ["1.1"]
@@ -251,7 +254,7 @@ def test_no_room_and_nobody_else_to_answer_keeps_the_old_one() -> None:
     for lone in (spec(1, max_surge=0), spec(1, max_usd_per_hour=0.15)):
         world = World(lone).having(replica(0, outdated=True))
         assert (launches(world), ends(world), world.plan().draining) == ([], [], ())
-        assert "slot 0 is not updated" in " ".join(world.plan().notes)
+        assert Reason(Cause.NO_ROOM_TO_UPDATE, slot=0) in world.plan().notes
 
 
 def test_a_newcomer_has_to_serve_a_while_before_the_next_is_replaced() -> None:
@@ -278,8 +281,9 @@ def test_budget_holds_and_is_explained() -> None:
     world = World(spec(3, max_usd_per_hour=0.26)).having(replica(0), replica(1, price=0.11))
     assert launches(world) == []
     [note] = world.plan().notes
-    assert "$0.100/h" in note
-    assert "leaves $0.050/h" in note
+    [dear] = note.because
+    assert (note.cause, dear.cause) == (Cause.WAITS, Cause.OVER_BUDGET)
+    assert (dear.usd_per_hour, dear.limit_usd_per_hour) == pytest.approx((0.1, 0.05))
 
 
 def test_budget_lets_a_silent_machine_make_room() -> None:
@@ -322,7 +326,7 @@ def test_all_silent_is_the_uplink_and_is_said() -> None:
     parts = [replica(slot, state="silent", silent_s=500) for slot in range(3)]
     planned = World(spec(3)).having(*parts).plan()
     assert (planned.launches, planned.terminations) == ((), ())
-    assert "uplink" in planned.notes[0]
+    assert planned.notes[0] == Reason(Cause.UPLINK_SUSPECTED)
 
 
 def test_vanished_machine_is_replaced_even_behind_a_dead_uplink() -> None:
@@ -345,12 +349,13 @@ def test_resting_location_is_skipped_and_reported() -> None:
         for slot, place in enumerate(PLACES)
         for event in (
             Event(NOW - 2, EventKind.LAUNCH, slot, 1, place.location),
-            Event(NOW - 1, EventKind.REFUSED, slot, 1, "", "capacity: full"),
+            Event(NOW - 1, EventKind.REFUSED, slot, 1, "", Reason(Cause.CAPACITY)),
         )
     ]
     world = World(spec(1), events=tuple(refused))
     assert launches(world) == []
-    assert "`east/one/a`: capacity" in world.plan().notes[0]
+    [all_rest] = world.plan().notes[0].because
+    assert Reason(Cause.CAPACITY, location="east/one/a") in all_rest.because
     assert launches(replace(world, now=NOW + NO_ROOM_S)) == ["0.2"]
 
 

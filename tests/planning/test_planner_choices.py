@@ -20,6 +20,7 @@ from fogft.model.choices import (
     WindowSpec,
 )
 from fogft.model.groups import CRITICAL_BLOCK, services_at
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.model.scoring import Weights
 from fogft.model.spec import PoolSpec
@@ -130,7 +131,7 @@ def test_an_impossible_price_launches_nothing_there(price):
     wrong = offer("a/r/1", price)
     planned = World(spec(1), offers=(wrong,)).plan()
     assert not planned.launches
-    assert "impossible price" in planned.notes[0]
+    assert planned.notes[0] == Reason(Cause.IMPOSSIBLE_PRICE, location="a/r/1")
     [launch] = World(spec(1), offers=(wrong, offer("b/r/1", 9.0))).plan().launches
     assert launch.offer.placement.cloud == "b"
 
@@ -170,7 +171,7 @@ def test_a_target_is_reached_by_no_more_than_it_needs(sold, target, correlation)
     planned = World(asked, offers=sold).plan()
     places = [launch.offer.placement for launch in planned.launches]
     reached = expected(places, assumed).correlated
-    if any("cannot be met" in note for note in planned.notes):
+    if any(note.cause is Cause.TARGET_UNMET for note in planned.notes):
         assert reached < target
         assert len(places) == 16
     else:
@@ -182,9 +183,10 @@ def test_a_target_out_of_reach_within_the_cap_says_what_the_money_buys():
     asked = spec(1, availability=AvailabilitySpec(0.99999), max_usd_per_hour=0.25)
     planned = World(asked, offers=SPOT).plan()
     assert len(planned.launches) == 2
-    [note] = [n for n in planned.notes if "cannot be met" in n]
-    assert "2 replicas are expected to reach 0.99" in note
-    assert "`max_usd_per_hour`" in note
+    [note] = [n for n in planned.notes if n.cause is Cause.TARGET_UNMET]
+    assert (note.count, note.target) == (2, 0.99999)
+    assert note.share == pytest.approx(0.99, abs=0.01)
+    assert note.because == (Reason(Cause.OVER_CAP),)
 
 
 def test_two_clouds_need_fewer_than_one():
@@ -266,7 +268,7 @@ def test_where_spot_is_refused_on_demand_of_the_same_place_stands_in(cause):
 
     def refused(*, on_demand: bool) -> tuple[Event, ...]:
         launch = Event(NOW - 2, EventKind.LAUNCH, 0, 1, "a/r/1", on_demand=on_demand)
-        return launch, Event(NOW - 1, EventKind.REFUSED, 0, 1, detail=f"{cause}: none")
+        return launch, Event(NOW - 1, EventKind.REFUSED, 0, 1, reason=Reason(Cause(cause)))
 
     for was_on_demand in (False, True):
         world = World(mixed, offers=(spot, demand), events=refused(on_demand=was_on_demand))
@@ -340,7 +342,8 @@ def test_a_replica_moves_to_a_much_cheaper_place_new_before_old():
     planned = world.plan()
     [launch] = planned.launches
     assert launch.offer.placement.zone == "2"
-    assert "48% better" in launch.reason  # half the price, and nothing is known of losses there
+    [why] = launch.reason.because  # half the price, and nothing is known of losses there
+    assert (why.cause, why.share) == (Cause.BETTER_SCORE, pytest.approx(0.48, abs=0.005))
     assert not planned.draining
     for _ in range(5):
         world = elapsed(applied(world, world.plan()), 5.0)
@@ -378,7 +381,7 @@ def refused(place: str, *ages_s: float, generation: int = 1) -> tuple[Event, ...
         for number, age_s in enumerate(ages_s, generation)
         for event in (
             Event(NOW - age_s, EventKind.LAUNCH, 9, number, place),
-            Event(NOW - age_s, EventKind.REFUSED, 9, number, detail="capacity: none"),
+            Event(NOW - age_s, EventKind.REFUSED, 9, number, reason=Reason(Cause.CAPACITY)),
         )
     )
 
@@ -404,10 +407,10 @@ def test_where_all_rest_the_one_resting_longest_is_tried_once_a_minute():
     world = World(spec(2), offers=sold, events=(*longest, *later))
     [launch] = world.plan().launches
     assert launch.offer.placement.cloud == "b"
-    assert "this location longest" in launch.reason
+    assert Reason(Cause.FAILED_LONGEST_AGO) in launch.reason.because
     again = replace(world, events=(*world.events, *refused("b/r/1", 59.0, generation=21)))
     assert not again.plan().launches
-    quota = tuple(e._replace(detail=e.detail.replace("capacity", "quota")) for e in world.events)
+    quota = tuple(e._replace(reason=e.reason and Reason(Cause.QUOTA)) for e in world.events)
     assert not replace(world, events=quota).plan().launches
 
 

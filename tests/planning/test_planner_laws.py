@@ -10,6 +10,7 @@ import hypothesis
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from fogft.model.reason import Cause
 from fogft.model.replica import LinkState, MachinePhase, ReplicaId
 from fogft.planning.planner import Plan
 from tests.nightly import by_day
@@ -35,7 +36,7 @@ many = settings(
 def needed(world: World, planned: Plan, leaving: set[ReplicaId]) -> int:
     """Return how many have to go on serving: one fewer where an outdated one makes room."""
     outdated = {m.id for m in world.machines or () if m.spec_hash == "old"}
-    makes_room = any("old before new" in note for note in planned.notes)
+    makes_room = any(note.cause is Cause.OLD_BEFORE_NEW for note in planned.notes)
     if makes_room and leaving & outdated:
         return max(1, planned.wanted - 1)
     return planned.wanted
@@ -252,14 +253,15 @@ def test_the_strategy_reaches_what_it_should() -> None:
     @given(worlds())
     def look(world: World) -> None:
         planned = world.plan()
+        causes = {why.cause for note in planned.notes for why in (note, *note.because)}
         hits = {
             "launches": planned.launches,
             "terminations": planned.terminations,
             "draining": planned.draining,
             "ends a serving one": {e.id for e in planned.terminations} & serving(world),
             "uplink": planned.health is not None and planned.health.uplink_suspected,
-            "budget": any("max_usd_per_hour" in note for note in planned.notes),
-            "surge": any("max_surge" in note for note in planned.notes),
+            "budget": Cause.OVER_BUDGET in causes,
+            "surge": Cause.SURGE_FULL in causes,
         }
         wanted.update((name, True) for name, hit in hits.items() if hit)
         if all(wanted.values()):

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from fogft.planning.observed.health import judge
 from fogft.planning.observed.history import Event, EventKind
@@ -46,40 +47,42 @@ OLD = replica(0, of=GOOD)
 
 def test_nothing_speaks_against_a_version_that_starts_or_serves() -> None:
     for state in ("provisioning", "starting", "unready", "ready"):
-        assert found(pool(OLD, replica(1, 2, state=state, of=NEW, age_s=20))) == ""
+        assert found(pool(OLD, replica(1, 2, state=state, of=NEW, age_s=20))) is None
 
 
 def test_a_run_that_keeps_ending_is_no_good() -> None:
     starting = replica(1, 2, state="unready", of=NEW, age_s=20)
-    assert found(pool(OLD, counted(starting, restarts=CRASH_LOOP - 1))) == ""
-    assert found(pool(OLD, counted(starting, restarts=CRASH_LOOP))).startswith(
-        "replica 1.2: `run` ended 4 times"
-    )
+    assert found(pool(OLD, counted(starting, restarts=CRASH_LOOP - 1))) is None
+    fault = found(pool(OLD, counted(starting, restarts=CRASH_LOOP)))
+    assert (fault.cause, fault.replica) == (Cause.REPLICA_FAILS, "1.2")
+    assert [(why.cause, why.count) for why in fault.because] == [(Cause.RUN_ENDS, 4)]
 
 
 def test_a_service_that_came_up_after_some_attempts_is_left_alone() -> None:
     serving = replica(1, 2, of=NEW, age_s=20)
-    assert found(pool(OLD, counted(serving, restarts=9))) == ""
+    assert found(pool(OLD, counted(serving, restarts=9))) is None
 
 
 def test_what_is_wrong_with_the_old_version_does_not_speak_against_the_new_one() -> None:
     crashing = counted(replica(0, state="unready", of=GOOD), restarts=50, failed=900)
-    assert found(pool(crashing, replica(1, 2, of=NEW))) == ""
+    assert found(pool(crashing, replica(1, 2, of=NEW))) is None
 
 
 @pytest.mark.parametrize(
     ("failure", "is_fault"),
     [
-        ("setup: exit status 1", True),
-        ("timeout: not running", True),
-        ("capacity: full", False),
-        ("quota: 8 of 8", False),
-        ("error: boom", False),
+        (Cause.SETUP, True),
+        (Cause.TIMEOUT, True),
+        (Cause.CAPACITY, False),
+        (Cause.QUOTA, False),
+        (Cause.ERROR, False),
     ],
 )
-def test_a_failed_launch_is_the_versions_fault_or_the_clouds(failure: str, is_fault: bool) -> None:
+def test_a_failed_launch_is_the_versions_fault_or_the_clouds(
+    failure: Cause, is_fault: bool
+) -> None:
     failed = replica(1, 2, state="failed", of=NEW, age_s=20)
-    failed = replace(failed, machine=replace(failed.machine, failure=failure))
+    failed = replace(failed, machine=replace(failed.machine, failure=Reason(failure)))
     assert failed.machine.phase is MachinePhase.FAILED
     assert bool(found(pool(OLD, failed))) is is_fault
 
@@ -89,32 +92,32 @@ def test_launches_that_keep_failing_are_the_versions_fault_in_the_end() -> None:
 
     def refused(times: int, at: float) -> tuple[Event, ...]:
         return tuple(
-            Event(at + i, kind, 1, i + 2, "east/one/a", "error: no such image")
+            Event(at + i, kind, 1, i + 2, "east/one/a", Reason(Cause.ERROR, words="no such image"))
             for i in range(times)
             for kind in (EventKind.LAUNCH, EventKind.REFUSED)
         )
 
     old = replica(0, of=GOOD, age_s=5000)
-    assert found(replace(pool(old), events=(*old.events, *refused(2, NOW - 50)))) == ""
-    assert "3 launches failed" in found(
-        replace(pool(old), events=(*old.events, *refused(3, NOW - 50)))
-    )
+    assert found(replace(pool(old), events=(*old.events, *refused(2, NOW - 50)))) is None
+    fault = found(replace(pool(old), events=(*old.events, *refused(3, NOW - 50))))
+    assert (fault.cause, fault.count) == (Cause.LAUNCHES_FAIL, 3)
     before = replace(pool(old), events=(*old.events, *refused(3, NOW - 250)))
-    assert found(before) == "", "before the update began"
+    assert found(before) is None, "before the update began"
 
 
 def test_more_errors_than_the_old_version_has_are_a_fault() -> None:
     new = replica(1, 2, of=NEW)
     old = counted(OLD, answered=990, failed=10)
-    assert found(pool(old, counted(new, answered=95, failed=4))) == ""
+    assert found(pool(old, counted(new, answered=95, failed=4))) is None
     why = found(pool(old, counted(new, answered=50, failed=25)))
-    assert why == "25 of 75 requests to the new version failed, 10 of 1000 to the old one"
+    assert why.cause is Cause.MORE_ERRORS
+    assert [(one.count, one.of) for one in why.because] == [(25, 75), (10, 1000)]
 
 
 def test_as_many_errors_as_the_old_version_has_are_none() -> None:
     """Requests that no version can answer speak against neither."""
     old, new = counted(OLD, answered=50, failed=50), replica(1, 2, of=NEW)
-    assert found(pool(old, counted(new, answered=48, failed=52))) == ""
+    assert found(pool(old, counted(new, answered=48, failed=52))) is None
 
 
 @example(hits=0, others=15)

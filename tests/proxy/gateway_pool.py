@@ -16,8 +16,7 @@ from typing import Any
 
 from fogft.child import tied
 from fogft.model import membership, names
-from fogft.model.certificate_holder import Role
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Gateway, RobotRoute, Topology
 from tests.link.namespaces import inside

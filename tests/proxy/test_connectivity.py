@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from fogft.model import membership, names
-from fogft.model.certificate_holder import Role
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind

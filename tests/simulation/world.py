@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from fogft.cloud.port import Launch
+from fogft.model.reason import Cause
 from fogft.model.replica import LinkReport, LinkState, Machine, MachinePhase, ReplicaId
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.planning.observed.clock_jumps import Reading
@@ -287,7 +288,7 @@ class World:
         left = (serving & known) - gone - noticed
         for end in tick.plan.terminations:
             if end.id in serving:
-                makes_room = "old before new" in end.reason
+                makes_room = end.reason.cause is Cause.REPLACED_FIRST
                 needed = max(1, self.wanted() - 1) if makes_room else self.wanted()
                 assert len(left) >= needed, f"{end.id.short} served; left: {left}"
         if known and len(serving & known) >= self.wanted():

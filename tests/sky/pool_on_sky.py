@@ -13,6 +13,7 @@ from fogft.model.replica import LinkReport, LinkState, Offer, Placement, Replica
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager.reconciler import Reconciler, Tick
+from fogft.reason_words import words
 from tests.simulation.memory_store import MemoryStore
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, WEST, replica
@@ -102,7 +103,7 @@ class PoolOnSky:
     @property
     def notes(self) -> str:
         """What `fogft status` says."""
-        return " | ".join(self.last.plan.notes) if self.last else ""
+        return " | ".join(map(words, self.last.plan.notes)) if self.last else ""
 
     def ready(self) -> list[str]:
         """Return the replicas that answer."""
@@ -119,7 +120,7 @@ class PoolOnSky:
 
     def said(self) -> str:
         """Return what the history tells of failures."""
-        return "\n".join(event.detail for event in self.store.events)
+        return "\n".join(words(event.reason) for event in self.store.events)
 
     def change(self, **spec: Any) -> None:
         """Apply a changed file."""

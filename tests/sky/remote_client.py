@@ -36,7 +36,7 @@ def main(folder: Path) -> dict[str, Any]:
     (folder / "launched").touch()
     wait(lambda: (folder / "seen").exists())  # the test has seen the VM at the provider
     machine = next(iter(cloud.machines(ID.pool_uid)))
-    told["before"] = (machine.phase.value, machine.failure)
+    told["before"] = (machine.phase.value, machine.failure and machine.failure.cause.value)
     cloud.terminate(ID)
     told["after"] = [m.id.short for m in cloud.machines(ID.pool_uid)]
     audit = cloud.audit(ID.pool_uid)

@@ -11,6 +11,7 @@ from fogft.cloud.sky.following import DEFAULT_LIMITS, JOB_PAUSE_S
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, WEST, replica
@@ -144,8 +145,7 @@ def test_a_launch_that_fails_is_listed_with_its_cause_until_it_is_terminated(
     scene.work()
     machine = scene.machine()
     assert machine.phase is MachinePhase.FAILED
-    assert machine.failure.split(":")[0] == cause
-    assert text in machine.failure
+    assert (machine.failure.cause, text in machine.failure.words) == (Cause(cause), True)
     scene.cloud.terminate(ID)
     assert not scene.machines()
 
@@ -181,8 +181,9 @@ def test_a_launch_that_hangs_is_aborted_and_taken_down(scene: Scene):
     scene.pass_s(DEFAULT_LIMITS.launch_s)
     scene.work()
     machine = scene.machine()
-    assert machine.failure.startswith("timeout: still launching after 900 s")
-    assert f"provisioning {NAME}" in machine.failure
+    assert machine.failure.cause is Cause.TIMEOUT
+    assert machine.failure.words.startswith("still launching after 900 s")
+    assert f"provisioning {NAME}" in machine.failure.words
     assert scene.sky.asked("cancel")
     assert not scene.provider.found
 
@@ -193,8 +194,8 @@ def test_a_failed_setup_shows_the_end_of_its_log_and_ends_the_vm(scene: Scene):
     scene.sky.finish(NAME, JobState.SETUP_FAILED)
     scene.work(LOOKED_AT)
     machine = scene.machine()
-    assert machine.failure.startswith("setup: ")
-    assert "no such package: yolo" in machine.failure
+    assert machine.failure.cause is Cause.SETUP
+    assert "no such package: yolo" in machine.failure.words
     assert not scene.provider.found
 
 
@@ -203,7 +204,7 @@ def test_a_server_proxy_that_ends_at_once_is_a_failure_with_its_log(scene: Scene
     scene.sky.job_logs[NAME] = "error: `replica.yaml`: key 'run' is missing\n"
     scene.sky.finish(NAME, JobState.ENDED)
     scene.work(LOOKED_AT)
-    assert "key 'run' is missing" in scene.machine().failure
+    assert "key 'run' is missing" in scene.machine().failure.words
 
 
 def test_a_job_is_asked_about_seldom(scene: Scene):
@@ -230,7 +231,7 @@ def test_a_setup_that_hangs_ends_at_its_own_limit(scene: Scene):
     assert scene.machine().phase is MachinePhase.RUNNING
     scene.pass_s(DEFAULT_LIMITS.setup_s)
     scene.work()
-    assert scene.machine().failure.startswith("timeout: still setting up")
+    assert scene.machine().failure.cause is Cause.TIMEOUT
     assert not scene.provider.found
 
 
@@ -339,7 +340,7 @@ def test_a_server_that_forgot_a_launch_is_asked_for_the_machine(scene: Scene):
     record = scene.sky.records[NAME]
     scene.sky.forget_everything()
     scene.work()
-    assert scene.machine().failure == "error: SkyPilot lost this launch"
+    assert scene.machine().failure == Reason(Cause.ERROR, words="SkyPilot lost this launch")
     assert not scene.provider.found, "the provider was asked to end what SkyPilot forgot"
     assert record.name == NAME
 
@@ -363,7 +364,9 @@ def test_an_order_that_was_never_heard_fails_after_a_while(scene: Scene):
     assert scene.machine().phase is MachinePhase.PROVISIONING
     scene.pass_s(DEFAULT_LIMITS.ask_s)
     scene.work()
-    assert scene.machine().failure == "error: SkyPilot never heard of this launch"
+    assert scene.machine().failure == Reason(
+        Cause.ERROR, words="SkyPilot never heard of this launch"
+    )
 
 
 def test_down_that_a_cloud_does_not_answer_says_what_may_still_run(scene: Scene):
@@ -582,7 +585,7 @@ def test_a_process_killed_while_it_ends_a_machine_leaves_it_listed(scene: Scene)
     machine = scene.machine()
     assert (machine.phase, machine.failure) == (
         MachinePhase.FAILED,
-        "error: its end was not confirmed",
+        Reason(Cause.ERROR, words="its end was not confirmed"),
     )
 
 

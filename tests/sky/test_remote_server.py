@@ -173,7 +173,7 @@ def test_a_robot_without_credentials_launches_and_ends_through_a_server_elsewher
         ("us-east-1", "m6i.large", "catalogue")
     }
     assert told["listed"] == [["0.1", "provisioning"]]
-    assert told["before"] == ["provisioning", ""]
+    assert told["before"] == ["provisioning", None]
     assert told["after"] == []
     assert told["audit"] == [[], []], "nobody but SkyPilot could be asked"
     assert "SkyPilot's word" in told["unverified"], "and `up` says so"

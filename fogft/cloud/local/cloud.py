@@ -25,6 +25,7 @@ from fogft.cloud.local.folder import NOTICE, Life, MachineFolder, Record, State,
 from fogft.cloud.local.resources import offers_for
 from fogft.cloud.port import Audit, Launch
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, StateError
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Offer, Placement, ReplicaId
 from fogft.poolfile.tree import nearest
 
@@ -281,5 +282,5 @@ def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machi
 
 def _damaged(folder: MachineFolder, now: float, error: StateError) -> Machine:
     """List a machine that lives though its files cannot be read, so that it can be ended."""
-    failure = f"error: {error.message}"
+    failure = Reason(Cause.ERROR, words=error.message)
     return Machine(folder.id, _UNKNOWN, MachinePhase.FAILED, now, failure=failure)

@@ -28,6 +28,7 @@ from typing import Any
 from fogft import disk
 from fogft.cloud.local import processes
 from fogft.errors import CloudError, StateError
+from fogft.model.reason import Reason
 from fogft.model.replica import MachinePhase, Placement, ReplicaId
 
 RECORD = "machine.json"
@@ -87,7 +88,7 @@ class State:
 
     phase: MachinePhase
     endpoint: str | None = None
-    failure: str = ""
+    failure: Reason | None = None
     progress: str = ""
     pids: Mapping[str, int] = field(default_factory=dict)
     domain_id: int | None = None
@@ -176,13 +177,16 @@ class MachineFolder:
         if raw is None:
             return None
         try:
-            return State(**{**raw, "phase": MachinePhase(raw["phase"])})
+            failure = Reason.from_plain(raw["failure"]) if raw["failure"] else None
+            return State(**{**raw, "phase": MachinePhase(raw["phase"]), "failure": failure})
         except (KeyError, TypeError, ValueError) as error:
             raise StateError(f"`{self.path / STATE}` is damaged: {error!r}") from error
 
     def write_state(self, state: State) -> None:
         """Say how far the machine has come. Raises `StateError` on a full disk."""
-        disk.write_json(self.path / STATE, asdict(state), durable=False)
+        plain = asdict(state)
+        plain["failure"] = state.failure.to_plain() if state.failure is not None else None
+        disk.write_json(self.path / STATE, plain, durable=False)
 
     def notice_at(self) -> float | None:
         """Return when a preempted machine ends; None without a notice."""

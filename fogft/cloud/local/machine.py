@@ -27,8 +27,10 @@ from fogft.cloud.local.folder import LINK, LOCK, NOTICE, MachineFolder, Record, 
 from fogft.cloud.local.relay import Relay
 from fogft.cloud.local.reservations import Reservation, reserve_domain, reserve_port
 from fogft.errors import FogftError, StateError
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from fogft.process import ENDING_SIGNALS, start_log
+from fogft.reason_words import words
 
 log = logging.getLogger("fogft.machine")
 
@@ -42,7 +44,11 @@ class _Ended(Exception):
 
 
 class _Failed(Exception):
-    """The machine will never run; says why, beginning with the cause."""
+    """The machine will never run; says why."""
+
+    def __init__(self, cause: Cause, said: str) -> None:
+        super().__init__(said)
+        self.reason = Reason(cause, words=said)
 
 
 def main(arguments: list[str]) -> int:
@@ -103,9 +109,9 @@ class Machine:
         except _Ended as ended:
             log.info("machine_ended replica=%s reason=%r", self._folder.id.short, str(ended))
         except _Failed as failed:
-            reason = str(failed)
+            reason = words(failed.reason)
             log.error("machine_failed replica=%s reason=%r", self._folder.id.short, reason)
-            self._say(State(MachinePhase.FAILED, failure=reason))
+            self._say(State(MachinePhase.FAILED, failure=failed.reason))
         finally:
             processes.end_machine(str(self._folder.id), spare={self._guard})
             sweep_shared_memory()
@@ -129,7 +135,7 @@ class Machine:
             workdir.mkdir(exist_ok=True)
             return workdir
         if not isinstance(wanted, str) or not Path(wanted).is_dir():
-            raise _Failed(f"error: `workdir` is not a folder of this computer: {wanted}")
+            raise _Failed(Cause.ERROR, f"`workdir` is not a folder of this computer: {wanted}")
         return Path(wanted)
 
     def _set_up(self, workdir: Path) -> None:
@@ -153,7 +159,7 @@ class Machine:
         code = self._statuses.pop(pid)
         if code:
             tail = logfile.tail(self._folder.log, begin)
-            raise _Failed(f"setup: {_in_words(code)}\n{tail}".rstrip())
+            raise _Failed(Cause.SETUP, f"{_in_words(code)}\n{tail}".rstrip())
         log.info("setup_done")
 
     # -- serve ------------------------------------------------------------------------------
@@ -162,7 +168,8 @@ class Machine:
         domain = reserve_domain({task_commands.robot_domain()})
         port = reserve_port()
         if domain is None or port is None:
-            raise _Failed(f"error: no {'ROS domain' if domain is None else 'port'} is free here")
+            missing = "ROS domain" if domain is None else "port"
+            raise _Failed(Cause.ERROR, f"no {missing} is free here")
         begin = logfile.size(self._folder.log)
         pid = self._start_server(workdir, domain, port)
         endpoint = f"127.0.0.1:{port.number}"
@@ -181,7 +188,7 @@ class Machine:
         code = self._statuses.pop(pid)
         if code > 0 and self._relay is not None and not self._relay.reached:
             tail = logfile.tail(self._folder.log, begin)
-            raise _Failed(f"error: serve {_in_words(code)}\n{tail}".rstrip())
+            raise _Failed(Cause.ERROR, f"serve {_in_words(code)}\n{tail}".rstrip())
         raise _Ended(f"serve {_in_words(code)}")
 
     def _start_server(self, workdir: Path, domain: Reservation, port: Reservation) -> int:
@@ -203,7 +210,7 @@ class Machine:
                 child.tied(command), cwd=workdir, env=environ, stdin=subprocess.DEVNULL
             )
         except OSError as error:
-            raise _Failed(f"error: `{command[0]}` cannot be started: {error}") from error
+            raise _Failed(Cause.ERROR, f"`{command[0]}` cannot be started: {error}") from error
         process.returncode = 0  # we wait for all children ourselves: see `_reap`
         return process.pid
 

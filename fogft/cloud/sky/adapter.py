@@ -17,7 +17,7 @@ from fogft.cloud.port import Audit, Launch
 from fogft.cloud.sky import listing, task, wheel
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
-from fogft.cloud.sky.failures import Cause, classify
+from fogft.cloud.sky.failures import classify
 from fogft.cloud.sky.following import DEFAULT_LIMITS, UNDER_WAY, Following, Limits
 from fogft.cloud.sky.journal import Entry, Journal, Stage
 from fogft.cloud.sky.naming import OWNER, cluster_name, label_value, replica_of
@@ -28,6 +28,7 @@ from fogft.cloud.sky.sdk import RefusedError, Sky
 from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
 from fogft.disk import write_whole
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
+from fogft.model.reason import Cause
 from fogft.model.replica import Machine, Offer, ReplicaId
 
 log = logging.getLogger(__name__)

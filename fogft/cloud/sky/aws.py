@@ -15,9 +15,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from fogft.cloud.sky import naming
-from fogft.cloud.sky.failures import Cause, classify
+from fogft.cloud.sky.failures import classify
 from fogft.cloud.sky.provider import Instance, NotAllowedError
 from fogft.errors import CloudUnreachable
+from fogft.model.reason import Cause
 from fogft.model.replica import Placement
 
 T = TypeVar("T")

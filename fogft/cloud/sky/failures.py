@@ -12,31 +12,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
-from enum import Enum
 
-
-class Cause(str, Enum):
-    """Why there is no machine. The first word of `Machine.failure`."""
-
-    CAPACITY = "capacity"  # full now: another place, or another time
-    QUOTA = "quota"  # the account may not have more: waiting does not help
-    CREDENTIALS = "credentials"  # expired, wrong, or without a permission
-    SETUP = "setup"  # the pool file's `setup` failed: every place would do the same
-    TIMEOUT = "timeout"  # it hung
-    ERROR = "error"
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A launch that will never run, with the cloud's own words."""
-
-    cause: Cause
-    words: str
-
-    def __str__(self) -> str:
-        return f"{self.cause.value}: {self.words}"
-
+from fogft.model.reason import Cause, Reason
 
 # In order: the first that matches decides. Quota before capacity, since some quota messages
 # also speak of capacity; credentials first, since without them nothing else is known.
@@ -73,7 +50,7 @@ _KINDS = {
 }
 
 
-def classify(kind: str, texts: Iterable[str]) -> Failure:
+def classify(kind: str, texts: Iterable[str]) -> Reason:
     """Return why a launch failed.
 
     Args:
@@ -84,9 +61,9 @@ def classify(kind: str, texts: Iterable[str]) -> Failure:
     for cause, pattern in _CODES:
         for text in told:
             if re.search(pattern, text):
-                return Failure(cause, _short(text, pattern))
+                return Reason(cause, words=_short(text, pattern))
     words = _short(told[-1] if told else kind, "")
-    return Failure(_KINDS.get(kind, Cause.ERROR), words)
+    return Reason(_KINDS.get(kind, Cause.ERROR), words=words)
 
 
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")

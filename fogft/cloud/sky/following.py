@@ -16,13 +16,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fogft.cloud.sky.ending import Ending
-from fogft.cloud.sky.failures import Cause, Failure, classify, tail
+from fogft.cloud.sky.failures import classify, tail
 from fogft.cloud.sky.journal import Entry, Journal, Stage
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
 from fogft.cloud.sky.task import SETUP_LIMIT_S
 from fogft.errors import CloudError, CloudUnreachable
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
+from fogft.reason_words import words as in_words
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +111,7 @@ class Following:
         if requests:
             self._move(entry, stage=Stage.LAUNCHING, request=requests[-1].id)
         elif self._age(entry) > self._limits.ask_s:
-            self._fail(entry, Failure(Cause.ERROR, "SkyPilot never heard of this launch"))
+            self._fail(entry, Reason(Cause.ERROR, words="SkyPilot never heard of this launch"))
 
     def _launching(self, entry: Entry) -> None:
         request = self._sky.request(entry.request)
@@ -132,7 +134,7 @@ class Following:
         if any(c.state is ClusterState.UP for c in clusters):
             self._move(entry, stage=Stage.SETTING_UP)
         else:
-            self._fail(entry, Failure(Cause.ERROR, "SkyPilot lost this launch"))
+            self._fail(entry, Reason(Cause.ERROR, words="SkyPilot lost this launch"))
 
     def _setting_up(self, entry: Entry) -> None:
         asked_at = self._clock()
@@ -150,38 +152,38 @@ class Following:
         if job is JobState.RUNNING:
             self._move(entry, stage=Stage.RUNNING)
         elif job is JobState.SETUP_FAILED:
-            self._fail(entry, Failure(Cause.SETUP, "`setup` failed" + self._job_tail(entry)))
+            self._fail(entry, Reason(Cause.SETUP, words="`setup` failed" + self._job_tail(entry)))
         elif job is JobState.MISSING:
-            self._fail(entry, Failure(Cause.ERROR, "SkyPilot started no job on the machine"))
+            self._fail(entry, Reason(Cause.ERROR, words="SkyPilot started no job on the machine"))
         elif job is JobState.ENDED:
             words = "`fogft serve` ended on the machine" + self._job_tail(entry)
-            self._fail(entry, Failure(Cause.ERROR, words))
+            self._fail(entry, Reason(Cause.ERROR, words=words))
 
     # -- failures ---------------------------------------------------------------------------
 
-    def _fail(self, entry: Entry, failure: Failure) -> None:
+    def _fail(self, entry: Entry, failure: Reason) -> None:
         """Write the failure first: whatever happens while it is taken down, it stays known."""
-        log.warning("launch_failed replica=%s reason=%r", entry.id.short, str(failure))
-        self._journal.update(entry.id, stage=Stage.FAILED, failure=str(failure))
+        log.warning("launch_failed replica=%s reason=%r", entry.id.short, in_words(failure))
+        self._journal.update(entry.id, stage=Stage.FAILED, failure=failure)
         try:
             self._ending.end(entry.id)
         except CloudError as error:  # it stays listed as failed until `terminate` has managed
             log.warning("end_failed replica=%s reason=%r", entry.id.short, str(error))
 
-    def _refused(self, entry: Entry, error: RefusedError) -> Failure:
+    def _refused(self, entry: Entry, error: RefusedError) -> Reason:
         failure = classify(error.kind, error.texts)
         if error.kind in ("CommandError", "ClusterSetUpError") and failure.cause is Cause.ERROR:
             log_tail = self._job_tail(entry)
             cause = Cause.SETUP if "setup" in " ".join(error.texts).lower() else Cause.ERROR
-            return Failure(cause, failure.words + log_tail)
+            return Reason(cause, words=failure.words + log_tail)
         if error.kind == "RequestCancelled":
-            return Failure(Cause.ERROR, "the launch was cancelled")
+            return Reason(Cause.ERROR, words="the launch was cancelled")
         return failure
 
-    def _hung(self, entry: Entry, limit_s: float, doing: str) -> Failure:
+    def _hung(self, entry: Entry, limit_s: float, doing: str) -> Reason:
         words = f"still {doing} after {limit_s:.0f} s"
         log_tail = self._job_tail(entry) if entry.stage is Stage.SETTING_UP else ""
-        return Failure(Cause.TIMEOUT, words + (log_tail or self._provision_tail(entry)))
+        return Reason(Cause.TIMEOUT, words=words + (log_tail or self._provision_tail(entry)))
 
     def _job_tail(self, entry: Entry) -> str:
         told = tail(self._sky.job_log(cluster_name(entry.id), entry.job, 30))

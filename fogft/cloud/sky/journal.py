@@ -22,6 +22,7 @@ from typing import Any
 from fogft.cloud.sky.naming import cluster_name, replica_of
 from fogft.disk import locked, make_folder, read_json, write_json, write_whole
 from fogft.errors import StateError
+from fogft.model.reason import Reason
 from fogft.model.replica import Placement, ReplicaId
 
 
@@ -58,7 +59,7 @@ class Entry:
     stage: Stage = Stage.ASKING
     request: str = ""
     job: int | None = None
-    failure: str = ""
+    failure: Reason | None = None
 
 
 class Journal:
@@ -141,7 +142,9 @@ class Journal:
         return self._folder / f"{cluster_name(id)}.json"
 
     def _write(self, entry: Entry) -> None:
-        write_json(self._path(entry.id), asdict(entry))
+        plain = asdict(entry)
+        plain["failure"] = entry.failure.to_plain() if entry.failure is not None else None
+        write_json(self._path(entry.id), plain)
 
 
 def _entry(value: Any, path: Path) -> Entry:
@@ -152,6 +155,7 @@ def _entry(value: Any, path: Path) -> Entry:
                 "id": ReplicaId(**value["id"]),
                 "placement": Placement(**value["placement"]),
                 "stage": Stage(value["stage"]),
+                "failure": Reason.from_plain(value["failure"]) if value["failure"] else None,
             }
         )
     except (KeyError, TypeError, ValueError) as error:

@@ -10,6 +10,7 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.journal import Entry, Stage
 from fogft.cloud.sky.provider import Instance
 from fogft.cloud.sky.sdk import Cluster, ClusterState
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 
 NOWHERE = Placement("", "", "", "")
@@ -20,7 +21,8 @@ def of_entry(
 ) -> Machine:
     """Return a machine that the journal knows; the others may say nothing of it."""
     phase = MachinePhase.PROVISIONING
-    failure, progress = "", entry.stage.value
+    failure: Reason | None = None
+    progress = entry.stage.value
     if entry.stage is Stage.SETTING_UP:
         phase = MachinePhase.RUNNING  # the machine runs; its services do not answer yet
     elif entry.stage is Stage.RUNNING:
@@ -31,9 +33,9 @@ def of_entry(
         phase, failure = MachinePhase.FAILED, entry.failure
     elif entry.stage is Stage.ENDING:
         # Listed until it is certain that nothing runs, so that a crash in between is repaired.
-        phase, failure = MachinePhase.FAILED, entry.failure or "error: its end was not confirmed"
+        phase, failure = MachinePhase.FAILED, entry.failure or _error("its end was not confirmed")
     elif cluster is not None and cluster.state is ClusterState.STOPPED:
-        phase, failure = MachinePhase.FAILED, "error: the machine was stopped"
+        phase, failure = MachinePhase.FAILED, _error("the machine was stopped")
     placement = entry.placement
     if cluster is not None and cluster.placement is not None:
         placement = _with_zone(placement, cluster.placement)
@@ -53,13 +55,14 @@ def of_entry(
 
 def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool, port: int) -> Machine:
     """Return a machine that SkyPilot lists and the journal has lost."""
-    phase, failure = MachinePhase.FAILED, ""
+    phase, failure = MachinePhase.FAILED, None
     if cluster.state is ClusterState.UP:
         phase = MachinePhase.RUNNING
     elif launching:
         phase = MachinePhase.PROVISIONING
     else:
-        failure = f"error: SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}"
+        said = f"SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}"
+        failure = _error(said)
     running = phase is MachinePhase.RUNNING and cluster.head_ip
     return Machine(
         id=id,
@@ -83,8 +86,12 @@ def of_instance(instance: Instance) -> Machine:
         launched_at=instance.launched_at,
         usd_per_hour=naming.usd_per_hour(instance.labels),
         spec_hash=instance.labels.get(naming.SPEC, ""),
-        failure=f"error: SkyPilot does not know {instance.placement.cloud} `{instance.key}`",
+        failure=_error(f"SkyPilot does not know {instance.placement.cloud} `{instance.key}`"),
     )
+
+
+def _error(words: str) -> Reason:
+    return Reason(Cause.ERROR, words=words)
 
 
 def _with_zone(asked: Placement, found: Placement) -> Placement:

@@ -26,7 +26,7 @@ from fogft.errors import WireError
 from fogft.link.counters import Counters
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.tunnel import Tunnel, hang_up, keep_alive
-from fogft.model.certificate_holder import Role, holder_of
+from fogft.model.credentials import Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.records import frames
 from fogft.records.record import RecordError, Verify

@@ -32,6 +32,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import NamedTuple
 
+from fogft.model.reason import Cause
 from fogft.planning.observed.expiring import Lasting
 from fogft.planning.observed.history import Failure, History
 
@@ -55,12 +56,12 @@ class Backoff(NamedTuple):
         since: Of the last failure, in seconds since the epoch.
         until: From then on it may be tried again.
         failures: How many in a row.
-        cause: Of the last one: ``capacity``, ``quota``, ``setup``, ...
+        cause: Of the last one.
     """
 
     until: float
     failures: int
-    cause: str
+    cause: Cause
     since: float = 0.0
 
 
@@ -113,8 +114,8 @@ def _outlook(history: History, supply: str, now: float) -> Lasting[_Outlook | No
         return Lasting(None, until)
     proven_at = history.proven_at(supply)
     bad = lately if lately[0].at > proven_at else [f for f in lately if f.at > proven_at]
-    setup = [f for f in lately if f.cause == "setup"]
-    rest = _backoff([f for f in bad if f.cause != "setup"] if setup else bad, now)
+    setup = [f for f in lately if f.cause is Cause.SETUP]
+    rest = _backoff([f for f in bad if f.cause is not Cause.SETUP] if setup else bad, now)
     rest_changes = NEVER if rest is None else min([rest.until, *_shortened(lately, rest)])
     disappointment = None
     if bad:
@@ -153,7 +154,7 @@ def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | 
     known = list(resting)
     if any(now - rest.since < EAGER_S for _, rest in known):
         return None
-    full = [(rest.since, supply) for supply, rest in known if rest.cause == "capacity"]
+    full = [(rest.since, supply) for supply, rest in known if rest.cause is Cause.CAPACITY]
     return min(full, default=(0.0, None))[1]
 
 
@@ -184,13 +185,13 @@ def _backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
         return None
     last = recent[-1]
     # Waiting a little does not help where the account is full.
-    until = last.at + (LIMIT_S if last.cause == "quota" else rest_s(len(recent), last.cause))
+    until = last.at + (LIMIT_S if last.cause is Cause.QUOTA else rest_s(len(recent), last.cause))
     return None if now >= until else Backoff(until, len(recent), last.cause, since=last.at)
 
 
-def rest_s(failures: int, cause: str = "") -> float:
+def rest_s(failures: int, cause: Cause | None = None) -> float:
     """Return how long so many failures in a row make a location rest, in seconds."""
-    base_s = NO_ROOM_S if cause == "capacity" else BASE_S
+    base_s = NO_ROOM_S if cause is Cause.CAPACITY else BASE_S
     return min(base_s * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
 
 

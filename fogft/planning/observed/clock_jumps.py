@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+from fogft.model.reason import Cause, Reason
+
 # Less is not worth a word: what a clock that is slewed gains between two looks, and a slow reading.
 LEAST_S = 5.0
 # A clock that was set is often set again at once. Until it has stood so long, nothing is launched
@@ -50,15 +52,12 @@ class Jump:
     slept_s: float = 0.0
 
     @property
-    def told(self) -> str:
-        """What happened, in words."""
-        parts = []
-        if self.set_s:
-            where = "forward" if self.set_s > 0 else "back"
-            parts.append(f"the clock was set {where} by {abs(self.set_s):.0f} s")
-        if self.slept_s:
-            parts.append(f"this machine slept for {self.slept_s:.0f} s")
-        return " and ".join(parts)
+    def reason(self) -> Reason:
+        """What happened."""
+        slept = Reason(Cause.SLEPT, seconds=self.slept_s)
+        if not self.set_s:
+            return slept
+        return Reason(Cause.CLOCK_SET, seconds=self.set_s, because=(slept,) if self.slept_s else ())
 
 
 class Watch:

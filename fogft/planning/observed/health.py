@@ -14,6 +14,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from fogft.model.groups import ready_at, replica_hash
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
     LinkReport,
     LinkState,
@@ -58,7 +59,7 @@ class Judged(NamedTuple):
         record: What is remembered of it; None for nothing.
         serving: Its link is up and its services are ready: ending it would be felt.
         may_serve: It served once and nothing proves that it does not serve now.
-        why: The verdict's reason in words; empty when good.
+        why: The verdict's reason; None when good.
     """
 
     machine: Machine
@@ -68,7 +69,7 @@ class Judged(NamedTuple):
     verdict: Verdict
     serving: bool
     may_serve: bool
-    why: str = ""
+    why: Reason | None = None
 
     @property
     def id(self) -> ReplicaId:
@@ -192,39 +193,43 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     link: LinkReport | None,
     record: Record | None,
     serving: bool,
-) -> tuple[Verdict, str]:
+) -> tuple[Verdict, Reason | None]:
     health, now = context.rules, context.now
     if machine.phase is MachinePhase.FAILED:
-        return Verdict.FAILED, machine.failure or "error"
+        return Verdict.FAILED, machine.failure or Reason(Cause.ERROR)
     if machine.notice:
-        return Verdict.LEAVING, "preemption notice"
+        return Verdict.LEAVING, Reason(Cause.NOTICE)
     if machine.phase is MachinePhase.PROVISIONING:
         if now - _accepted_at(machine, record, now) > health.start_limit_s:
-            return Verdict.FAILED, f"timeout: not running after {health.start_limit_s:.0f} s"
-        return Verdict.GOOD, ""
+            return Verdict.FAILED, _timeout(Cause.NOT_RUNNING, health.start_limit_s)
+        return Verdict.GOOD, None
     # A mark of our own comes back in the report: it is not the replica's wish.
     if link is not None and link.draining and not (record and record.draining_since):
-        return Verdict.LEAVING, "it asked to be left alone"
+        return Verdict.LEAVING, Reason(Cause.DRAINS_ITSELF)
     silent = link is not None and was_heard(link, record) and link.state is not LinkState.UP
     if link is not None and silent and context.may_doubt and link.silent_for_s > context.patience_s:
-        return Verdict.UNRESPONSIVE, f"silent for {link.silent_for_s:.0f} s"
+        return Verdict.UNRESPONSIVE, Reason(Cause.SILENT, seconds=link.silent_for_s)
     if link is not None and link.disagrees and context.may_doubt:
-        return Verdict.DISAGREES, "its answers differ from those of the others"
+        return Verdict.DISAGREES, Reason(Cause.DISAGREES)
     if serving and link is not None and link.at_risk and _has_settled(record, now):
-        return Verdict.AT_RISK, "the cloud recommends to move it (rebalance)"
+        return Verdict.AT_RISK, Reason(Cause.AT_RISK)
     if serving or not context.may_doubt:
-        return Verdict.GOOD, ""
+        return Verdict.GOOD, None
     if silent:
-        return Verdict.GOOD, ""
+        return Verdict.GOOD, None
     if record is None or record.first_ready_at is None:
         since = machine.launched_at if record is None else record.launched_at
         if now - since > health.start_limit_s:
-            return Verdict.FAILED, f"timeout: not ready after {health.start_limit_s:.0f} s"
-        return Verdict.GOOD, ""
+            return Verdict.FAILED, _timeout(Cause.NOT_READY, health.start_limit_s)
+        return Verdict.GOOD, None
     away_s = now - record.unready_since if record.unready_since is not None else 0.0
     if away_s > health.start_limit_s and context.ready_somewhere:
-        return Verdict.STUCK, f"its service has been away for {away_s:.0f} s"
-    return Verdict.GOOD, ""
+        return Verdict.STUCK, Reason(Cause.SERVICE_AWAY, seconds=away_s)
+    return Verdict.GOOD, None
+
+
+def _timeout(awaited: Cause, limit_s: float) -> Reason:
+    return Reason(Cause.TIMEOUT, because=(Reason(awaited, seconds=limit_s),))
 
 
 def _accepted_at(machine: Machine, record: Record | None, now: float) -> float:

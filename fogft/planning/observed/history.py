@@ -19,6 +19,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple, TypeVar
 
 from fogft.errors import StateError
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import supply
 from fogft.planning.observed.expiring import Digest, Lasting, outdate
 
@@ -56,8 +57,7 @@ class Event(NamedTuple):
         at: Seconds since the epoch.
         location: Where (``cloud/region/zone``); empty in events after the launch.
         on_demand: Of a launch: not bought on the spot market.
-        detail: Why, in words. For REFUSED and FAILED the first word is the cause:
-            ``capacity``, ``quota``, ``setup``, ``timeout`` or ``error``.
+        reason: Why it happened, where that is known.
         by_s: Of CLOCK and SLEPT: so much later is all that was remembered before.
     """
 
@@ -66,7 +66,7 @@ class Event(NamedTuple):
     slot: int
     generation: int
     location: str = ""
-    detail: str = ""
+    reason: Reason | None = None
     on_demand: bool = False
     by_s: float = 0.0
 
@@ -80,8 +80,8 @@ class Event(NamedTuple):
         }
         if self.location:
             out["location"] = self.location
-        if self.detail:
-            out["detail"] = self.detail
+        if self.reason is not None:
+            out["reason"] = self.reason.to_plain()
         if self.on_demand:
             out["on_demand"] = True
         if self.by_s:
@@ -102,7 +102,7 @@ class Event(NamedTuple):
                 slot=int(value["slot"]),
                 generation=int(value["generation"]),
                 location=str(value.get("location", "")),
-                detail=str(value.get("detail", "")),
+                reason=Reason.from_plain(value["reason"]) if "reason" in value else None,
                 on_demand=bool(value.get("on_demand", False)),
                 by_s=float(value.get("by_s", 0.0)),
             )
@@ -148,7 +148,7 @@ class Failure(NamedTuple):
     """A location disappointed: it refused, a launch failed there, or a replica died young."""
 
     at: float
-    cause: str
+    cause: Cause
 
 
 class History:
@@ -282,7 +282,7 @@ class History:
     def _fail(self, record: Record, event: Event) -> None:
         supply = record.supply
         outdate(self._of_supplies, supply)
-        cause = event.detail.split(":")[0].split(" ")[0] or "error"
+        cause = event.reason.cause if event.reason is not None else Cause.ERROR
         insort(self._failures.setdefault(supply, []), Failure(event.at, cause), key=_AT)
 
     def record(self, slot: int, generation: int) -> Record | None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.errors import FogftError
-from fogft.model.certificate_holder import Holder, Role
+from fogft.model.credentials import Holder, Role
 from fogft.pool.commands import change, joining
 from fogft.pool.commands.joining import Issued, Joined
 from fogft.pool.commands.status import slots

@@ -23,8 +23,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.errors import CredentialError, FogftError
-from fogft.model.certificate_holder import Holder, Role
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.membership import Found, to_dict
 from fogft.model.names import is_endpoint

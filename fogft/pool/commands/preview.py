@@ -27,6 +27,7 @@ from fogft.pool.manager import offers
 from fogft.poolfile.changes import changes, replaces_replicas
 from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import clouds_named, located
+from fogft.reason_words import words
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def order(
         replaces_replicas=replaces,
         new_before_old=has_room(spec, usd_per_hour, cheapest),
         rolled_back=rolled_back,
-        notes=(*notes, *(planned.notes if before is None and sold else ())),
+        notes=(*notes, *(map(words, planned.notes) if before is None and sold else ())),
         costs_money=isinstance(concrete, Accounts),
         accounts=accounts,
     )
@@ -164,7 +165,7 @@ def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:
     except (PoolNotFound, SpecError):
         return None, ""
     same = trial.file == digest(source.encode()) == store.applied()
-    return before, trial.fault if same else ""
+    return before, words(trial.fault) if same else ""
 
 
 def _tested(

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from fogft import disk
 from fogft.errors import CloudError, StateError, told
+from fogft.model.reason import Cause, Reason
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import status
 from fogft.pool.manager.status import PoolStatus
@@ -127,12 +128,12 @@ def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
     events = store.recent(1 << 30)
     history = History(events)
     report = proxy_report.read(paths.proxy_status, identity.uid)
-    trouble = ["no manager runs: the cloud was asked directly"]
+    trouble = [Reason(Cause.NO_MANAGER)]
     try:
         machines = tuple(cloud.machines(identity.uid))
     except CloudError as error:
         machines = None
-        trouble.append(f"the cloud did not answer: {told(error)}")
+        trouble.append(Reason(Cause.NO_ANSWER, words=told(error)))
     links = report.links if report is not None and report.fresh(now) else None
     observed = Observed(now, machines, links)
     health = None if machines is None else judge(identity.uid, spec, observed, history)

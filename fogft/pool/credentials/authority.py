@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from fogft import disk
 from fogft.errors import CredentialError
-from fogft.model.certificate_holder import Role
+from fogft.model.credentials import Role
 
 if TYPE_CHECKING:
     from cryptography import x509

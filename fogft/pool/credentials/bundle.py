@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fogft.errors import CredentialError
-from fogft.model.certificate_holder import Holder, holder_of
+from fogft.model.credentials import Holder, holder_of
 
 VERSION = 1
 SIZE_LIMIT = 1 << 20

@@ -17,8 +17,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.errors import CredentialError
-from fogft.model.certificate_holder import Holder, Role
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.records.client import RendezvousClient
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import DialIn, SlotState

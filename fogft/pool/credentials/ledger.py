@@ -18,7 +18,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.errors import CredentialError, StateError
-from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.replica import ReplicaId
 from fogft.pool.credentials import authority

@@ -12,6 +12,7 @@ from fogft import disk
 from fogft.errors import StateError
 from fogft.model import ros_names
 from fogft.model.middleware import Speaks
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.services import Discovered, grown, offered
@@ -38,7 +39,7 @@ class Discovery:
         self._path = path
         self._known = read(path)
         self._refused: dict[tuple[str, str], str] = {}
-        self.notes: list[str] = []
+        self.notes: list[Reason] = []
 
     def look(self, spec: PoolSpec, observed: Observed) -> bool:
         """Take up what replicas offer; return whether that changed the file.
@@ -65,7 +66,7 @@ class Discovery:
             self._refused[(name, kind)] = _check(name, kind, load=spec.rmw.robot is Speaks.RCLPY)
         why = self._refused[(name, kind)]
         if why:
-            self.notes.append(f"`{name}` is not offered here: {why}")
+            self.notes.append(Reason(Cause.NOT_OFFERED, name=name, words=why))
         return why
 
 

@@ -17,6 +17,7 @@ from fogft.errors import PoolNotFound, SpecError, StateError
 from fogft.model.intent import Intent, from_json, to_json
 from fogft.model.membership import from_dict, to_dict
 from fogft.model.names import POOL_UID_PATTERN
+from fogft.model.reason import Reason
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import Event, History
@@ -193,8 +194,11 @@ class PoolStore:
         """Return what is remembered of the file applied last, or of an earlier one."""
         try:
             raw = disk.read_json(self.paths.trial)
-            return Trial() if raw is None else Trial(**raw)
-        except (StateError, TypeError):
+            if raw is None:
+                return Trial()
+            fault = Reason.from_plain(raw["fault"]) if raw["fault"] else None
+            return Trial(**{**raw, "fault": fault})
+        except (StateError, TypeError, ValueError, KeyError):
             return Trial()  # damaged: the file is tried again
 
     def write_trial(self, trial: Trial) -> None:
@@ -203,7 +207,8 @@ class PoolStore:
         Raises:
             StateError: It cannot be written.
         """
-        disk.write_json(self.paths.trial, asdict(trial))
+        fault = trial.fault.to_plain() if trial.fault is not None else None
+        disk.write_json(self.paths.trial, {**asdict(trial), "fault": fault})
 
     def intent(self) -> Intent:
         """Return what the user wants besides the file; nothing where nothing was asked."""

@@ -14,8 +14,7 @@ import datetime
 
 from fogft.errors import CredentialError
 from fogft.model import names
-from fogft.model.certificate_holder import holder_of
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import CredentialPaths, holder_of
 from fogft.model.replica import Membership
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger

@@ -17,9 +17,7 @@ from typing import Any
 from fogft import disk
 from fogft.cloud.port import Launch
 from fogft.errors import CredentialError
-from fogft.model import certificate_holder
-from fogft.model.certificate_holder import Holder, Role, holder_of
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import NAME_LIMIT, CredentialPaths, Holder, Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND, replica_hash, services_at, task_at
 from fogft.model.proxy_config import ClientProxyConfig, RendezvousConfig, ServerProxyConfig
 from fogft.model.replica import ReplicaId
@@ -57,9 +55,7 @@ def certificate_days(spec: PoolSpec) -> float:
 
 def robot_name() -> str:
     """Return this machine's name, fit for a certificate."""
-    name = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[
-        : certificate_holder.NAME_LIMIT
-    ].strip("-")
+    name = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:NAME_LIMIT].strip("-")
     return name or "robot"
 
 

@@ -22,6 +22,7 @@ from fogft import disk, logfile
 from fogft.cloud.port import Cloud
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.metrics.scrape import Scrape
+from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkReport
 from fogft.planning import lifetime
 from fogft.pool.credentials.ledger import Ledger
@@ -87,7 +88,7 @@ class Manager:
         self._discovery = Discovery(self._paths.discovered)
         self._versions: dict[Path, tuple[int, int, int] | None] = {}
         self._digest: object = None
-        self._trouble: list[str] = []
+        self._trouble: list[Reason] = []
         self._told: status.PoolStatus | None = None
         self._scrape = Scrape(lambda: of_pool(self._told), {"pool": self._identity.name})
         self._metrics = metrics
@@ -188,9 +189,9 @@ class Manager:
         except OSError as error:  # no room, no descriptor, a folder that was taken away
             self._failed(str(error))
 
-    def _failed(self, reason: str) -> None:
-        log.error("manager_step_failed reason=%r", reason)
-        self._trouble.append(reason)
+    def _failed(self, message: str) -> None:
+        log.error("manager_step_failed reason=%r", message)
+        self._trouble.append(Reason(Cause.TROUBLE, words=message))
 
     def _attempt_tick(self) -> Tick | None:
         ticks: list[Tick] = []
@@ -222,11 +223,13 @@ class Manager:
         notes = [
             *self._trouble,
             *self._discovery.notes,
-            *filter(None, (self._proxy.trouble, self._records.trouble)),
+            *because(self._proxy.trouble),
         ]
+        if self._records.trouble:
+            notes.append(Reason(Cause.TROUBLE, words=self._records.trouble))
         if (report is None or not fresh) and not tick.over:
-            when = "lately" if report else "yet"
-            notes.append(f"the client proxy has not reported {when}")
+            cause = Cause.STALE_PROXY_REPORT if report else Cause.NO_PROXY_REPORT
+            notes.append(Reason(cause))
         seen = status.of_tick(
             tick,
             history=self._store.history(),
@@ -242,7 +245,9 @@ class Manager:
         else:  # show what was seen last; `cloud_reachable` says how it is meant
             seen = replace(seen, replicas=self._replicas)
         if ended:
-            seen = replace(seen, ended=ended, proxy_alive=False, proxy_pid=None, notes=[])
+            seen = replace(
+                seen, ended=ended, proxy_alive=False, proxy_pid=None, notes=[], reasons=[]
+            )
             log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
         self._told = seen
         disk.write_json(self._paths.status, seen.to_json(), durable=False)

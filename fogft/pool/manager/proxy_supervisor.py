@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 
 from fogft import disk
 from fogft.child import detached
+from fogft.model.reason import Cause, Reason
 from fogft.pool.folder.paths import PoolPaths
 
 log = logging.getLogger(__name__)
@@ -76,11 +77,9 @@ class ProxySupervisor:
         log.warning("proxy_ended status=%d ran_s=%.1f", status, ran_s)
 
     @property
-    def trouble(self) -> str:
-        """Return what is wrong with it, in a sentence; empty when nothing is."""
+    def trouble(self) -> Reason | None:
+        """Return what is wrong with it; None when nothing is."""
         if self._failures < 2 or self.child is not None:
-            return ""
-        return (
-            f"the client proxy has ended {self._failures} times in a row; "
-            f"its log is `{self._paths.proxy_log}`"
-        )
+            return None
+        log_name = str(self._paths.proxy_log)
+        return Reason(Cause.PROXY_KEEPS_ENDING, count=self._failures, name=log_name)

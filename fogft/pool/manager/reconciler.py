@@ -21,6 +21,7 @@ from fogft.errors import CloudError, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.model.groups import replica_hash, sales, task_at
 from fogft.model.intent import Intent
 from fogft.model.membership import Found, members_of, successor, with_by_hand
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
     LinkReport,
     Machine,
@@ -46,6 +47,7 @@ from fogft.pool.manager.operations import Operations, Submit
 from fogft.pool.manager.remembering import Remembering
 from fogft.pool.manager.timekeeping import Timekeeping
 from fogft.pool.manager.updating import Updating
+from fogft.reason_words import words
 
 log = logging.getLogger(__name__)
 
@@ -180,14 +182,15 @@ class Reconciler:
             intent = replace(intent, stopping=True)
         decided = plan(identity.uid, spec, intent, observed, history, health=health)
         if over:
-            ends = tuple(end._replace(reason="`max_hours` is over") for end in decided.terminations)
+            reason = Reason(Cause.MAX_HOURS)
+            ends = tuple(end._replace(reason=reason) for end in decided.terminations)
             decided = decided._replace(terminations=ends)
         update = None
         if decided.health is not None and not intent.stopping:
             update = self._updating.settle(
                 spec, trial, decided.health, history, wanted=decided.wanted, now=observed.now
             )
-        trouble += [update.told] if update is not None else []
+        trouble += [update.reason] if update is not None else []
         if trouble:
             decided = decided._replace(notes=(*decided.notes, *trouble))
         if observed.machines is not None:
@@ -214,10 +217,11 @@ class Reconciler:
                 )
                 cause = _refusal(error)
                 if cause:
-                    self._remember.add(EventKind.REFUSED, id, detail=f"{cause}: {error}")
+                    reason = Reason(cause, words=str(error))
+                    self._remember.add(EventKind.REFUSED, id, reason=reason)
 
-    def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[str]]:
-        trouble: list[str] = []
+    def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[Reason]]:
+        trouble: list[Reason] = []
         busy = self.operations.busy()  # before the cloud is asked: see `operations`
         now = self._time.now
         machines: tuple[Machine, ...] | None = None
@@ -229,7 +233,7 @@ class Reconciler:
             machines = tuple(sorted(listed.values(), key=by_id))
         except CloudError as error:
             log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
-            trouble.append(f"the cloud did not answer: {told(error)}")
+            trouble.append(Reason(Cause.NO_ANSWER, words=told(error)))
         sold = self._current_offers(spec, now, trouble) if machines is not None else ()
         ending = frozenset(id for id, order in busy.items() if order is None)
         links = self._links(identity.uid, now)
@@ -248,7 +252,9 @@ class Reconciler:
             if self._refreshes.start(id, None, functools.partial(cloud.refresh, id)):
                 log.info("refresh_ordered replica=%s", id.short)
 
-    def _current_offers(self, spec: PoolSpec, now: float, trouble: list[str]) -> tuple[Offer, ...]:
+    def _current_offers(
+        self, spec: PoolSpec, now: float, trouble: list[Reason]
+    ) -> tuple[Offer, ...]:
         key = spec.derived.get("sales")
         if key is None:
             key = spec.derived["sales"] = json.dumps(sales(spec), sort_keys=True, default=str)
@@ -260,7 +266,7 @@ class Reconciler:
                     self._offers = sold
                 self._offers_for = (key, now)
             except FogftError as error:
-                trouble.append(f"no prices can be had: {told(error)}")
+                trouble.append(Reason(Cause.NO_PRICES, words=told(error)))
                 if known is None or known[0] != key:
                     return ()
         return self._offers
@@ -331,10 +337,11 @@ class Reconciler:
             EventKind.LAUNCH,
             order.id,
             location=location,
-            detail=planned.reason,
+            reason=planned.reason,
             on_demand=not order.placement.spot,
         )
-        log.info("launch_ordered replica=%s zone=%s %s", order.id.short, location, planned.reason)
+        why = words(planned.reason)
+        log.info("launch_ordered replica=%s zone=%s reason=%r", order.id.short, location, why)
         expected = Machine(
             id=order.id,
             placement=order.placement,
@@ -345,22 +352,22 @@ class Reconciler:
         )
         self.operations.start(order.id, expected, lambda: self._cloud.launch(order))
 
-    def _terminate(self, id: ReplicaId, reason: str, history: History) -> None:
+    def _terminate(self, id: ReplicaId, reason: Reason, history: History) -> None:
         if id in self.operations.busy():
             return  # its launch is under way: a later tick ends it
         record = history.record(id.slot, id.generation)
         if record is None or not record.ending:
-            self._remember.add(EventKind.ENDING, id, detail=reason)
-            log.info("terminate_ordered replica=%s reason=%r", id.short, reason)
+            self._remember.add(EventKind.ENDING, id, reason=reason)
+            log.info("terminate_ordered replica=%s reason=%r", id.short, words(reason))
         self.operations.start(id, None, lambda: self._cloud.terminate(id))
 
 
-def _refusal(error: Exception) -> str:
-    """Return the cause of a refused launch; empty when it may have been launched all the same."""
+def _refusal(error: Exception) -> Cause | None:
+    """Return the cause of a refused launch; None when it may have been launched all the same."""
     if isinstance(error, NoCapacity):
-        return "capacity"
+        return Cause.CAPACITY
     if isinstance(error, QuotaExceeded):
-        return "quota"
+        return Cause.QUOTA
     if isinstance(error, CloudError) and type(error) is not CloudError:
-        return ""  # unreachable: the cloud's list will tell
-    return "error"
+        return None  # unreachable: the cloud's list will tell
+    return Cause.ERROR

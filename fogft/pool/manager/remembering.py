@@ -9,10 +9,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
+from fogft.model.reason import Reason
 from fogft.model.replica import LinkState, Observed, ReplicaId
 from fogft.planning.observed.health import Health, Judged, Verdict
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.pool.folder.store import Store
+from fogft.reason_words import words
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +37,7 @@ class Remembering:
         id: ReplicaId,
         *,
         location: str = "",
-        detail: str = "",
+        reason: Reason | None = None,
         on_demand: bool = False,
         at: float | None = None,
     ) -> None:
@@ -45,7 +47,7 @@ class Remembering:
             StateError: It cannot be written; it did not happen.
         """
         when = self._clock() if at is None else at
-        self._store.append(Event(when, kind, id.slot, id.generation, location, detail, on_demand))
+        self._store.append(Event(when, kind, id.slot, id.generation, location, reason, on_demand))
 
     def losses(self, observed: Observed) -> None:
         """Note who is no longer listed. The cloud's list must be known.
@@ -92,8 +94,8 @@ class Remembering:
                 log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
                 self.add(EventKind.UNREADY, id, at=now)
             if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
-                log.warning("replica_failed replica=%s reason=%r", id.short, judged.why)
-                self.add(EventKind.FAILED, id, detail=judged.why, at=now)
+                log.warning("replica_failed replica=%s reason=%r", id.short, words(judged.why))
+                self.add(EventKind.FAILED, id, reason=judged.why, at=now)
 
 
 def _answers(judged: Judged) -> bool:

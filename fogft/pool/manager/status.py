@@ -11,8 +11,10 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from fogft.errors import StateError
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
 from fogft.planning.observed.history import MOVING, Event, EventKind, History
+from fogft.reason_words import words
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.model.spec import PoolSpec
@@ -46,6 +48,7 @@ class ReplicaStatus:
             ``at risk``.
         age_s: Since its launch; None where that was somebody else's.
         differs: The type of a service is not the same there as here; `detail` says how.
+        reason: Why the verdict is not ``good``, as ``{cause, ...}``; None when it is.
     """
 
     slot: int
@@ -66,6 +69,7 @@ class ReplicaStatus:
     age_s: float | None
     detail: str
     differs: bool = False
+    reason: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -86,13 +90,15 @@ class UpdateStatus:
         state: ``in progress``, ``stopped`` or ``rolled back``.
         done: Replicas of the version that is wanted now which serve.
         of: How many are wanted.
-        fault: Why it was given up; empty while it was not.
+        fault: Why it was given up, in words; empty while it was not.
+        reason: The same as ``{cause, ...}``.
     """
 
     state: str
     done: int
     of: int
     fault: str = ""
+    reason: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -108,9 +114,11 @@ class PoolStatus:
         ready: Replicas whose services answer and that are to stay.
         ended: Why the manager has ended the pool by itself; empty while it runs.
         notes: Why the pool is not yet as wanted, in sentences.
+        reasons: The same, one for each note, as ``{cause, ...}``.
         topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
             how this machine's robot finds its gateways; empty where there are none.
-        events: The last things that happened: ``{at, event, replica, location, detail}``.
+        events: The last things that happened: ``{at, event, replica, location, detail,
+            reason}``.
         applied: Digest of the pool file that was applied last.
     """
 
@@ -132,6 +140,7 @@ class PoolStatus:
     ended: str = ""
     excluded: Sequence[str] = ()
     notes: Sequence[str] = ()
+    reasons: Sequence[Mapping[str, Any]] = ()
     replicas: Sequence[ReplicaStatus] = ()
     by_hand: Sequence[ReplicaStatus] = ()
     services: Sequence[ServiceStatus] = ()
@@ -171,13 +180,14 @@ def of_tick(
     epoch: int,
     manager_pid: int,
     proxy_alive: bool,
-    notes: Sequence[str] = (),
+    notes: Sequence[Reason] = (),
 ) -> PoolStatus:
     """Return the status after a tick."""
     from fogft.model.groups import FIRST_BY_HAND
 
     health, observed, plan = tick.plan.health, tick.observed, tick.plan
     judged = health.replicas if health is not None else ()
+    said = [*plan.notes, *_without_certificate(tick), *notes]
     leaving = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
     replicas = [_replica(one, leaving, history, observed.now) for one in judged]
     links = {link.id: link for link in observed.links or ()}
@@ -202,7 +212,8 @@ def of_tick(
         proxy_pid=report.pid if report is not None and proxy_alive else None,
         proxy_alive=proxy_alive,
         excluded=sorted(tick.intent.excluded),
-        notes=[*plan.notes, *_without_certificate(tick), *notes],
+        notes=[words(note) for note in said],
+        reasons=[note.to_plain() for note in said],
         replicas=replicas,
         by_hand=[_started_by_hand(member, links, tick.spec) for member in by_hand],
         services=_services(tick.spec, heard, report),
@@ -217,7 +228,8 @@ def _update(tick: Tick) -> UpdateStatus | None:
     update = tick.update
     if update is None:
         return None
-    return UpdateStatus(update.state.value, update.done, update.of, update.fault)
+    fault = update.fault
+    return UpdateStatus(update.state.value, update.done, update.of, words(fault), _plain(fault))
 
 
 def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
@@ -230,12 +242,15 @@ def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
     return {"robot": robot, **here.to_plain(), "links": links}
 
 
-def _without_certificate(tick: Tick) -> list[str]:
+def _plain(reason: Reason | None) -> dict[str, Any] | None:
+    return None if reason is None else reason.to_plain()
+
+
+def _without_certificate(tick: Tick) -> list[Reason]:
     if tick.membership is None:
         return []
     return [
-        f"gateway `{gateway.name}` has no certificate: `fogft credentials issue gateway "
-        f"{gateway.name}`"
+        Reason(Cause.NO_CERTIFICATE, name=gateway.name)
         for gateway in tick.membership.topology.gateways
         if not gateway.generations
     ]
@@ -267,6 +282,7 @@ def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float)
         age_s=max(0.0, now - launched_at),
         detail=_detail(one),
         differs=link is not None and link.differs,
+        reason=_plain(one.why),
     )
 
 
@@ -301,8 +317,10 @@ def _started_by_hand(
 def _detail(one: Judged) -> str:
     """Return what is worth knowing of a replica: what is wrong, else what is being done."""
     link, progress = one.link, one.machine.progress
-    if one.why or (progress and (link is None or link.state is LinkState.CONNECTING)):
-        return one.why or progress
+    if one.why is not None:
+        return words(one.why)
+    if progress and (link is None or link.state is LinkState.CONNECTING):
+        return progress
     return link.detail if link is not None else ""
 
 
@@ -327,5 +345,6 @@ def _event(event: Event) -> dict[str, Any]:
         "event": WORDS[event.kind],
         "replica": "" if event.kind in MOVING else f"{event.slot}.{event.generation}",
         "location": event.location,
-        "detail": event.detail,
+        "detail": words(event.reason),
+        "reason": _plain(event.reason),
     }

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
+from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.clock_jumps import Reading, Watch
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.folder.store import Store
@@ -43,7 +44,7 @@ class Timekeeping:
         self._clock = clock
         self._reading = reading
         self._watch = Watch()
-        self._unwritten: list[tuple[EventKind, float, str]] = []
+        self._unwritten: list[tuple[EventKind, float, Reason]] = []
 
     def look(self) -> bool:
         """Take the time of a tick; return whether it jumped.
@@ -60,11 +61,11 @@ class Timekeeping:
         if jump is not None:
             log.error("clock_jumped set_s=%.1f slept_s=%.1f", jump.set_s, jump.slept_s)
             both = ((EventKind.CLOCK, jump.set_s), (EventKind.SLEPT, jump.slept_s))
-            self._unwritten += [(kind, by_s, jump.told) for kind, by_s in both if by_s]
+            self._unwritten += [(kind, by_s, jump.reason) for kind, by_s in both if by_s]
         jumped = bool(self._unwritten)
         while self._unwritten:
-            kind, by_s, told = self._unwritten[0]
-            self._store.append(Event(self.now, kind, 0, 0, detail=told, by_s=by_s))
+            kind, by_s, reason = self._unwritten[0]
+            self._store.append(Event(self.now, kind, 0, 0, reason=reason, by_s=by_s))
             del self._unwritten[0]
             self._updating.move(by_s)
         return jumped
@@ -75,11 +76,8 @@ class Timekeeping:
         return self._watch.doubt_s
 
     @property
-    def notes(self) -> list[str]:
+    def notes(self) -> list[Reason]:
         """What there is to say of it."""
         if not self.doubt_s:
             return []
-        return [
-            f"the clock was set by {self.doubt_s:+.0f} s: nothing is launched or ended for it; "
-            "schedules follow once it has stood for a minute"
-        ]
+        return [Reason(Cause.CLOCK_DOUBTED, seconds=self.doubt_s)]

@@ -20,6 +20,7 @@ from fogft.planning.observed.health import Health, judge
 from fogft.planning.observed.history import History
 from fogft.planning.rollout import Trial, Update
 from fogft.pool.folder.store import Store
+from fogft.reason_words import words
 
 log = logging.getLogger(__name__)
 
@@ -50,11 +51,11 @@ class Updating:
             return spec, trial
         health = judge(uid, spec, observed, history)
         fault = rollout.fault(spec, good, health, history, trial.began_at)
-        if not fault:
+        if fault is None:
             return spec, trial
         trial = replace(trial, fault=fault)
         store.write_trial(trial)
-        log.error("update_stopped file=%s reason=%r", trial.file, fault)
+        log.error("update_stopped file=%s reason=%r", trial.file, words(fault))
         return store.spec(), trial
 
     def move(self, by_s: float) -> None:

@@ -23,7 +23,7 @@ from fogft.link.port import Listener, Probe, ProbeAnswer
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.model import names
-from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.process import start_log, stop_on_signal

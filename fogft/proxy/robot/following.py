@@ -19,7 +19,7 @@ from typing import Any
 from fogft import disk
 from fogft.disk import Watched
 from fogft.link.dial_out.robot import DialIn
-from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.membership import from_dict, is_newer
 from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import Member, Membership

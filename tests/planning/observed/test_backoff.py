@@ -5,6 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.backoff import (
     AVOID_S,
     BASE_S,
@@ -24,26 +25,26 @@ from fogft.planning.observed.history import Event, EventKind, Failure, History
 PLACE, OTHER = "c/r/a", "c/r/b"
 
 
-def refused(at: float, generation: int, detail: str = "capacity: full") -> list[Event]:
+def refused(at: float, generation: int, cause: Cause = Cause.CAPACITY) -> list[Event]:
     return [
         Event(at, EventKind.LAUNCH, 0, generation, PLACE),
-        Event(at, EventKind.REFUSED, 0, generation, "", detail),
+        Event(at, EventKind.REFUSED, 0, generation, "", Reason(cause)),
     ]
 
 
 @given(st.lists(st.floats(0, 3000), min_size=1, max_size=30), st.floats(3000, 10_000))
 def test_rest_is_bounded_and_forgiven(times: list[float], now: float) -> None:
     """No rest is longer than the limit, and none outlives forgiveness."""
-    rest = backoff([Failure(at, "capacity") for at in times], now)
+    rest = backoff([Failure(at, Cause.CAPACITY) for at in times], now)
     if rest is not None:
         assert now < rest.until <= max(times) + LIMIT_S
-    assert backoff([Failure(at, "capacity") for at in times], max(times) + FORGIVE_S) is None
+    assert backoff([Failure(at, Cause.CAPACITY) for at in times], max(times) + FORGIVE_S) is None
 
 
-@given(st.integers(1, 40), st.sampled_from(["error", "capacity"]))
-def test_rest_doubles_up_to_the_limit(count: int, cause: str) -> None:
+@given(st.integers(1, 40), st.sampled_from([Cause.ERROR, Cause.CAPACITY]))
+def test_rest_doubles_up_to_the_limit(count: int, cause: Cause) -> None:
     """n failures in a row rest for a base times 2 ** (n - 1), at most LIMIT_S."""
-    base_s = {"error": BASE_S, "capacity": NO_ROOM_S}[cause]
+    base_s = {Cause.ERROR: BASE_S, Cause.CAPACITY: NO_ROOM_S}[cause]
     rest = backoff([Failure(float(i), cause) for i in range(count)], count - 0.5)
     assert rest is not None
     assert rest.until == count - 1 + min(base_s * 2 ** (count - 1), LIMIT_S)
@@ -60,8 +61,8 @@ def test_a_success_wipes_the_slate_clean() -> None:
 
 def test_quota_rests_as_long_as_possible() -> None:
     """A full account does not get better by asking again soon."""
-    rest = resting(History(refused(0, 1, "quota: 8 vCPU")), 1)[PLACE]
-    assert (rest.until, rest.cause) == (LIMIT_S, "quota")
+    rest = resting(History(refused(0, 1, Cause.QUOTA)), 1)[PLACE]
+    assert (rest.until, rest.cause) == (LIMIT_S, Cause.QUOTA)
 
 
 def test_early_death_counts_and_a_late_one_does_not() -> None:
@@ -79,7 +80,7 @@ def test_failed_setup_is_held_against_the_file_not_the_place() -> None:
     """A broken `setup` stops launches everywhere for a while, until one becomes ready."""
     events = [
         Event(0, EventKind.LAUNCH, 0, 1, PLACE),
-        Event(9, EventKind.FAILED, 0, 1, "", "setup: exit status 1"),
+        Event(9, EventKind.FAILED, 0, 1, "", Reason(Cause.SETUP)),
     ]
     found = resting(History(events), 10)
     assert set(found) == {EVERYWHERE}
@@ -99,7 +100,7 @@ def test_an_ended_replica_is_no_failure() -> None:
 
 HAPPENINGS = st.lists(
     st.tuples(
-        st.sampled_from(["capacity: full", "quota: 8", "setup: exit 1", "ready", "gone", "look"]),
+        st.sampled_from([Cause.CAPACITY, Cause.QUOTA, Cause.SETUP, "ready", "gone", "look"]),
         st.sampled_from([PLACE, OTHER]),
         st.booleans(),
         st.sampled_from([0, 1, 5, 60, 299, 600, 3599, 3600, 14_400]) | st.integers(-9_000, 9_000),
@@ -121,7 +122,7 @@ def test_what_is_remembered_of_places_is_what_follows_from_all_events(happenings
         elif what in ("ready", "gone"):
             happened.append(Event(now, EventKind(what), 0, generation))
         else:
-            happened.append(Event(now, EventKind.REFUSED, 0, generation, "", what))
+            happened.append(Event(now, EventKind.REFUSED, 0, generation, "", Reason(what)))
         events += happened
         for event in happened:
             asked.add(event)
@@ -148,7 +149,7 @@ def test_who_waits_looks_again_when_a_rest_ends_or_all_rest_for_long_enough() ->
     """Whichever comes first: a rest for want of room is longer than the minute."""
     events = [e for n in range(1, 9) for e in refused(n, n)]
     launch = Event(0, EventKind.LAUNCH, 0, 1, PLACE)
-    few = History([launch, Event(1, EventKind.FAILED, 0, 1, "", "error")])
+    few = History([launch, Event(1, EventKind.FAILED, 0, 1, "", Reason(Cause.ERROR))])
     many = History(events)
     assert next_change(few, 2, waits=True, restless=False) == 1 + BASE_S
     assert next_change(many, 9, waits=True, restless=False) == 8 + EAGER_S

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from fogft.model.choices import ScheduleSpec, WindowSpec
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed
 from fogft.planning.observed.backoff import avoided, disappointing, resting
 from fogft.planning.observed.clock_jumps import DOUBT_S, LEAST_S, Jump, Reading, Watch
@@ -36,7 +37,7 @@ def test_a_clock_that_is_set_is_told_to_the_second(set_s, passed_s):
     assert jump is not None
     assert abs(jump.set_s - set_s) < 1e-3
     assert jump.slept_s == 0.0
-    assert ("forward" if set_s > 0 else "back") in jump.told
+    assert jump.reason == Reason(Cause.CLOCK_SET, seconds=jump.set_s)
 
 
 @given(st.floats(LEAST_S + 1, 1e6), st.one_of(st.just(0.0), gained))
@@ -80,9 +81,9 @@ def test_all_that_is_remembered_keeps_its_distance_from_now(happenings):
         ahead_s += set_s
         if set_s:
             told.append(Event(now + ahead_s, EventKind.CLOCK, 0, 0, by_s=float(set_s)))
-        for what, detail in ((EventKind.LAUNCH, ""), (kind, "capacity: full")):
-            right.append(Event(now, what, 0, generation, PLACE, detail))
-            told.append(Event(now + ahead_s, what, 0, generation, PLACE, detail))
+        for what, why in ((EventKind.LAUNCH, None), (kind, Reason(Cause.CAPACITY))):
+            right.append(Event(now, what, 0, generation, PLACE, why))
+            told.append(Event(now + ahead_s, what, 0, generation, PLACE, why))
     true, moved = History(right), History(told)
     assert _ages(moved, now + ahead_s) == _ages(true, now)
     kept = compacted(told, now + ahead_s)

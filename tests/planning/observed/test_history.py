@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import StateError
+from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import MOVING, Event, EventKind, History, compacted
 
 events = st.lists(
@@ -17,7 +18,7 @@ events = st.lists(
         st.integers(0, 3),
         st.integers(1, 4),
         st.sampled_from(["", "c/r/a", "c/r/b"]),
-        st.sampled_from(["", "capacity: full"]),
+        st.sampled_from([None, Reason(Cause.CAPACITY, words="full")]),
         st.booleans(),
     ),
     max_size=40,

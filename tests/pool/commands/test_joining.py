@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fogft.errors import CredentialError
-from fogft.model.certificate_holder import Role
+from fogft.model.credentials import Role
 from fogft.model.membership import from_dict
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.spec import PoolSpec, ServiceSpec

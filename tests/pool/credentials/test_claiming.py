@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fogft.errors import CredentialError
-from fogft.model.certificate_holder import Role
+from fogft.model.credentials import Role
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.pool.commands import joining
 from fogft.pool.commands.joining import Joined

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fogft.errors import CredentialError, StateError
-from fogft.model.certificate_holder import Holder, Role
+from fogft.model.credentials import Holder, Role
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 

@@ -12,13 +12,14 @@ import pytest
 from fogft import disk
 from fogft.errors import PoolNotFound, StateError
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Membership
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.folder import history_file
 from fogft.pool.folder.store import read_identity
 from tests.pool.scene import Scene, store_of
 
-LAUNCH = Event(1.0, EventKind.LAUNCH, 0, 1, "c/r/a", "fills a new slot")
+LAUNCH = Event(1.0, EventKind.LAUNCH, 0, 1, "c/r/a", Reason(Cause.NEW_SLOT))
 READY = Event(2.0, EventKind.READY, 0, 1)
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from fogft.model import names
-from fogft.model.certificate_holder import Holder, Role
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.membership import Found, members_of
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, Placement, ReplicaId
 from fogft.model.spec import PoolSpec, ServiceSpec

@@ -16,7 +16,7 @@ from fogft.cloud.sky import naming
 from fogft.doctor import pools
 from fogft.errors import FogftError
 from fogft.model import membership, names
-from fogft.model.certificate_holder import Role, holder_of
+from fogft.model.credentials import Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.replica import LinkReport, LinkState, Member, Membership, ReplicaId
 from fogft.model.spec import GroupSpec

@@ -8,6 +8,7 @@ import threading
 import pytest
 
 from fogft.errors import CloudUnreachable, NoCapacity, StateError
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.planner import PlannedLaunch
@@ -105,7 +106,9 @@ def test_refused_launch_is_followed_elsewhere_under_a_new_generation() -> None:
     bench.reconciler.tick()
     bench.run()
     assert bench.kinds() == [EventKind.LAUNCH, EventKind.REFUSED, EventKind.LAUNCH]
-    assert bench.store.events[1].detail.startswith("capacity: ")
+    refusal = bench.store.events[1].reason
+    assert refusal is not None
+    assert refusal.cause is Cause.CAPACITY
     assert [id.short for id in bench.cloud.calls.launched] == ["0.2"]
 
 
@@ -184,7 +187,7 @@ def test_prices_are_kept_while_the_cloud_is_away_for_prices() -> None:
     bench.cloud.fail_next("offers", CloudUnreachable("?"))
     tick = bench.reconciler.tick()
     assert len(tick.observed.offers) == 2
-    assert any("no prices" in note for note in tick.plan.notes)
+    assert any(note.cause is Cause.NO_PRICES for note in tick.plan.notes)
 
 
 def test_events_are_one_per_line_facts() -> None:
@@ -192,5 +195,5 @@ def test_events_are_one_per_line_facts() -> None:
     bench = Bench()
     bench.reconciler.tick()
     assert bench.store.events == [
-        Event(NOW, EventKind.LAUNCH, 0, 1, "east/one/a", "fills a new slot")
+        Event(NOW, EventKind.LAUNCH, 0, 1, "east/one/a", Reason(Cause.NEW_SLOT))
     ]

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from fogft import disk
+from fogft.model.reason import Cause
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
 from fogft.pool.manager.proxy_supervisor import BACKOFF_LIMIT_S, ProxySupervisor
@@ -117,8 +118,9 @@ def test_a_proxy_that_keeps_dying_is_started_less_and_less_often(tmp_path: Path)
     assert waits[-1] <= BACKOFF_LIMIT_S
     assert waits[0] < 2
     proxy.supervisor.look()
-    assert "times in a row" in proxy.supervisor.trouble
-    assert str(proxy.paths.proxy_log) in proxy.supervisor.trouble
+    trouble = proxy.supervisor.trouble
+    assert trouble is not None
+    assert (trouble.cause, trouble.name) == (Cause.PROXY_KEEPS_ENDING, str(proxy.paths.proxy_log))
 
 
 def test_a_proxy_that_ran_well_is_started_again_at_once(tmp_path: Path) -> None:
@@ -127,7 +129,7 @@ def test_a_proxy_that_ran_well_is_started_again_at_once(tmp_path: Path) -> None:
     proxy.look_until_ended()
     proxy.now += 31
     assert proxy.supervisor.look()
-    assert proxy.supervisor.trouble == ""
+    assert proxy.supervisor.trouble is None
     assert proxy.supervisor.child is not None
     proxy.supervisor.child.wait(20)
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import StateError
 from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.folder.store import Identity
@@ -80,7 +81,7 @@ def status_of(world: World, **others: Any) -> status.PoolStatus:
         tick_of(world),
         history=world.history,
         report=proxy_report.parse(REPORT, UID),
-        recent=[Event(NOW, EventKind.LAUNCH, 0, 1, "c/r/a", "fills a new slot")],
+        recent=[Event(NOW, EventKind.LAUNCH, 0, 1, "c/r/a", Reason(Cause.NEW_SLOT))],
         epoch=3,
         manager_pid=11,
         proxy_alive=True,
@@ -93,7 +94,7 @@ def test_status_says_what_was_seen_and_survives_json() -> None:
     world = World(spec(2)).having(
         replica(0), replica(1, state="noticed"), replica(2, outdated=True)
     )
-    seen = status_of(world, notes=["one more"])
+    seen = status_of(world, notes=[Reason(Cause.TROUBLE, words="one more")])
     assert (seen.target, seen.ready, seen.proxy_pid) == (2, 2, 7)
     assert [r.phase for r in seen.replicas] == ["ready", "draining", "ready"]
     assert [r.detail for r in seen.replicas] == ["", "preemption notice", ""]
@@ -101,6 +102,8 @@ def test_status_says_what_was_seen_and_survives_json() -> None:
     assert seen.services[0].ready_replicas == 3
     assert seen.services[0].counters["answered"] == 3
     assert seen.notes[-1] == "one more"
+    assert seen.reasons[-1] == {"cause": "trouble", "words": "one more"}
+    assert [r.reason for r in seen.replicas] == [None, {"cause": "preemption_notice"}, None]
     assert seen.events[0]["event"] == "launched"
     again = status.from_json(json.loads(json.dumps(seen.to_json())))
     assert again.to_json() == json.loads(json.dumps(seen.to_json()))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Member, Membership, Observed
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import Event, EventKind
@@ -71,7 +72,9 @@ def test_a_rollback_puts_the_good_file_in_force_and_stays_over_a_restart(store):
     assert tick(store, broken(store)).task["run"] == "good"
     again = PoolStore(store.paths, parse, lambda: NOW)
     assert (run(store), run(again)) == ("good", "good")
-    assert "`run` ended 9 times" in again.trial().fault
+    fault = again.trial().fault
+    assert fault is not None
+    assert [(why.cause, why.count) for why in fault.because] == [(Cause.RUN_ENDS, 9)]
     assert tick(again, whole(again)).task["run"] == "good"
     assert store.paths.good_spec.read_text() == "good"
 
@@ -96,7 +99,7 @@ def test_damaged_memory_tries_again_and_breaks_nothing(store):
         store.paths.trial.write_bytes(garbage)
         assert run(store) == "bad"
         assert store.trial() == Trial()
-    store.write_trial(Trial(store.applied(), 1.0, "it broke"))
+    store.write_trial(Trial(store.applied(), 1.0, Reason(Cause.ERROR)))
     assert run(store) == "good"
     store.paths.good_spec.unlink()
     assert run(store) == "bad", "nothing to go back to"
@@ -108,7 +111,7 @@ def test_nothing_is_judged_while_the_cloud_cannot_be_reached(store):
     world = broken(store)
     observed = replace(world.observed, machines=None)
     spec, trial = Updating(store).look(UID, observed, world.history)
-    assert (spec.task["run"], trial.fault) == ("bad", "")
+    assert (spec.task["run"], trial.fault) == ("bad", None)
     assert isinstance(observed, Observed)
 
 
@@ -126,7 +129,7 @@ def test_an_update_begins_when_the_manager_first_sees_it(store):
     tick(store, whole(store))
     store.paths.spec.write_text("next")
     failures = [
-        Event(NOW - 9 + n, kind, 1, n + 2, "east/one/a", "error: boom")
+        Event(NOW - 9 + n, kind, 1, n + 2, "east/one/a", Reason(Cause.ERROR))
         for n in range(3)
         for kind in (EventKind.LAUNCH, EventKind.REFUSED)
     ]
@@ -175,5 +178,7 @@ def test_answers_that_say_no_end_an_update_and_bring_the_good_file_back(store):
     world = replace(World(store.spec()).having(old, new), links=report.links)
     tick(store, world)
     assert run(store) == "good"
-    trial = store.trial()
-    assert trial.fault == "20 of 20 requests to the new version failed, 0 of 20 to the old one"
+    fault = store.trial().fault
+    assert fault is not None
+    assert fault.cause is Cause.MORE_ERRORS
+    assert [(one.count, one.of) for one in fault.because] == [(20, 20), (0, 20)]

@@ -19,6 +19,7 @@ from typing import Any
 from fogft.cloud.port import Launch
 from fogft.cloud.sky.adapter import SkyCloud
 from fogft.errors import CloudUnreachable
+from fogft.model.reason import Cause
 from fogft.model.replica import Machine, MachinePhase, Offer, ReplicaId
 from tests.sky.emulated_aws.emulation import Steps, control, running, until
 from tests.sky.emulated_aws.pool import kill_server
@@ -137,7 +138,8 @@ class Proof:
             until("c has failed", lambda: self.phase(c) is MachinePhase.FAILED)
         machine = self.machine(c)
         assert machine is not None
-        assert machine.failure.startswith("capacity: "), machine.failure
+        assert machine.failure is not None
+        assert machine.failure.cause is Cause.CAPACITY, machine.failure
         self.cloud.terminate(c)
         with step("a launch whose set-up fails, until its VM is gone"):
             d = self.launch(0, 3, "eu-west-1", setup="echo no such package: yolo; exit 3")
@@ -145,8 +147,9 @@ class Proof:
             until("d's VM is gone", lambda: len(running()) == 1)
         machine = self.machine(d)
         assert machine is not None
-        assert machine.failure.startswith("setup: "), machine.failure
-        assert "yolo" in machine.failure, machine.failure
+        assert machine.failure is not None
+        assert machine.failure.cause is Cause.SETUP, machine.failure
+        assert "yolo" in machine.failure.words, machine.failure
         self.cloud.terminate(d)
         for region in ("us-east-1", "us-west-2"):
             control(f"/capacity?place={region}&has=1")

@@ -144,7 +144,11 @@ class Proof:
                    ("launch_ordered", ""))  # fmt: skip
         with step("... its region has no capacity left: until whole again, elsewhere"):
             self.whole(2)
-        failed = [e for e in self.pool.status()["events"] if e["detail"].startswith("capacity")]
+        failed = [
+            e
+            for e in self.pool.status()["events"]
+            if (e["reason"] or {}).get("cause") == "capacity"
+        ]
         assert failed
         regions = {region_of(r) for r in self.pool.replicas().values()}
         assert regions == {"us-west-2", "eu-west-1"}

@@ -16,7 +16,7 @@ from collections.abc import Collection
 
 from fogft.link import frame
 from fogft.link.frame import Greeting
-from fogft.model.certificate_holder import Holder, Role, holder_of
+from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.refusal import Refusal
 from fogft.records.record import RecordError, Verify
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model import names
-from fogft.model.certificate_holder import GENERATION_LIMIT, NAME_PATTERN, Holder, Role, holder_of
+from fogft.model.credentials import GENERATION_LIMIT, NAME_PATTERN, Holder, Role, holder_of
 from fogft.model.replica import ReplicaId
 
 UID, OTHER = "0123456789abcdef", "f" * 16

@@ -1,0 +1,194 @@
+"""Why something happened or waits: a cause, and what it refers to.
+
+Decisions compare causes. Words are made of a reason where people read it, by `reason_words`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from enum import Enum
+from typing import Any
+
+
+class Cause(str, Enum):
+    """What a reason says. The values stand in files and in JSON, and do not change."""
+
+    # A launch was refused or has failed.
+    CAPACITY = "capacity"  # full now: another place, or another time
+    QUOTA = "quota"  # the account may not have more: waiting does not help
+    CREDENTIALS = "credentials"  # expired, wrong, or without a permission
+    SETUP = "setup"  # the pool file's `setup` failed: every place would do the same
+    TIMEOUT = "timeout"  # it took too long
+    ERROR = "error"
+    NOT_RUNNING = "not_running"  # of a timeout: what did not come
+    NOT_READY = "not_ready"
+
+    # What is wrong with a replica.
+    NOTICE = "preemption_notice"
+    DRAINS_ITSELF = "drains_itself"
+    SILENT = "silent"
+    DISAGREES = "disagrees"
+    AT_RISK = "at_risk"
+    SERVICE_AWAY = "service_away"
+
+    # Why a working replica is replaced.
+    DRAINED = "drained"
+    EXCLUDED = "excluded"
+    NO_GROUP = "no_group"
+    OUTDATED = "outdated"
+    SUPERSEDED = "superseded"
+    BETTER_SPREAD = "better_spread"
+    BETTER_SCORE = "better_score"
+    SPOT_AGAIN = "spot_again"  # it moves to the market that is meant for it
+    ON_DEMAND_AGAIN = "on_demand_again"
+
+    # Why a replica ends now.
+    DOWN = "down"
+    MAX_HOURS = "max_hours"
+    NOT_WANTED = "not_wanted"
+    REPLACED = "replaced"
+    REPLACED_FIRST = "replaced_first"  # before its successor exists
+    ENOUGH_SPOT = "enough_spot"
+    BUDGET_FULL = "budget_full"  # it blocks its own replacement
+
+    # Why one is launched.
+    REPLACES = "replaces"
+    FOLLOWS = "follows"
+    NEW_SLOT = "new_slot"
+    STANDS_IN = "stands_in"  # on demand, until enough spot machines are ready
+    FAILED_LONGEST_AGO = "failed_longest_ago"
+
+    # Why nothing is bought, or not this offer.
+    NOTHING_OFFERED = "nothing_offered"
+    IMPOSSIBLE_PRICE = "impossible_price"
+    LOCATION_FULL = "location_full"  # it would hold too many of the replicas
+    ALL_EXCLUDED = "all_excluded"
+    BACKING_OFF = "backing_off"
+    ALL_BACKING_OFF = "all_backing_off"
+    OVER_BUDGET = "over_budget"
+    SURGE_FULL = "surge_full"
+    WAITS = "waits"
+    NO_ROOM_TO_UPDATE = "no_room_to_update"
+    OLD_BEFORE_NEW = "old_before_new"
+    OTHER_KIND = "other_kind"
+    OTHER_MARKET = "other_market"
+    LOST_THERE = "lost_there"
+    CROWDED = "crowded"
+    WORSE_SCORE = "worse_score"
+    CHOSEN = "chosen"  # of a worse score: what was chosen in its place
+
+    # How many are wanted.
+    SCHEDULED_AHEAD = "scheduled_ahead"
+    TARGET_UNMET = "target_unmet"
+    MOST_REPLICAS = "most_replicas"
+    OVER_CAP = "over_cap"
+
+    # An update.
+    UPDATING = "updating"
+    UPDATE_STOPPED = "update_stopped"
+    ROLLED_BACK = "rolled_back"
+    REPLICA_FAILS = "replica_fails"
+    TYPES_DIFFER = "types_differ"
+    RUN_ENDS = "run_ends"
+    MORE_ERRORS = "more_errors"
+    REQUESTS_FAILED = "requests_failed"
+    LAUNCHES_FAIL = "launches_fail"
+
+    # What the manager cannot see or do.
+    CLOUD_UNREACHABLE = "cloud_unreachable"
+    NO_ANSWER = "no_answer"
+    NO_PRICES = "no_prices"
+    UPLINK_SUSPECTED = "uplink_suspected"
+    NOBODY_HEARD = "nobody_heard"
+    STOPPING = "stopping"
+    ENDS_SOON = "ends_soon"
+    CLOCK_SET = "clock_set"
+    CLOCK_DOUBTED = "clock_doubted"
+    SLEPT = "slept"
+    NO_MANAGER = "no_manager"
+    NO_PROXY_REPORT = "no_proxy_report"
+    STALE_PROXY_REPORT = "stale_proxy_report"
+    PROXY_KEEPS_ENDING = "proxy_keeps_ending"
+    NO_CERTIFICATE = "no_certificate"
+    NOT_OFFERED = "not_offered"
+    TROUBLE = "trouble"  # an error, in its own words
+
+
+@dataclass(frozen=True)
+class Reason:
+    """A cause with its data. What does not belong to the cause keeps its default.
+
+    Attributes:
+        slot: Of the pool.
+        replica: ``slot.generation``.
+        location: ``cloud``, ``cloud/region`` or ``cloud/region/zone``.
+        name: Of a service, a gateway or a file.
+        seconds: How long, or until when.
+        count: How many, `of` so many.
+        share: Of one, such as a gain or an availability; `target` is what it is held against.
+        usd_per_hour: A price; `limit_usd_per_hour` is what it is held against.
+        words: What somebody else says: a cloud, a program, an error. Shown, never read.
+        because: What led to it, the main reason first.
+    """
+
+    cause: Cause
+    slot: int | None = None
+    replica: str = ""
+    location: str = ""
+    name: str = ""
+    seconds: float | None = None
+    count: int | None = None
+    of: int | None = None
+    share: float | None = None
+    target: float | None = None
+    usd_per_hour: float | None = None
+    limit_usd_per_hour: float | None = None
+    words: str = ""
+    because: tuple[Reason, ...] = ()
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return its JSON form: the cause and the data that it has."""
+        out: dict[str, Any] = {"cause": self.cause.value}
+        for name in _DATA:
+            value = getattr(self, name)
+            if value not in (None, "", ()):
+                out[name] = value
+        if self.because:
+            out["because"] = [one.to_plain() for one in self.because]
+        return out
+
+    @classmethod
+    def from_plain(cls, raw: Mapping[str, Any]) -> Reason:
+        """Read the JSON form.
+
+        Raises:
+            ValueError: It is none.
+        """
+        try:
+            because = tuple(cls.from_plain(one) for one in raw.get("because", ()))
+            return cls(**{**raw, "cause": Cause(raw["cause"]), "because": because})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"not a reason: {error!r}") from error
+
+    @property
+    def place_at_fault(self) -> bool:
+        """Whether it speaks against the place: a replacement goes elsewhere."""
+        return self.cause not in _NOT_THE_PLACE
+
+    @property
+    def is_move(self) -> bool:
+        """Whether a replica that is well moves to a better place."""
+        return self.cause in _MOVES
+
+
+_DATA = [field.name for field in fields(Reason) if field.name not in ("cause", "because")]
+_MOVES = frozenset(
+    {Cause.BETTER_SPREAD, Cause.BETTER_SCORE, Cause.SPOT_AGAIN, Cause.ON_DEMAND_AGAIN}
+)
+_NOT_THE_PLACE = _MOVES | {Cause.OUTDATED}
+
+
+def because(reason: Reason | None) -> tuple[Reason, ...]:
+    """Return what `Reason.because` takes for a reason that may be missing."""
+    return () if reason is None else (reason,)
