@@ -75,7 +75,7 @@ class Explanation:
         wanted: Replicas wanted now.
         cap: US dollars per hour; None for none.
         assumed: What the availability rests on.
-        expected: Of each service, by the replicas that carry it.
+        expected: Of each service, by the replicas that carry it; ``*`` for all where `run` tells.
         cost: Of the planned replicas.
         single: The cheapest on-demand machine that would do alone, and its cost; None where
             no price is known.
@@ -159,7 +159,9 @@ def explain(
         expected={
             service.name: expected([o.placement for o, has in carried if service in has], assumed)
             for service in spec.services
-        },
+        }
+        # What `run` advertises is not known before it runs: all replicas carry all of it.
+        or {"*": expected([o.placement for o, _ in carried], assumed)},
         target=spec.availability.target if spec.availability else None,
         cost=cost(carried),
         single=None if cheapest is None else (cheapest, _alone(cheapest, spec.services)),

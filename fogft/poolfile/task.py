@@ -6,6 +6,7 @@ Not here: what stands in SkyPilot's own keys (SkyPilot judges that).
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import removed
@@ -67,6 +68,28 @@ def check_task(top: Section) -> None:
         top.text("setup", "write the commands that install what `run` needs, or remove it")
     if top.has("envs"):
         _envs(top.section("envs"))
+    if top.has("workdir"):
+        _workdir(top)
+    if top.has("resources"):
+        _spot(top.section("resources"))
+
+
+def _workdir(top: Section) -> None:
+    written = top.children["workdir"].value
+    if isinstance(written, str) or (isinstance(written, Mapping) and "url" in written):
+        return
+    what = f"must be a folder or a repository, not {shown(plain(top.children['workdir']))}"
+    raise top.error("workdir", what, "write `workdir: .`, or `workdir: {url: ..., ref: ...}`")
+
+
+def _spot(resources: Section) -> None:
+    """SkyPilot would take what is no truth value for one."""
+    for key in ("any_of", "ordered"):
+        if resources.has(key):
+            for one in resources.sections(key, "write a list of maps"):
+                _spot(one)
+    if resources.has("use_spot"):
+        resources.flag("use_spot", False)
 
 
 def _envs(envs: Section) -> None:

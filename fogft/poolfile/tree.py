@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 from fogft.errors import SpecError
 
+SMALLEST = 1e-12  # of a number above 0: a smaller one is a slip of the pen
 Choice = TypeVar("Choice", bound=Enum)
 
 
@@ -195,6 +196,8 @@ class Section:
             raise self.error(key, f"must be a number, not {_got(node)}", hint)
         if not math.isfinite(node.value):
             raise self.error(key, f"must be finite, not {shown(node.value)}", hint)
+        if 0 < node.value < SMALLEST:
+            raise self.error(key, f"is too small: {shown(node.value)}", hint)
         if not 0 <= node.value <= high or not (node.value or zero):
             raise self.error(key, f"must be {limits}, not {shown(node.value)}", hint)
         return float(node.value)

@@ -281,3 +281,15 @@ def test_distances_are_estimated_where_nothing_can_be_measured(pool, tmp_path, c
     offers = {o["region"]: o for o in json.loads(capsys.readouterr().out)["offers"]}
     assert [offers[r]["rtt_source"] for r in regions] == ["estimated", "pool file", "estimated"]
     assert offers["us-west-1"]["rtt_s"] < 0.03 < 0.1 < offers["eu-central-1"]["rtt_s"] < 0.3
+
+
+def test_a_pool_whose_services_run_tells_is_planned(pool, capsys):
+    """Without `services` all replicas carry whatever `run` advertises."""
+    pool.write_text(
+        "name: told\nresources: {any_of: [{infra: local/us-west-1}]}\n"
+        "run: exec true\nfogft: {replicas: 2}\n"
+    )
+    assert main.run(["plan", str(pool)]) == 0
+    assert "availability  0.99" in capsys.readouterr().out
+    assert main.run(["plan", str(pool), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)

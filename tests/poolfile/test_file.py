@@ -254,6 +254,21 @@ MISTAKES = {
         "pool.yaml:1: resources: must be a map of keys, not a list",
         "write `key: value` lines here",
     ),
+    "map without a repository for workdir": (
+        pool(top="workdir: {x: {y: 1}}"),
+        "pool.yaml:1: workdir: must be a folder or a repository, not `{'x': {'y': 1}}`",
+        "write `workdir: .`, or `workdir: {url: ..., ref: ...}`",
+    ),
+    "list for use_spot": (
+        pool(top="resources: {any_of: [{infra: aws}, {infra: gcp, use_spot: []}]}"),
+        "pool.yaml:1: resources.any_of[1].use_spot: must be true or false, not a list",
+        "write `use_spot: true` or `use_spot: false`",
+    ),
+    "time-out that is next to nothing": (
+        pool(services="[{name: a, type: a/srv/A, timeout_s: 1.0e-320}]"),
+        "pool.yaml:3: fogft.services[0].timeout_s: is too small: `1e-320`",
+        "write a number of seconds above 0 and at most 86400, such as `timeout_s: 2.5`",
+    ),
     "list for run": (
         "run: [a, b]\nfogft: {services: [{name: a, type: a/srv/A}]}\n",
         "pool.yaml:1: run: must be text, not a list",
