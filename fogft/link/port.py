@@ -159,7 +159,11 @@ class Peer:
 
 @dataclass(frozen=True)
 class LinkStatus:
-    """A snapshot of a link. Durations in seconds."""
+    """A snapshot of a link. Durations in seconds.
+
+    Attributes:
+        uplinks: How each uplink does, where there are several, for people.
+    """
 
     state: LinkState
     probe_answer: ProbeAnswer | None
@@ -170,6 +174,7 @@ class LinkStatus:
     in_flight_bytes: int
     reopened: int
     detail: str
+    uplinks: tuple[Mapping[str, Any], ...] = ()
 
 
 class Link(Protocol):

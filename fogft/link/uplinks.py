@@ -167,6 +167,7 @@ class UplinksLink:
             in_flight=sum(status.in_flight for status in found),
             in_flight_bytes=sum(status.in_flight_bytes for status in found),
             reopened=sum(status.reopened for status in found),
+            uplinks=tuple(self.uplinks()),
         )
 
     def uplinks(self) -> list[dict[str, Any]]:

@@ -11,6 +11,7 @@ import bisect
 import threading
 from collections import deque
 from collections.abc import Mapping
+from enum import Enum
 from types import MappingProxyType
 from typing import Any
 
@@ -25,6 +26,17 @@ OUTCOMES_COUNTED = (
     *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
     *("request_bytes", "response_bytes"),
 )
+
+
+class Outcome(str, Enum):
+    """How a request ended."""
+
+    ANSWERED = "answered"  # by a replica
+    FALLBACK = "fallback"  # by the fallback service
+    EMPTY = "empty"  # with the default response
+    SILENT = "silent"  # with none
+    TURNED_AWAY = "turned_away"  # it was not taken
+    CANCELLED = "cancelled"  # its caller took it back
 
 
 class Outcomes:
@@ -71,7 +83,7 @@ class Outcomes:
     def note(
         self,
         request: bytes,
-        outcome: str,
+        outcome: Outcome,
         *,
         took_s: float,
         asked: Mapping[int, float] = MappingProxyType({}),
@@ -82,7 +94,7 @@ class Outcomes:
 
         Args:
             request: Its id.
-            outcome: One of `count`'s.
+            outcome: How it ended.
             took_s: Since it arrived, in seconds.
             asked: Who was asked for it, and when after its arrival.
             refused: Who refused it, and why the last time.
@@ -92,7 +104,7 @@ class Outcomes:
             self.trace.append(
                 {
                     "request": request.hex(),
-                    "outcome": outcome,
+                    "outcome": outcome.value,
                     "replica": replica,
                     "took_s": round(took_s, 6),
                     "asked": {_short(key): round(after_s, 6) for key, after_s in asked.items()},
@@ -117,6 +129,11 @@ class Outcomes:
     def failed(self, replica: ReplicaId) -> None:
         """Count a request that came to nothing at a replica, by the fault of its service."""
         self._ill[replica] = self._ill.get(replica, 0) + 1
+
+    def rejected(self, replica: ReplicaId) -> None:
+        """Count a response that was real, but not ok."""
+        self.count["rejected"] += 1
+        self.failed(replica)
 
     def by(self, replica: ReplicaId) -> tuple[int, int]:
         """Return how many requests a replica has answered well, and how many failed there."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fogft.ordering.active_version import Office
+from fogft.ordering.active_version import ActiveVersion
 from fogft.ordering.orders import START, Op, Position
 from fogft.ordering.peer import Order, Peer, Phase
 from fogft.ordering.term import OrderedTerm
@@ -21,10 +21,10 @@ from fogft.ordering.term import OrderedTerm
 
 @dataclass(frozen=True)
 class Handover:
-    """From what a term begins in which another version takes office.
+    """From what a term begins in which another version becomes active.
 
     Attributes:
-        version: The one that takes it.
+        version: The one that becomes active.
         at: The state that it takes over: every number given before has been applied there.
         state: Its bytes.
     """
@@ -57,7 +57,7 @@ class Sequencer(OrderedTerm):
         log_bytes: int = 64 << 20,
     ) -> None:
         super().__init__(epoch, mark=mark, log_entries=log_entries, log_bytes=log_bytes)
-        self.office = Office(begin.version if begin else holder)
+        self.active = ActiveVersion(begin.version if begin else holder)
         self.handover: Handover | None = None  # this term's end: the next begins from it
         self._begin = begin
         self._change_to: str | None = None  # no number is given meanwhile
@@ -85,7 +85,7 @@ class Sequencer(OrderedTerm):
         self._unanswered.pop(index, None)
 
     def _counts(self, replica: int) -> bool:
-        return self.office.believes(self._version(replica))
+        return self.active.counts(self._version(replica))
 
     def _applied(self, replica: int, index: int, payload: bytes) -> bool:
         first = index in self._unanswered and self._counts(replica)
@@ -109,9 +109,9 @@ class Sequencer(OrderedTerm):
         promise = peer.promise
         if promise is None or not promise.sound or promise.position < self.mark:
             return
-        if not self.office.may_lead(self._version(replica)):
+        if not self.active.may_lead(self._version(replica)):
             return
-        self.office.holder = self._version(replica)
+        self.active.version = self._version(replica)
         self._begin_at(promise.position)
         self._bring_all()
 
@@ -129,21 +129,21 @@ class Sequencer(OrderedTerm):
     # -- versions -------------------------------------------------------------------------
 
     def _govern(self, now: float) -> None:
-        """Have a version take over: by a handover, or because nobody is left in office."""
+        """Have a version take over: by a handover, or because the active one is gone."""
         joined = self.joined
         standing = [self._version(r) for r in joined]
-        self.office.look(standing, now)
+        self.active.look(standing, now)
         if self.base is None:
             self._find_base()
-        elif (heir := self.office.successor(standing)) is not None:
-            self.office.holder = heir
+        elif (heir := self.active.successor(standing)) is not None:
+            self.active.version = heir
             self._change_to = None
             for replica in joined:
                 if self._counts(replica):
                     self._recall(replica, self._peers[replica].next)
         elif self.handover is None:
             staying = [self._version(r) for r in joined if r not in self._leaving]
-            self._change_to = self.office.wish(staying)
+            self._change_to = self.active.wanted(staying)
             self._prepare_handover(now)
 
     def _prepare_handover(self, now: float) -> None:

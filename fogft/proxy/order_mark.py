@@ -18,13 +18,13 @@ from fogft.ordering import orders
 from fogft.ordering.orders import Position
 
 _MAGIC = int.from_bytes(b"fogmark1", "little")
-# magic, the pool's uid, the term, the mark's epoch, the mark's index, the version in office
+# magic, the pool's uid, the term, the mark's epoch, the mark's index, the active version
 _WORDS = 6
 _TERM, _EPOCH, _INDEX, _HOLDER = 2, 3, 4, 5
 _VERSION = re.compile(r"[0-9a-f]{16}")
 
 
-class MarkFile:
+class OrderMark:
     """The mark of one stateful service on one robot.
 
     Args:
@@ -86,7 +86,7 @@ class MarkFile:
         if self._words[_EPOCH] != position.epoch:
             self._words[_EPOCH] = position.epoch
         self._words[_INDEX] = position.index
-        if version != self._version:  # last: who is in office has a state up to the index
+        if version != self._version:  # last: the active one has a state up to the index
             self._version = version
             self._words[_HOLDER] = int(version, 16) if _VERSION.fullmatch(version) else 0
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from fogft.requests.hedging import NEVER
+from fogft.requests.choose import NEVER
 from fogft.requests.latency import Latencies
 from fogft.requests.token_bucket import TokenBucket
 
@@ -73,7 +73,7 @@ class _Replica:
 
 
 class Adaptive:
-    """The policy `adaptive`; see `hedging.Hedging`.
+    """The policy `adaptive`; see `choose.Choose`.
 
     Args:
         budget: Extra copies that are allowed, as a share of requests.
@@ -240,20 +240,19 @@ class Adaptive:
         if answered:
             self._heard(known, now - begun, now)
 
-    def stopped(self, request: bytes, open: Mapping[int, float], now: float) -> None:
-        """Learn that these would have taken longer than until now."""
+    def stopped(
+        self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
+    ) -> None:
+        """Learn that these would have taken longer than until now.
+
+        At a deadline, who has answered nothing else meanwhile is doubted.
+        """
         for replica, begun in open.items():
             self._probes.pop((request, replica), None)
             known = self._of(replica)
             known.ended()
             self._overtaken(known, now - begun, now)
-
-    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
-        """Learn the same, and doubt who has answered nothing else meanwhile."""
-        self.stopped(request, open, now)
-        for replica, begun in open.items():
-            known = self._of(replica)
-            known.doubted = known.doubted or known.answered_at < begun
+            known.doubted = known.doubted or (expired and known.answered_at < begun)
 
     def report(self) -> dict[str, Any]:
         """Return counts, the budget, and each replica's estimate by ``slot.generation``."""

@@ -7,7 +7,7 @@ the replicas are out, and the fallback's answer is awaited for its own time.
 
 Law: a request is handed to the fallback at most once, and ends exactly once.
 
-Owns: which requests are due. Not here: calling (`proxy.robot.dispatcher`), the replicas' answers.
+Owns: which requests are due. Not here: calling (`proxy.robot.delivery`), the replicas' answers.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from collections.abc import Iterator
 from typing import Generic, TypeVar
 
 from fogft.model.choices import FallbackSpec
-from fogft.requests.hedging import NEVER
+from fogft.requests.choose import NEVER
 
 T = TypeVar("T")
 
 
-class Rescues(Generic[T]):
+class FallbackTimer(Generic[T]):
     """The requests of one service that the fallback may have to answer."""
 
     def __init__(self, spec: FallbackSpec) -> None:

@@ -13,7 +13,8 @@ A replica that declined a request, failed it or came after it may be asked (agai
 others work on it, because those others may be frozen. Whether it is, is the policy's to say.
 
 Owns: which answer is returned, who may be asked, and when a request has nobody working on it.
-Not here: whom to ask (`hedging`), sending, locks and clocks (`fogft.proxy.robot.dispatcher`).
+Not here: what an answer means (`decide`), who is asked (`choose`), sending, locks and clocks
+(`fogft.proxy.robot.dispatcher`).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import random
 
 import pytest
 
-from fogft.ordering.active_version import VACANCY_S, Office
+from fogft.ordering.active_version import VACANCY_S, ActiveVersion
 from fogft.ordering.sequencer import Sequencer
 from tests.linearizability import counter
 from tests.nightly import by_day
@@ -61,7 +61,7 @@ class Versions(World):
 
     def new_term(self) -> Sequencer:
         super().new_term()
-        self.sequencer.office = Office(self.holder)
+        self.sequencer.active = ActiveVersion(self.holder)
         return self.sequencer
 
     def tick(self, seconds: float = 0.1) -> None:
@@ -82,7 +82,7 @@ class Versions(World):
         return self.hosts[replica].machine.current
 
     def calm(self, limit: int = 4000) -> None:
-        """Let everything come to rest that can, with the office where it belongs."""
+        """Let everything come to rest that can, with the right version active."""
         for _ in range(limit):
             self.now += 0.001
             working = [r for r, host in self.hosts.items() if host.work is not None]
@@ -114,7 +114,7 @@ def update(world: Versions, source: random.Random, to: str, *, kills: bool = Fal
             drive(world, source, ask_counter, 40, faults=0.0)
             world.tick(0.1)
             stay = [world.version_of[r] for r in world.hosts if r not in world.leaving]
-            if 2 * stay.count(to) <= len(stay) or world.sequencer.office.holder == to:
+            if 2 * stay.count(to) <= len(stay) or world.sequencer.active.version == to:
                 break
         world.remove_replica(old)
         drive(world, source, ask_counter, 60, faults=0.0)
@@ -167,7 +167,7 @@ def test_a_rollback_goes_on_from_the_new_versions_state(seed):
 
 @pytest.mark.parametrize("seed", range(by_day(8, at_night=200)))
 def test_a_killed_proxy_never_lets_the_old_version_answer_after_the_new_one(seed):
-    """Its successor knows who was in office, and begins from nobody else's state."""
+    """Its successor knows which version was active, and begins from nobody else's state."""
     source = random.Random(seed)
     world = Versions(1 + seed % 3)
     drive(world, source, ask_counter, 100, faults=0.0)
@@ -180,8 +180,8 @@ def test_a_killed_proxy_never_lets_the_old_version_answer_after_the_new_one(seed
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_who_stands_by_takes_an_office_that_was_left(seed):
-    """All of the version in office are lost at once: the other one goes on, nothing is lost."""
+def test_who_stands_by_follows_a_version_that_is_gone(seed):
+    """All of the active version are lost at once: the other one goes on, nothing is lost."""
     source = random.Random(seed)
     world = Versions(2)
     drive(world, source, ask_counter, 100, faults=0.0)
@@ -231,19 +231,19 @@ def test_a_version_that_stands_by_is_never_believed():
         ("b", ["b", "a", "a"], "a"),
     ],
 )
-def test_an_office_goes_to_the_most_that_stay(holder, staying, wish):
+def test_the_version_of_most_that_stay_becomes_active(holder, staying, wish):
     """Equal numbers change nothing: so it does not go back and forth."""
-    assert Office(holder).wish(staying) == wish
+    assert ActiveVersion(holder).wanted(staying) == wish
 
 
-def test_an_office_is_left_only_after_a_while():
+def test_a_version_is_gone_only_after_a_while():
     """A link that comes up a little later than another decides nothing."""
-    office = Office("a")
-    office.look(["b"], 0.0)
-    office.look(["b"], VACANCY_S - 0.1)
-    assert (office.successor(["b"]), office.may_lead("b")) == (None, False)
-    office.look(["b", "a"], VACANCY_S)
-    office.look(["b"], VACANCY_S + 1)
-    assert office.successor(["b"]) is None
-    office.look(["b"], 3 * VACANCY_S)
-    assert (office.successor(["b"]), office.may_lead("b")) == ("b", True)
+    active = ActiveVersion("a")
+    active.look(["b"], 0.0)
+    active.look(["b"], VACANCY_S - 0.1)
+    assert (active.successor(["b"]), active.may_lead("b")) == (None, False)
+    active.look(["b", "a"], VACANCY_S)
+    active.look(["b"], VACANCY_S + 1)
+    assert active.successor(["b"]) is None
+    active.look(["b"], 3 * VACANCY_S)
+    assert (active.successor(["b"]), active.may_lead("b")) == ("b", True)

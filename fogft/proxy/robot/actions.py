@@ -4,8 +4,9 @@ The goal that a client makes goes to every replica, and to those that come while
 way: a goal outlives the replicas that it was given to. The first that succeeds is the result;
 the others are then told to cancel. What a client cancels is cancelled everywhere.
 
-Owns: how goals and results differ from plain services (`dispatcher`). Not here: cancelling
-(`action_cancel`), feedback and status (`topics`).
+Owns: what decides for the three services, and what replicas must have of them.
+Not here: a request's life (`dispatcher`), what a goal is (`fogft.topics.goals`), feedback and
+status (`topics`).
 """
 
 from __future__ import annotations
@@ -13,175 +14,342 @@ from __future__ import annotations
 import logging
 import math
 import os
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from fogft.link.port import Answer, Link
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Effect, Refusal
-from fogft.model.replica import ReplicaId
 from fogft.model.spec import Part, ServiceSpec
-from fogft.proxy.robot.action_cancel import CancelDispatcher
-from fogft.proxy.robot.action_part import PartDispatcher, ReachingAll, Shared
-from fogft.proxy.robot.dispatcher import key_of
-from fogft.proxy.robot.request import Request
+from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.replication import Send
+from fogft.requests.decide import Accepts, Judgement, Means
+from fogft.requests.first_response import Pending
 from fogft.topics import goals
-from fogft.topics.goals import Had, Took
+from fogft.topics.goals import Goals, Had
 
 log = logging.getLogger(__name__)
 
+_CANCELS_KEPT = 4096
+_CANCEL_FOR_S = 60.0  # a replica may be away for a moment
+_CANCEL_TIMEOUT_S = 10.0
+_CANCEL_AGAIN_S = 0.25
 
-class GoalDispatcher(ReachingAll):
+
+@dataclass(frozen=True)
+class _ToCancel:
+    """That a replica is to be told to cancel a goal: from when, and until when it is tried."""
+
+    goal: bytes
+    replica: int
+    at: float
+    until: float
+
+
+class _Action:
+    """What the three services of one action share, under a lock that is taken last.
+
+    Attributes:
+        goals: Its goals.
+        to_cancel: Who is to be told.
+        replicas: Who can be given goals.
+        began: Called, without the lock, with a goal and a replica that has taken it.
+    """
+
+    def __init__(self, clock: Callable[[], float], wake: Callable[[], None]) -> None:
+        self.lock = threading.Lock()
+        self.clock = clock
+        self.wake = wake
+        self.goals = Goals()
+        self.to_cancel: deque[_ToCancel] = deque(maxlen=_CANCELS_KEPT)
+        self.replicas: Collection[int] = ()
+        self.began: Callable[[bytes, int], None] = lambda goal, replica: None
+
+    def cancel(self, goal: bytes, replicas: Iterable[int], now: float) -> None:
+        """Have replicas told to cancel a goal. Under the lock."""
+        until = now + _CANCEL_FOR_S
+        self.to_cancel += [_ToCancel(goal, replica, now, until) for replica in replicas]
+        self.wake()
+
+
+class _GoalPart:
     """`send_goal`: until a goal has its result, each replica is given it that does not have it."""
 
-    def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
-        """Take a client's goal, and note who is given it."""
-        goal, until = goals.goal_of(payload), self._clock() + timeout_s
-        with self.shared.lock:
-            self.shared.goals.made(payload, request, tuple(self._links), until)
-        taken = super().forward(request, payload, handle, timeout_s)
-        if not taken:
-            self._is_over(goal)
-        return taken
+    sends_requests = False
+    ready = True
+    flagged: Collection[int] = ()
 
-    def _declined(self, request: bytes, replica: int) -> None:
-        with self.shared.lock:
-            self.shared.goals.failed(request, replica, self._clock())
-        super()._declined(request, replica)
+    def __init__(self, action: _Action, name: str) -> None:
+        self.accepts: Accepts | None = partial(goals.is_success, Part.GOAL)
+        self._action = action
+        self._name = name
 
-    def answered(self, link: Link, answer: Answer) -> None:
-        """Take the end of an attempt; remember who has the goal."""
-        replica = key_of(link)
-        took = self._took(answer, replica)  # before its client can know, and ask for the result
-        if took is not None and took.goal is not None:
-            if not took.in_vain:
-                self.shared.began(took.goal, replica)
-            else:
-                with self.shared.lock:
-                    self.shared.cancel(took.goal, (replica,), self._clock())
-                self._wake()
-        super().answered(link, answer)
+    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+        """Note a goal, and who is given it."""
+        with self._action.lock:
+            self._action.goals.made(pending.item.payload, request, able, pending.deadline)
 
-    def _took(self, answer: Answer, replica: int) -> Took | None:
-        id, payload, now = answer.request_id, answer.payload, self._clock()
-        with self.shared.lock:
-            if payload is None and answer.refusal is not Refusal.MALFORMED:
-                self.shared.goals.failed(id, replica, now)
-                return None
-            accepts = payload is not None and goals.is_success(Part.GOAL, payload)
-            return self.shared.goals.took(id, replica, now, accepts=accepts)
+    def read(self, payload: bytes) -> bool:
+        """Return whether it was accepted."""
+        return goals.is_success(Part.GOAL, payload)
 
-    def _is_over(self, goal: bytes) -> None:
+    def judge(
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+    ) -> Judgement:
+        """Remember who has the goal: before its client can know, and ask for the result."""
+        self._took(id, replica, accepts=reading)
+        return Means.SUCCESS if reading else Means.REJECTION
+
+    def _took(self, id: bytes, replica: int, *, accepts: bool) -> None:
+        action, now = self._action, self._action.clock()
+        with action.lock:
+            took = action.goals.took(id, replica, now, accepts=accepts)
+            if took.goal is not None and took.in_vain:
+                action.cancel(took.goal, (replica,), now)
+        if took.goal is not None and not took.in_vain:
+            action.began(took.goal, replica)
+
+    def refused(
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+    ) -> None:
+        """A replica did not look at a goal, or cannot read it."""
+        if refusal is Refusal.MALFORMED:
+            self._took(id, replica, accepts=False)
+        else:
+            self.declined(id, replica, self._action.clock())
+
+    def closed(self, request: bytes, pending: Pending[Any]) -> None:
         """Nobody was asked, or has answered: unless it was accepted, the goal is over, too."""
-        with self.shared.lock:
-            if goal not in self.shared.goals:
-                self.shared.goals.ended(goal)
+        goal = goals.goal_of(pending.item.payload)
+        with self._action.lock:
+            if goal not in self._action.goals:
+                self._action.goals.ended(goal)
 
-    def route(self, links: Sequence[Link]) -> None:
-        """Give replicas that have come the goals that are under way."""
-        before, after = dict(self._links), {key_of(link): link for link in links}
-        come = [replica for replica, link in after.items() if before.get(replica) is not link]
-        with self.shared.lock:
-            for replica in before.keys() - after.keys():
-                self.shared.goals.left(replica)
-            for goal in self.shared.goals.unwanted():  # it may have missed that
-                self.shared.cancel(goal, come, self._clock())
-        super().route(links)
-        self._catch_up()
+    def hears_out(self, request: bytes) -> bool:
+        """All replicas shall have the goal, whoever was first."""
+        return True
 
-    def tick(self) -> float:
-        """Also give each replica the goals that it lacks."""
-        self._catch_up()
-        return super().tick()
+    def report(self) -> dict[str, Any]:
+        """Return how many goals are known."""
+        return {"goals": self._action.goals.kept}
 
-    def _catch_up(self) -> None:
-        now = self._clock()
-        for replica, link in tuple(self._links.items()):
-            with self.shared.lock:
-                lacking = self.shared.goals.lacking(replica, now)
-            for payload in lacking:
-                self._give(replica, link, payload)
+    # -- what replicas must have ----------------------------------------------------------
 
-    def _give(self, replica: int, link: Link, payload: bytes) -> None:
-        id, timeout_s = os.urandom(REQUEST_ID_BYTES), self.spec.timeout_s
-        goal, now = goals.goal_of(payload), self._clock()
-        with self.shared.lock:
-            self.shared.goals.gave(goal, id, replica, now + timeout_s)
-        if link.offer(self.spec.name, id, payload, timeout_s):
-            log.info("goal_sent_again service=%s replica=%s goal=%s", self.spec.name,
-                     link.peer.id.short, goal.hex())  # fmt: skip
-            return
-        with self.shared.lock:
-            self.shared.goals.failed(id, replica, now)
+    def request_of(self, id: bytes) -> bytes:
+        """Every attempt has the id of its request, or one that no request has."""
+        return id
+
+    def reach(
+        self,
+        come: Collection[int],
+        now: float,
+        versions: Mapping[int, str],
+        leaving: Collection[int],
+    ) -> None:
+        """Note who can be given goals; who comes may have missed that some were ended."""
+        action = self._action
+        with action.lock:
+            for replica in set(action.replicas) - versions.keys():
+                action.goals.left(replica)
+            action.replicas = tuple(versions)
+            for goal in action.goals.unwanted():
+                action.cancel(goal, come, now)
+
+    def take(self, now: float, timeout_s: float) -> list[Send]:
+        """Return the goals that replicas lack."""
+        found = []
+        with self._action.lock:
+            for replica in self._action.replicas:
+                for payload in self._action.goals.lacking(replica, now):
+                    id, goal = os.urandom(REQUEST_ID_BYTES), goals.goal_of(payload)
+                    self._action.goals.gave(goal, id, replica, now + timeout_s)
+                    found.append(Send(replica, id, payload, timeout_s))
+                    log.info("goal_sent_again service=%s replica=%d.%d goal=%s", self._name,
+                             replica >> 32, replica & 0xFFFFFFFF, goal.hex())  # fmt: skip
+        return found
+
+    def declined(self, id: bytes, replica: int, now: float) -> None:
+        """A replica's link did not take a goal."""
+        with self._action.lock:
+            self._action.goals.failed(id, replica, now)
+
+    def close(self) -> None:
+        """End the action's goals: what comes in its place may be another action."""
+        with self._action.lock:
+            self._action.goals.clear()
 
 
-class ResultDispatcher(PartDispatcher):
-    """`get_result`: the first replica that succeeds; the others are told to cancel the goal."""
+class _ResultPart:
+    """`get_result`: the first replica that succeeds; the others are told to cancel the goal.
 
-    def __init__(self, *args: Any, **others: Any) -> None:
-        super().__init__(*args, **others)
-        self.shared.began = self._began
+    Where a replica does not know the goal, it may be about to be given it, or has lost it: it is
+    asked again. It may have refused it: it is not asked again. Or it has forgotten what became
+    of it: then that is its result.
+    """
 
-    def _began(self, goal: bytes, replica: int) -> None:
-        """A replica has taken a goal, perhaps anew: it may be asked for the result."""
-        with self._lock:
-            self._requests.welcome(replica, partial(_is_about, goal))
-        self._wake()
+    flagged: Collection[int] = ()
 
-    def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
-        """Take a request for a result; its goal is under way until that comes."""
-        taken = super().forward(request, payload, handle, timeout_s)
-        if taken:
-            with self.shared.lock:
-                self.shared.goals.awaited(goals.goal_of(payload))
-        return taken
+    def __init__(self, action: _Action) -> None:
+        self.accepts: Accepts | None = partial(goals.is_success, Part.RESULT)
+        self._action = action
 
-    def answered(self, link: Link, answer: Answer) -> None:
-        """Take a result; where a replica does not know the goal, see why.
+    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+        """Note that a goal is under way until its result comes."""
+        with self._action.lock:
+            self._action.goals.awaited(goals.goal_of(pending.item.payload))
 
-        It may be about to be given it, or has lost it: it is asked again. It may have refused it:
-        it is not asked again. Or it has forgotten what became of it: then that is its result.
-        """
-        pending, payload = self._requests.get(answer.request_id), answer.payload
+    def read(self, payload: bytes) -> bool:
+        """Return whether the goal has succeeded."""
+        return goals.is_success(Part.RESULT, payload)
+
+    def judge(
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+    ) -> Judgement:
+        """Take a result."""
         if pending is None:
-            super().answered(link, answer)
-            return
-        replica, goal = key_of(link), goals.goal_of(pending.item.payload)
-        if payload is None:
-            if answer.refusal is not None and Effect.GOALS_LOST in answer.refusal.effect:
-                with self.shared.lock:
-                    self.shared.goals.lost(goal, replica)
-            super().answered(link, answer)
-            return
-        asked_at = pending.open.get(replica, -math.inf)
-        with self.shared.lock:
-            under_way = goal in self.shared.goals
-            had = self.shared.goals.had(goal, replica, asked_at)
-        if under_way and goals.is_unknown(payload) and had is not Had.TAKEN:
-            reason = Refusal.FORGOTTEN if had is Had.REFUSED else Refusal.NOT_READY
-            super().answered(link, answer._replace(payload=None, refusal=reason))
-            return
-        with self.shared.lock:
-            losers = (self.shared.goals.takers(goal) | set(self._links)) - {replica}
-        super().answered(link, answer)
-        won = goals.is_success(Part.RESULT, payload) and answer.request_id not in self._requests
-        if under_way and won:
-            with self.shared.lock:
-                self.shared.cancel(goal, losers, self._clock())
-            self._wake()
+            return Means.SUCCESS if reading else Means.REJECTION
+        action, goal = self._action, goals.goal_of(pending.item.payload)
+        now, unknown = action.clock(), goals.is_unknown(payload)
+        with action.lock:
+            under_way = goal in action.goals
+            had = action.goals.had(goal, replica, pending.open.get(replica, -math.inf))
+            if under_way and unknown and had is not Had.TAKEN:
+                return Refusal.FORGOTTEN if had is Had.REFUSED else Refusal.NOT_READY
+            if reading and under_way and now < pending.deadline:
+                losers = action.goals.takers(goal) | set(action.replicas)
+                action.cancel(goal, losers - {replica}, now)
+        if reading:
+            return Means.SUCCESS
+        weaker = unknown and pending.rejection is not None
+        return Means.WEAKER_REJECTION if weaker else Means.REJECTION
 
-    def _rejected(self, id: ReplicaId, replica: int, request: bytes, payload: bytes) -> None:
-        """Keep the rejection that says more: that of a replica which knows the goal."""
-        pending = self._requests.get(request)
-        if pending is not None and pending.rejection is not None and goals.is_unknown(payload):
-            payload = pending.rejection
-        super()._rejected(id, replica, request, payload)
+    def refused(
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+    ) -> None:
+        """Note who may have lost the goal."""
+        if pending is not None and Effect.GOALS_LOST in refusal.effect:
+            with self._action.lock:
+                self._action.goals.lost(goals.goal_of(pending.item.payload), replica)
 
-    def _is_over(self, goal: bytes) -> None:
-        with self.shared.lock:
-            self.shared.goals.ended(goal)
+    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+        """The goal has its result, or will have none."""
+        with self._action.lock:
+            self._action.goals.ended(goals.goal_of(pending.item.payload))
+
+    def hears_out(self, request: bytes) -> bool:
+        """The others are told to cancel the goal instead."""
+        return False
+
+    def report(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+
+class _CancelPart:
+    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile.
+
+    What a replica cancels is begun on none that comes later.
+    """
+
+    sends_requests = False
+    ready = True
+    flagged: Collection[int] = ()
+
+    def __init__(self, action: _Action) -> None:
+        self.accepts: Accepts | None = partial(goals.is_success, Part.CANCEL)
+        self._action = action
+        self._replicas: Collection[int] = ()
+        self._sent: OrderedDict[bytes, tuple[bytes, float]] = OrderedDict()  # goal, until when
+
+    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+        """Note a client's cancellation."""
+        goal = goals.goal_of(pending.item.payload)
+        if any(goal):  # else it means all goals made by now, and must not come later again
+            self._note(request, goal, self._action.clock() + _CANCEL_FOR_S)
+
+    def _note(self, id: bytes, goal: bytes, until: float) -> None:
+        self._sent[id] = goal, until
+        while len(self._sent) > _CANCELS_KEPT:
+            self._sent.popitem(last=False)
+
+    def read(self, payload: bytes) -> bool:
+        """Return whether something is cancelled."""
+        return goals.is_success(Part.CANCEL, payload)
+
+    def judge(
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+    ) -> Judgement:
+        """Note what a replica has cancelled."""
+        if not reading:
+            return Means.REJECTION
+        with self._action.lock:
+            for goal in goals.cancelled(payload):
+                self._action.goals.cancelled(goal)
+        return Means.SUCCESS
+
+    def refused(
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+    ) -> None:
+        """A replica has not heard it."""
+        self.declined(id, replica, self._action.clock())
+
+    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+        """Replicas are told all the same."""
+
+    def hears_out(self, request: bytes) -> bool:
+        """All replicas shall be told, whoever was first."""
+        return True
+
+    def report(self) -> dict[str, Any]:
+        """Return how many replicas are still to be told."""
+        return {"to_cancel": len(self._action.to_cancel)}
+
+    # -- what replicas must have ----------------------------------------------------------
+
+    def request_of(self, id: bytes) -> bytes:
+        """Every attempt has the id of its request, or one that no request has."""
+        return id
+
+    def reach(
+        self,
+        come: Collection[int],
+        now: float,
+        versions: Mapping[int, str],
+        leaving: Collection[int],
+    ) -> None:
+        """Note who can be told."""
+        self._replicas = frozenset(versions)
+
+    def take(self, now: float, timeout_s: float) -> list[Send]:
+        """Return what is to be told to those who work in vain, or were not there."""
+        found, later = [], []
+        with self._action.lock:
+            for one in self._action.to_cancel:
+                if one.at <= now and one.replica in self._replicas:
+                    id, request = os.urandom(REQUEST_ID_BYTES), goals.cancel_request(one.goal)
+                    self._note(id, one.goal, one.until)
+                    found.append(Send(one.replica, id, request, _CANCEL_TIMEOUT_S))
+                elif now < one.until:
+                    later.append(one)
+            self._action.to_cancel.clear()
+            self._action.to_cancel += later
+        return found
+
+    def declined(self, id: bytes, replica: int, now: float) -> None:
+        """A replica has not heard it: it is told again."""
+        with self._action.lock:
+            goal, until = self._sent.get(id, (b"", 0.0))
+            if now < until:
+                self._action.to_cancel.append(
+                    _ToCancel(goal, replica, now + _CANCEL_AGAIN_S, until)
+                )
+
+    def close(self) -> None:
+        """Nothing is held."""
 
 
 class Actions:
@@ -189,20 +357,25 @@ class Actions:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._shared: dict[str, Shared] = {}
+        self._actions: dict[str, _Action] = {}
 
     def make(
         self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
-    ) -> PartDispatcher:
+    ) -> Dispatcher:
         """Make the dispatcher of an action's part."""
-        action = spec.name.rpartition("/")[0]
-        shared = self._shared.setdefault(action, Shared())
+        name = spec.name.rpartition("/")[0]
+        action = self._actions.setdefault(name, _Action(self._clock, wake))
+        make = partial(Dispatcher, spec, respond, wake=wake, clock=self._clock)
         if spec.part is Part.GOAL:
-            return GoalDispatcher(spec, respond, shared, wake=wake, clock=self._clock)
-        if spec.part is Part.RESULT:
-            return ResultDispatcher(spec, respond, shared, wake=wake, clock=self._clock)
-        return CancelDispatcher(spec, respond, shared, wake=wake, clock=self._clock)
+            goal = _GoalPart(action, spec.name)
+            return make(decide=goal, replication=goal)
+        if spec.part is Part.CANCEL:
+            cancel = _CancelPart(action)
+            return make(decide=cancel, replication=cancel)
+        result = make(decide=_ResultPart(action))
+        action.began = lambda goal, replica: result.began_anew(replica, partial(_is_about, goal))
+        return result
 
 
-def _is_about(goal: bytes, request: Request) -> bool:
-    return goals.goal_of(request.payload) == goal
+def _is_about(goal: bytes, request: bytes) -> bool:
+    return goals.goal_of(request) == goal

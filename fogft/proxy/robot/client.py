@@ -12,27 +12,25 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
 from fogft.errors import RosError
 from fogft.link.port import Answer, Dialer, GatewayView, Link, Peer
-from fogft.link.uplinks import UplinksLink
 from fogft.model import names
 from fogft.model.replica import LinkState, Member, Membership, ReplicaId
 from fogft.model.spec import HedgingMode, Part, ServiceSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
-from fogft.proxy.robot.dispatcher import Dispatcher, key_of
-from fogft.proxy.robot.ordered_dispatcher import OrderedDispatcher
+from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.proxied_service import ProxiedService
+from fogft.proxy.robot.sending import key_of
 from fogft.proxy.robot.through_gateways import best_of, seen_through
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
 from fogft.proxy.robot.type_check import Define, Sameness
-from fogft.proxy.robot.voting import VotingDispatcher
 from fogft.records.record import SignedRecord
-from fogft.requests.hedging import NEVER
+from fogft.requests.choose import NEVER
 from fogft.ros.port import RosNode, RosTopics
 
 log = logging.getLogger(__name__)
@@ -48,7 +46,7 @@ class MakeDispatcher(Protocol):
         spec: ServiceSpec,
         respond: Callable[[Any, bytes], None],
         wake: Callable[[], None],
-    ) -> Dispatcher | OrderedDispatcher:
+    ) -> Dispatcher:
         """Make it, given how to respond and how to have `tick` called soon."""
 
 
@@ -145,10 +143,7 @@ class ClientProxy:
 
     def _adopt(self, service: ProxiedService) -> None:
         """Have the dispatcher follow its service's spec, with a client of the fallback."""
-        spec, dispatcher = self._here(service.spec), service.dispatcher
-        if isinstance(dispatcher, OrderedDispatcher):
-            dispatcher.adopt(spec)
-            return
+        spec = self._here(service.spec)
         name = spec.fallback.service if spec.fallback is not None else ""
         if name != service.fallback_name:
             old, service.fallback, service.fallback_name = service.fallback, None, name
@@ -159,7 +154,7 @@ class ClientProxy:
                     log.error("fallback_not_usable service=%s reason=%r", spec.name, error.message)
             if old is not None:
                 old.close()
-        dispatcher.adopt(spec, service.fallback)
+        service.dispatcher.adopt(spec, service.fallback)
 
     def _here(self, spec: ServiceSpec) -> ServiceSpec:
         """Return a service's policy as it is here: a request goes to one gateway, not to all.
@@ -311,31 +306,15 @@ class ClientProxy:
     def _route(self) -> None:
         self._topics.route({key_of(link): link for link in self._links.values()})
         differ = {id: self._differences(link) for id, link in self._links.items()}
+        versions, links = self._versions(), list(self._links.values())
+        leaving = frozenset(link.peer.id for link in links if self._draining(link))
         for service in self._services.values():
             name = service.spec.name
-            if isinstance(service.dispatcher, OrderedDispatcher):
-                # It brings replicas to readiness itself, and needs those that are not.
-                usable = [
-                    x for x in self._links.values() if x.usable and name not in differ[x.peer.id]
-                ]
-                service.dispatcher.route(usable, self._versions(), self._leaving(usable))
-                continue
-            able = [
-                link
-                for id, link in self._links.items()
-                if name in link.ready and name not in differ[id]
-            ]
-            fresh = [link for link in able if not self._draining(link)]
-            service.able = bool(able)
-            # Who is asked to work is not asked of one that leaves; who is told to stop is.
-            told = service.spec.part is Part.CANCEL
-            service.dispatcher.route(able if told else fresh or able)
+            fit = [link for link in links if name not in differ[link.peer.id]]
+            service.dispatcher.route(may_be_asked(service.spec, fit, leaving), versions, leaving)
 
     def _versions(self) -> dict[ReplicaId, str]:
         return {id: member.version for id, member in self._members.items()}
-
-    def _leaving(self, links: Iterable[Link]) -> frozenset[ReplicaId]:
-        return frozenset(link.peer.id for link in links if self._draining(link))
 
     def _draining(self, link: Link) -> bool:
         member = self._members.get(link.peer.id)
@@ -401,7 +380,7 @@ class ClientProxy:
         differ = self._differences(link)
         ours = next(iter(differ.values()), "") if link.usable else ""
         id = link.peer.id
-        ended = [s.dispatcher.by(id) for s in self._services.values()]
+        ended = [s.dispatcher.outcomes.by(id) for s in self._services.values()]
         return {
             "slot": id.slot,
             "generation": id.generation,
@@ -411,21 +390,18 @@ class ClientProxy:
             "offered": dict(answer.offered) if answer and link.usable else {},
             "draining": self._draining(link),
             "at_risk": bool(answer and answer.at_risk),
-            "disagrees": any(
-                isinstance(s.dispatcher, VotingDispatcher) and s.dispatcher.disagrees(key_of(link))
-                for s in self._services.values()
-            ),
+            "disagrees": any(s.dispatcher.disagrees(key_of(link)) for s in self._services.values()),
             "heard_age_s": status.heard_age_s,
             "silent_for_s": status.silent_for_s,
             "rtt_s": status.rtt_s,
             "in_flight": status.in_flight,
             "reopened": status.reopened,
-            "won": sum(s.dispatcher.won(id) for s in self._services.values()),
+            "won": sum(s.dispatcher.outcomes.won_by(id) for s in self._services.values()),
             "restarts": answer.restarts if answer else 0,
             "answered": sum(well for well, _ in ended),
             "failed": sum(ill for _, ill in ended),
             "work": dict(answer.work) if answer else {},
-            **({"uplinks": link.uplinks()} if isinstance(link, UplinksLink) else {}),
+            **({"uplinks": list(status.uplinks)} if status.uplinks else {}),
             "detail": status.detail or ours or (answer.detail if answer else ""),
         }
 
@@ -435,7 +411,6 @@ class ClientProxy:
             return [
                 {"service": name, **line}
                 for name, service in self._services.items()
-                if isinstance(service.dispatcher, Dispatcher)
                 for line in service.dispatcher.trace()
             ]
 
@@ -445,6 +420,24 @@ class ClientProxy:
             for id in list(self._links):
                 self._drop(id)
             self._topics.close()
+
+
+def may_be_asked(
+    spec: ServiceSpec, links: Sequence[Link], leaving: Collection[ReplicaId]
+) -> list[Link]:
+    """Return the links by which a service's requests may go.
+
+    Args:
+        spec: The service. Replicas of a stateful one are brought to readiness by what is sent.
+        links: Those whose replicas have the service's type as we have it.
+        leaving: The replicas that are to go soon.
+    """
+    if spec.state is not None:
+        return [link for link in links if link.usable]
+    ready = [link for link in links if spec.name in link.ready]
+    if spec.part is Part.CANCEL:  # who is told to stop may leave; who is asked to work not
+        return ready
+    return [link for link in ready if link.peer.id not in leaving] or ready
 
 
 def _good_members(membership: Membership) -> dict[ReplicaId, Member]:

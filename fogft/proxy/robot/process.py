@@ -29,14 +29,14 @@ from fogft.model.spec import Part, ServiceSpec
 from fogft.process import start_log, stop_on_signal
 from fogft.proxy import middleware, start
 from fogft.proxy.config import read_client
-from fogft.proxy.order_mark import MarkFile
+from fogft.proxy.order_mark import OrderMark
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.diagnostics_node import SeenFromRos
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
-from fogft.proxy.robot.ordered_dispatcher import OrderedDispatcher
-from fogft.proxy.robot.voting import VotingDispatcher
+from fogft.proxy.robot.service_order import ServiceOrder
+from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning
 from fogft.ros.port import RosNode, RosTopics
 
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_STATEFUL_BYTES = 64 << 20  # of requests; each is in the log of its order, too
 TRACE_NAME = "trace.jsonl"
 _TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 0.5
@@ -190,7 +191,7 @@ def make_dispatcher(
     pool_uid: str,
     actions: Actions,
     speaks: Speaks = Speaks.RCLPY,
-) -> Dispatcher | OrderedDispatcher:
+) -> Dispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
 
     Args:
@@ -212,26 +213,22 @@ def make_dispatcher(
 
     # The policy may become `empty` later.
     empty = middleware.empty_response(speaks, spec.type, needed=spec.needs_type)
+    make = functools.partial(Dispatcher, spec, respond, empty_response=empty, wake=wake)
     if spec.state is not None:
-        mark = MarkFile(
-            marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}", pool_uid
-        )
-        return OrderedDispatcher(spec, respond, mark, empty_response=empty, wake=wake)
+        mark = marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}"
+        order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake)
+        return make(decide=order, replication=order, max_pending_bytes=_STATEFUL_BYTES)
+    ok_of = functools.partial(types.bool_field, spec.type)
     if spec.quorum > 1:
-        return VotingDispatcher(
-            spec,
-            respond,
-            empty_response=empty,
-            wake=wake,
-            comparison=Comparison(spec.type, dict(spec.tolerance)),
-        )
-    return Dispatcher(
-        spec,
-        respond,
-        ok_of=functools.partial(types.bool_field, spec.type),
-        empty_response=empty,
-        wake=wake,
-    )
+        comparison = Comparison(spec.type, dict(spec.tolerance))
+        flagged = functools.partial(_replica_disagrees, spec.name)
+        return make(decide=Quorum(spec.quorum, comparison, flagged), ok_of=ok_of)
+    return make(ok_of=ok_of)
+
+
+def _replica_disagrees(service: str, replica: int, count: int) -> None:
+    log.error("replica_disagrees service=%s replica=%d.%d count=%d",
+              service, replica >> 32, replica & 0xFFFFFFFF, count)  # fmt: skip
 
 
 class _Parts(NamedTuple):

@@ -10,7 +10,6 @@ import logging
 from fogft.errors import RosError
 from fogft.model.spec import ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.proxy.robot.ordered_dispatcher import OrderedDispatcher
 from fogft.requests.advertising import Advertising
 from fogft.ros.port import RosClient, RosNode, RosServer
 
@@ -21,27 +20,21 @@ class ProxiedService:
     """A service of the robot's.
 
     Attributes:
-        able: Whether a replica could answer when requests were last routed.
         trouble: Why it cannot be offered; empty when it can.
     """
 
-    def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher | OrderedDispatcher) -> None:
+    def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher) -> None:
         self.spec = spec
         self.dispatcher = dispatcher
         self.server: RosServer | None = None
         self.fallback: RosClient | None = None
         self.fallback_name = ""
-        self.able = False
         self.trouble = ""
         self._advertising = Advertising()
 
     def advertise(self, node: RosNode, now: float) -> None:
         """Offer or withdraw it, as it should be now (monotonic seconds)."""
-        dispatcher = self.dispatcher
-        if isinstance(dispatcher, OrderedDispatcher):
-            able, waiting = dispatcher.able, 0
-        else:
-            able, waiting = self.able, dispatcher.waiting
+        able, waiting = self.dispatcher.able, self.dispatcher.waiting
         wanted = self._advertising.wanted(self.spec, able=able, waiting=waiting, now=now)
         if wanted and self.server is None:
             self._offer(node)

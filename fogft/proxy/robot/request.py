@@ -1,13 +1,25 @@
-"""What the client proxy keeps with a request: its bytes, its caller's handle, when it came."""
+"""What the client proxy keeps of one service's requests: each with its caller, all with counters.
+
+Owns: the lock under which they are. Not here: what happens to them (`dispatcher`).
+"""
 
 from __future__ import annotations
 
+import threading
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
+from fogft.metrics.outcomes import Outcome, Outcomes
 from fogft.model.refusal import Refusal
+from fogft.model.spec import ServiceSpec
+from fogft.requests.first_response import Pending
+from fogft.requests.pending import PendingRequests
+
+_TRACE_KEPT = 20_000  # lines until they are written, twice a second
 
 
-class Story:
+class RequestTrace:
     """Who was asked for a traced request. Moments are on the dispatcher's clock, seconds.
 
     Attributes:
@@ -31,13 +43,74 @@ class Request:
     """A caller's request. `arrived` is on the dispatcher's clock, seconds.
 
     Attributes:
-        story: For the trace; None where it is not traced.
+        trace: Who was asked; None where it is not traced.
     """
 
-    __slots__ = ("arrived", "handle", "payload", "story")
+    __slots__ = ("arrived", "handle", "payload", "trace")
 
     def __init__(self, payload: bytes, handle: Any, arrived: float, *, traced: bool) -> None:
         self.payload = payload
         self.handle = handle
         self.arrived = arrived
-        self.story = Story() if traced else None
+        self.trace = RequestTrace() if traced else None
+
+
+class Ledger:
+    """One service's requests and counters. All is used under the lock.
+
+    Attributes:
+        lock: Held for moments, never while something is sent or delivered.
+        spec: The service and its policy.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self, spec: ServiceSpec, requests: PendingRequests[Request], clock: Callable[[], float]
+    ) -> None:
+        self.lock = threading.Lock()
+        self.requests = requests
+        self.outcomes = Outcomes()
+        self.clock = clock
+        self.adopt(spec)
+
+    def adopt(self, spec: ServiceSpec) -> None:
+        """Follow another policy."""
+        self.spec = spec
+        if spec.trace != (self.outcomes.trace is not None):
+            self.outcomes.trace = deque(maxlen=_TRACE_KEPT) if spec.trace else None
+
+    def end(self, request: bytes, pending: Pending[Request], outcome: Outcome) -> None:
+        """Count how a request ended that no replica's answer has ended."""
+        self.outcomes.count[outcome] += 1
+        self.trace(request, pending, outcome, self.clock())
+
+    def trace(
+        self,
+        request: bytes,
+        pending: Pending[Request],
+        outcome: Outcome,
+        now: float,
+        *,
+        replica: str = "",
+    ) -> None:
+        """Note how a request ended, where that is wanted."""
+        if self.outcomes.trace is None:
+            return
+        arrived, trace = pending.item.arrived, pending.item.trace or RequestTrace()
+        asked = {key: begun - arrived for key, begun in trace.asked.items()}
+        self.outcomes.note(
+            request,
+            outcome,
+            took_s=now - arrived,
+            asked=asked,
+            refused=trace.refused,
+            replica=replica,
+        )
+
+    def take_trace(self) -> list[dict[str, Any]]:
+        """Return how requests ended since the last call."""
+        trace = self.outcomes.trace
+        found = list(trace or ())
+        if trace:
+            trace.clear()
+        return found

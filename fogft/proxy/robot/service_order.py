@@ -1,41 +1,68 @@
 """The order of one stateful service on a robot: its terms, one after the other.
 
-What happens comes in by methods, and what is to be sent goes out by `take`. All is called under
-the dispatcher's lock.
+It decides which answers count, and brings replicas to the same numbers in the same order. All
+that it decides is `ordering.sequencer`'s; here are the requests that have a number, those that
+wait for one, and the mark that survives this process. Protocol: docs/design/state.md.
 
-Owns: terms and the mark's file. Not here: what a term decides (`fogft.ordering.sequencer`),
-callers, deadlines and links (`ordered_dispatcher`). Protocol: docs/design/state.md.
+Owns: terms and the mark's file. Not here: callers, deadlines and links (`dispatcher`).
 """
 
 from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
-from fogft.ordering.orders import OrderId
-from fogft.ordering.peer import Order
+from fogft.ordering.orders import Op, OrderError, OrderId, decode, encode
 from fogft.ordering.sequencer import Handover, Sequencer
-from fogft.proxy.order_mark import MarkFile
+from fogft.proxy.order_mark import OrderMark
+from fogft.proxy.robot.replication import Send
+from fogft.requests.decide import Accepts, Judgement, Means
+from fogft.requests.first_response import Pending
 
 log = logging.getLogger(__name__)
+
+# An order is not given up at its caller's deadline: it must be applied all the same.
+_ATTEMPT_S = 60.0
 
 
 class ServiceOrder:
     """Numbers requests, and says what to send to whom and when an answer counts.
 
+    See `requests.decide.Decide` and `replication.Replication`.
+
     Args:
         name: The service's.
         mark: What survives this process.
+        wake: Has what is due sent soon.
+        clock: Monotonic seconds.
     """
 
-    def __init__(self, name: str, mark: MarkFile) -> None:
+    sends_requests = True
+    flagged: Collection[int] = ()
+
+    def __init__(
+        self,
+        name: str,
+        mark: OrderMark,
+        *,
+        wake: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.accepts: Accepts | None = None
         self._name = name
         self._mark = mark
-        self._reachable: tuple[Iterable[int], Mapping[int, str], Iterable[int]] = ((), {}, ())
+        self._wake = wake
+        self._clock = clock
+        self._versions: Mapping[int, str] = {}
+        self._leaving: Collection[int] = ()
+        self._requests: dict[int, bytes] = {}  # by number
+        self._numbers: dict[bytes, int] = {}
+        self._waiting: dict[bytes, bytes] = {}  # no replica can take them yet; oldest first
+        self._told = ""
         self._term = self._begin_term()
 
     def _begin_term(self, above: int = 0, begin: Handover | None = None) -> Sequencer:
@@ -50,86 +77,6 @@ class ServiceOrder:
         return self._term.ready
 
     @property
-    def due(self) -> bool:
-        """Whether something is to be sent, or decided by `tick`."""
-        term = self._term
-        ends = term.deposed_by is not None or term.handover is not None
-        return term.sends or ends or term.changing
-
-    def submit(self, payload: bytes) -> int | None:
-        """Number a request; None while none is taken."""
-        return self._term.submit(payload) if self._term.ready else None
-
-    def abandon(self, number: int) -> None:
-        """Nobody waits for the answer to this number any more."""
-        self._term.abandon(number)
-
-    def reach(
-        self,
-        replicas: Iterable[int],
-        now: float,
-        versions: Mapping[int, str],
-        leaving: Iterable[int],
-    ) -> None:
-        """Set which replicas can be sent to."""
-        self._reachable = (replicas, versions, leaving)
-        self._reach(now)
-
-    def _reach(self, now: float) -> None:
-        replicas, versions, leaving = self._reachable
-        self._term.reach(replicas, now, versions=versions, leaving=leaving)
-
-    def tick(self, now: float) -> None:
-        """Do what is due."""
-        if self._term.deposed_by is not None:  # by a term of ours that the file has lost track of
-            above = self._term.deposed_by
-            log.warning("term_ended service=%s obeyed=%x", self._name, above)
-            self._term = self._begin_term(above)
-            self._reach(now)
-        self._term.tick(now)
-        begin = self._term.handover
-        if begin is not None:  # all numbers given are answered, and none waits
-            log.info("office_changed service=%s version=%s", self._name, begin.version)
-            self._term = self._begin_term(begin=begin)
-            self._reach(now)
-
-    def take(self) -> list[tuple[int, Order]]:
-        """Return the orders to send, each after its term, and forget them."""
-        epoch = self._term.epoch
-        return [(epoch, order) for order in self._term.take()]
-
-    def is_current(self, id: OrderId) -> bool:
-        """Whether an order is of the present term."""
-        return id[1] == self._term.epoch
-
-    def replied(self, replica: int, id: OrderId, payload: bytes) -> bool:
-        """Take a reply to an order of the present term.
-
-        Returns:
-            Whether it is the answer to its number: then that is written down as returned.
-
-        Raises:
-            OrderError: The bytes are not what this operation is answered with.
-        """
-        op, _, index = id
-        term = self._term
-        answers = term.replied(replica, op, index, payload)
-        if answers:
-            self._mark.write(term.mark, term.office.holder or "")
-        return answers
-
-    def refused(self, replica: int, id: OrderId, answer: Answer, now: float) -> None:
-        """Take a refusal, or the loss of an order."""
-        if self.is_current(id):
-            reason = answer.refusal or Refusal.LOST
-            self._term.refused(replica, id[0], id[2], reason, now, detail=answer.detail)
-
-    def declined(self, replica: int, id: OrderId, now: float) -> None:
-        """An order was not taken by its link."""
-        if self.is_current(id):
-            self._term.declined(replica, id[0], id[2], now)
-
-    @property
     def trouble(self) -> str:
         """Why the service cannot be had; empty if nothing is wrong."""
         if self._term.held_by:
@@ -141,21 +88,173 @@ class ServiceOrder:
             return "no replica that can be reached holds the state; see docs/design/state.md"
         return ""
 
-    @property
-    def held_bytes(self) -> int:
-        """Bytes of the requests that are kept."""
-        return self._term.log.held_bytes if self._term.log else 0
+    # -- what a caller wants --------------------------------------------------------------
+
+    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+        """Give a request its number; it waits where no replica can take it."""
+        payload = pending.item.payload
+        if self._waiting or not self._number(request, payload):
+            self._waiting[request] = payload
+
+    def _number(self, request: bytes, payload: bytes) -> bool:
+        number = self._term.submit(payload) if self._term.ready else None
+        if number is None:
+            return False
+        self._numbers[request], self._requests[number] = number, request
+        return True
+
+    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+        """Nobody waits for this answer any more; what has a number is applied all the same."""
+        self._waiting.pop(request, None)
+        number = self._numbers.pop(request, None)
+        if number is not None:
+            del self._requests[number]
+            self._term.abandon(number)
+
+    def hears_out(self, request: bytes) -> bool:
+        """All replicas apply all requests."""
+        return True
+
+    # -- what replicas say ----------------------------------------------------------------
+
+    def request_of(self, id: bytes) -> bytes | None:
+        """Return the request of a number; None for an order about no request."""
+        try:
+            op, epoch, number = decode(id)
+        except OrderError:  # of the time before this service was stateful
+            return None
+        if op not in (Op.APPLY, Op.RECALL):
+            return None
+        return self._requests.get(number, b"") if epoch == self._term.epoch else b""
+
+    def read(self, payload: bytes) -> None:
+        """Every answer counts alike."""
+
+    def judge(
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+    ) -> Judgement:
+        """Take a reply; where it answers a number, write down that this is returned."""
+        current = self._current(id)
+        if current is None:
+            return Means.NOTHING
+        op, _, number = current
+        term = self._term
+        try:
+            answers = term.replied(replica, op, number, payload)
+        except OrderError as error:
+            log.warning("order_unreadable service=%s reason=%r", self._name, error)
+            self.refused(id, replica, Refusal.MALFORMED, "", pending)
+            return Refusal.MALFORMED
+        if answers:
+            self._mark.write(term.mark, term.active.version or "")
+        self._wake_if_due()
+        if answers:
+            return Means.SUCCESS
+        return Means.LATE if op is Op.APPLY else Means.NOTHING
+
+    def refused(
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+    ) -> None:
+        """Take a refusal, or the loss of an order."""
+        current = self._current(id)
+        if current is not None:
+            op, _, number = current
+            self._term.refused(replica, op, number, refusal, self._clock(), detail=detail)
+        self._wake_if_due()
+
+    def declined(self, id: bytes, replica: int, now: float) -> None:
+        """An order was not taken by its link."""
+        current = self._current(id)
+        if current is not None:
+            self._term.declined(replica, current[0], current[2], now)
+
+    def _current(self, id: bytes) -> OrderId | None:
+        """Return an order of the present term; None for any other."""
+        try:
+            order = decode(id)
+        except OrderError:
+            return None
+        return order if order[1] == self._term.epoch else None
+
+    def _wake_if_due(self) -> None:
+        term = self._term
+        if term.sends or term.deposed_by is not None or term.handover is not None or term.changing:
+            self._wake()
+
+    # -- what is sent ---------------------------------------------------------------------
+
+    def reach(
+        self,
+        come: Collection[int],
+        now: float,
+        versions: Mapping[int, str],
+        leaving: Collection[int],
+    ) -> None:
+        """Note which replicas can be sent to."""
+        self._versions, self._leaving = versions, leaving
+        self._reach(now)
+
+    def _reach(self, now: float) -> None:
+        self._term.reach(self._versions, now, versions=self._versions, leaving=self._leaving)
+
+    def take(self, now: float, timeout_s: float) -> list[Send]:
+        """Number what waits, and return the orders to send, in their order."""
+        self._tick(now)
+        for request, payload in list(self._waiting.items()):
+            if not self._number(request, payload):
+                break
+            del self._waiting[request]
+        self._look_for_trouble()
+        epoch, limit_s = self._term.epoch, max(_ATTEMPT_S, 4 * timeout_s)
+        return [
+            Send(
+                order.replica,
+                encode(order.op, epoch, order.index),
+                order.payload,
+                limit_s,
+                order.op is Op.APPLY,
+            )
+            for order in self._term.take()
+        ]
+
+    def _tick(self, now: float) -> None:
+        if self._term.deposed_by is not None:  # by a term of ours that the file has lost track of
+            above = self._term.deposed_by
+            log.warning("term_ended service=%s obeyed=%x", self._name, above)
+            self._term = self._begin_term(above)
+            self._reach(now)
+        self._term.tick(now)
+        begin = self._term.handover
+        if begin is not None:  # all numbers given are answered, and none waits
+            log.info("version_changed service=%s version=%s", self._name, begin.version)
+            self._term = self._begin_term(begin=begin)
+            self._reach(now)
+
+    def _look_for_trouble(self) -> None:
+        trouble = self.trouble
+        if trouble and trouble != self._told:
+            self._told = trouble
+            log.error("state_unavailable service=%s reason=%r", self._name, trouble)
+
+    # -- what people see ------------------------------------------------------------------
 
     def report(self) -> dict[str, Any]:
         """Return the state of the order, as `proxy-status.json` has it."""
         term = self._term
         log_ = term.log
-        return {
+        order = {
             "epoch": term.epoch >> 32,
             "last": log_.last if log_ else None,
             "joined": len(term.joined),
             "log": len(log_) if log_ else 0,
+            "log_bytes": log_.held_bytes if log_ else 0,
             "checkpoint": log_.checkpoint.index if log_ and log_.checkpoint else None,
             "answered": term.mark.index,
-            "version": term.office.holder or "",
+            "version": term.active.version or "",
+            "trouble": self.trouble,
         }
+        return {"order": order}
+
+    def close(self) -> None:
+        """Let go of the mark's file. Nothing may be answered afterwards."""
+        self._mark.close()

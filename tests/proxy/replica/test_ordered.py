@@ -9,9 +9,10 @@ from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.state import StateService, StateSpec
-from fogft.proxy.order_mark import MarkFile
+from fogft.proxy.order_mark import OrderMark
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
-from fogft.proxy.robot.ordered_dispatcher import OrderedDispatcher
+from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.service_order import ServiceOrder
 from tests.proxy.fakes import UID, Clock, FakeClient, FakeLink
 
 STATE = StateSpec(StateService("/g", "p/srv/G", "d"), StateService("/s", "p/srv/S", "d"))
@@ -71,10 +72,12 @@ class Scene:
         self.dispatcher = self.start()
 
     def start(self):
-        dispatcher = OrderedDispatcher(
+        order = ServiceOrder("/s", OrderMark(self.folder / "mark", UID), clock=self.clock)
+        dispatcher = Dispatcher(
             self.spec,
             lambda handle, payload: self.responses.append((handle, payload)),
-            MarkFile(self.folder / "mark", UID),
+            decide=order,
+            replication=order,
             empty_response=b"empty",
             clock=self.clock,
         )

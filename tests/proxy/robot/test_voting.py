@@ -12,8 +12,9 @@ import pytest
 from fogft.errors import RosError
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
-from fogft.proxy.robot.dispatcher import key_of
-from fogft.proxy.robot.voting import VotingDispatcher
+from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.sending import key_of
+from fogft.requests.votes import Quorum
 from fogft.ros import environment
 from tests.proxy.by_hand import LIMIT_S, ROOT, Parts, wait_for
 from tests.proxy.fakes import Clock, FakeLink
@@ -36,12 +37,12 @@ class Numbers:
 class Scene:
     def __init__(self, links: int = 3, **spec: object) -> None:
         self.clock, self.responses = Clock(), []
-        self.dispatcher = VotingDispatcher(
+        self.dispatcher = Dispatcher(
             ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, quorum=2, **spec),
             lambda handle, payload: self.responses.append((handle, payload)),
             empty_response=b"empty",
             clock=self.clock,
-            comparison=Numbers(),
+            decide=Quorum(2, Numbers()),
         )
         self.links = [FakeLink(slot) for slot in range(links)]
         self.dispatcher.route(self.links)

@@ -1,11 +1,11 @@
-"""Whom a request is sent to, and when a further replica is asked. Pure: time comes in.
+"""Choose which replicas a request goes to first, which next, and when. Pure: time comes in.
 
 A policy is asked when a request comes (`first`) and again while it is open (`more`), and is
 told how each attempt ended. It never sends anything; the dispatcher does as it says, and
 checks nothing but that a replica may be asked.
 
 Owns: `all` and `failover`; the interface of every policy.
-Not here: `adaptive` (`fogft.requests.adaptive`), which answer wins (`first_response`).
+Not here: `adaptive` (`fogft.requests.adaptive`), which answer wins (`fogft.requests.decide`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Protocol
 NEVER = float("inf")
 
 
-class Hedging(Protocol):
+class Choose(Protocol):
     """Decides which replicas work on a request. Not thread-safe: its owner holds a lock.
 
     Replicas are numbers, `open` maps each that works on a request to the moment it was asked.
@@ -30,12 +30,12 @@ class Hedging(Protocol):
     look_at: float
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return whom a new request goes to at once, of those that are able to answer."""
+        """Return which of the able replicas a new request goes to at once."""
 
     def more(
         self, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return whom an open request goes to now, of those that may be asked and are not."""
+        """Return which of those that may be asked, and are not, an open request goes to now."""
 
     def declined(self, replica: int, *, full: bool) -> None:
         """A replica that was returned was not asked: its window was full, or no need was left."""
@@ -54,18 +54,17 @@ class Hedging(Protocol):
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
         """An attempt ended after its request had: with an answer, or without one."""
 
-    def stopped(self, request: bytes, open: Mapping[int, float], now: float) -> None:
-        """A request was answered by somebody else than a replica; these stop."""
-
-    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
-        """A request's deadline came while these worked on it; they stop."""
+    def stopped(
+        self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
+    ) -> None:
+        """A request ended without these: its deadline came, or it was answered otherwise."""
 
     def report(self) -> dict[str, Any]:
         """Return what the policy has learned, for people."""
 
 
 class All:
-    """Every request goes to every replica at once, and to all that come later."""
+    """Every request goes to every replica at once, and to all that come later. Learns nothing."""
 
     moves_on = False  # all were asked already
     look_at = NEVER
@@ -101,18 +100,17 @@ class All:
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
         """Learn nothing."""
 
-    def stopped(self, request: bytes, open: Mapping[int, float], now: float) -> None:
-        """Learn nothing."""
-
-    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
+    def stopped(
+        self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
+    ) -> None:
         """Learn nothing."""
 
     def report(self) -> dict[str, Any]:
-        """Return nothing: nothing is learned."""
+        """Return nothing."""
         return {}
 
 
-class Failover(All):
+class Failover:
     """One replica gets every request. Another one takes its place when it fails.
 
     It fails when it is no longer able to answer (suspected, not ready, drained), when an
@@ -120,6 +118,7 @@ class Failover(All):
     """
 
     moves_on = True
+    look_at = NEVER
 
     def __init__(self) -> None:
         self._current: int | None = None
@@ -149,14 +148,32 @@ class Failover(All):
         self.switched += old is not None
         return (self._current,)
 
+    def declined(self, replica: int, *, full: bool) -> None:
+        """Stay: a full window is no failure."""
+
+    def answered(
+        self, request: bytes, open: Mapping[int, float], replica: int, now: float
+    ) -> Iterable[int]:
+        """Return the others: a failed one may still work on it."""
+        return [other for other in open if other != replica]
+
     def failed(self, request: bytes, replica: int, now: float) -> None:
         """Move on from a replica that failed."""
         if replica == self._current:
             self._failed = True
 
-    def expired(self, request: bytes, open: Mapping[int, float], now: float) -> None:
+    def awaits(self, request: bytes, replica: int) -> bool:
+        """Await nothing."""
+        return False
+
+    def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
+        """Learn nothing."""
+
+    def stopped(
+        self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
+    ) -> None:
         """Move on from a replica that let a deadline pass: its service may hang."""
-        if self._current in open:
+        if expired and self._current in open:
             self._failed = True
 
     def report(self) -> dict[str, Any]:

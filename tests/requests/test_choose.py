@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.hedging import NEVER, All, Failover
+from fogft.requests.choose import NEVER, All, Failover
 
 A = b"a" * 16
 
@@ -45,7 +45,7 @@ def test_failover_leaves_a_replica_that_lets_a_deadline_pass():
     """Its service may hang while its server proxy goes on answering probes."""
     policy = Failover()
     policy.first(A, (1, 2), 0.0)
-    policy.expired(A, {1: 0.0}, 5.0)
+    policy.stopped(A, {1: 0.0}, 5.0, expired=True)
     assert policy.first(A, (1, 2), 5.0) == (2,)
 
 

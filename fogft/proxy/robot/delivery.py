@@ -1,0 +1,187 @@
+"""How a request's end reaches its caller: a response, a fallback's, an empty one, or silence.
+
+Where a caller is (in ROS, or a robot at a gateway) is the matter of the function that responds.
+When the fallback is asked is `requests.fallback`'s to say; here it is called.
+
+Owns: calls of the fallback service. Not here: which answer is returned (`dispatcher`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+from fogft.errors import RosError
+from fogft.log_limits import worth_logging
+from fogft.metrics.outcomes import Outcome
+from fogft.model.spec import OnTimeout, ServiceSpec
+from fogft.proxy.robot.request import Ledger, Request
+from fogft.requests.choose import NEVER
+from fogft.requests.fallback import FallbackTimer
+from fogft.requests.first_response import Pending
+from fogft.ros.port import RosClient
+
+log = logging.getLogger(__name__)
+
+Respond = Callable[[Any, bytes], None]
+
+
+class Delivery:
+    """How one service's requests end.
+
+    Args:
+        ledger: The service's requests.
+        respond: Sends a response to the caller of a handle. Any thread.
+        empty_response: The serialised default response, for ``on_timeout: empty``.
+        forget: Tells these replicas that a request is no longer wanted.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        respond: Respond,
+        empty_response: bytes | None,
+        forget: Callable[[bytes, Iterable[int]], None],
+    ) -> None:
+        self._ledger = ledger
+        self._respond = respond
+        self._empty_response = empty_response
+        self._forget = forget
+        self._client: RosClient | None = None
+        self.adopt(ledger.spec, None)
+
+    def adopt(self, spec: ServiceSpec, client: RosClient | None) -> None:
+        """Follow what a spec says of the fallback, with its client. Under the lock.
+
+        Without a fallback nothing more is asked before the deadline.
+        """
+        self._client, requests = client, self._ledger.requests
+        if requests.fallback is None and spec.fallback is not None:
+            requests.fallback = FallbackTimer(spec.fallback)
+        elif requests.fallback is not None:
+            old = requests.fallback.spec
+            unasked = replace(old, after_s=None, while_none_ready=False)
+            requests.fallback.spec = spec.fallback or unasked
+
+    # -- without the lock -----------------------------------------------------------------
+
+    def give(self, pending: Pending[Request], payload: bytes) -> None:
+        """Send a response to its caller. One that ROS does not take harms no other request."""
+        try:
+            self._respond(pending.item.handle, payload)
+        except RosError as error:
+            self._warn("undelivered", "response_undelivered", error.message)
+
+    def expired(self, request: bytes, pending: Pending[Request]) -> None:
+        """A request's deadline has come."""
+        spec, response = self._ledger.spec, pending.rejection
+        if self._ledger.requests.fallback is not None and spec.on_timeout is OnTimeout.FALLBACK:
+            outcome = Outcome.FALLBACK
+        elif response is not None:
+            outcome = Outcome.ANSWERED
+        elif spec.on_timeout is OnTimeout.EMPTY and self._empty_response is not None:
+            outcome, response = Outcome.EMPTY, self._empty_response
+        else:
+            outcome = Outcome.SILENT
+        log.warning(
+            "request_timed_out service=%s outcome=%s waited_s=%.3f open=%s request=%s",
+            spec.name, outcome.value, spec.timeout_s, sorted(pending.open), request.hex(),
+        )  # fmt: skip
+        if outcome is Outcome.FALLBACK:
+            self._await_fallback(request, pending)
+            return
+        with self._ledger.lock:
+            self._ledger.end(request, pending, outcome)
+        if response is not None:
+            self.give(pending, response)
+
+    # -- the fallback ---------------------------------------------------------------------
+
+    def tick(self, now: float, *, able: bool) -> float:
+        """Ask the fallback for what is due, and give up what it has not answered in time.
+
+        Returns:
+            When to call again.
+        """
+        timer, requests = self._ledger.requests.fallback, self._ledger.requests
+        if timer is None:
+            return NEVER
+        with self._ledger.lock:
+            due = [(request, requests.get(request)) for request in timer.due(now, able=able)]
+            over = timer.given_up(now)
+            look_at = timer.look_at(able=able)
+        for request, pending in due:
+            if pending is not None and not self._ask(request, pending):
+                with self._ledger.lock:
+                    timer.failed(request)
+        for request, pending in over:
+            self._without_fallback(request, pending)
+        return look_at
+
+    def _await_fallback(self, request: bytes, pending: Pending[Request]) -> None:
+        """The fallback has the rest of the say; it may have been asked before."""
+        timer = self._ledger.requests.fallback
+        assert timer is not None
+        with self._ledger.lock:
+            must_ask = timer.expired(request, pending, self._ledger.clock())
+        if must_ask and not self._ask(request, pending):
+            with self._ledger.lock:
+                ours = timer.answered(request) is not None
+            if ours:
+                self._without_fallback(request, pending)
+
+    def _ask(self, request: bytes, pending: Pending[Request]) -> bool:
+        """Call the fallback; return whether it could be called."""
+        client = self._client
+        try:
+            if client is not None and client.available():
+                payload = pending.item.payload
+                client.call(payload, lambda response: self._fallback_answered(request, response))
+                return True
+            reason = "nobody offers it"
+        except RosError as error:
+            reason = error.message
+        self._warn("fallback_failed", "fallback_not_asked", reason)
+        return False
+
+    def _fallback_answered(self, request: bytes, payload: bytes) -> None:
+        """Take the fallback's response, on the thread that takes from ROS."""
+        ledger = self._ledger
+        accepts = ledger.requests.decide.accepts
+        try:
+            ok = accepts is None or accepts(payload)
+        except RosError:
+            ok = False
+        with ledger.lock:
+            pending, overdue = ledger.requests.fallback_answered(request, ledger.clock(), ok=ok)
+            if not ok:
+                ledger.outcomes.count["fallback_failed"] += 1
+            elif pending is not None:
+                ledger.end(request, pending, Outcome.FALLBACK)
+        if pending is None:
+            return  # a replica was first
+        if not ok:
+            self._without_fallback(request, pending)
+            return
+        self.give(pending, payload)
+        if not overdue:
+            self._forget(request, tuple(pending.open))
+
+    def _without_fallback(self, request: bytes, pending: Pending[Request]) -> None:
+        """The fallback had nothing either: return the rejection if there is one."""
+        response = pending.rejection
+        with self._ledger.lock:
+            outcome = Outcome.SILENT if response is None else Outcome.ANSWERED
+            self._ledger.end(request, pending, outcome)
+        if response is not None:
+            self.give(pending, response)
+
+    def _warn(self, counter: str, event: str, reason: str) -> None:
+        with self._ledger.lock:
+            self._ledger.outcomes.count[counter] += 1
+            count = self._ledger.outcomes.count[counter]
+        if worth_logging(count):
+            name = self._ledger.spec.name
+            log.warning("%s service=%s reason=%r count=%d", event, name, reason, count)

@@ -1,0 +1,162 @@
+"""Offer one service's requests to the links of replicas, and tell links what is not wanted.
+
+Whom to ask, and when, is the policy's to say (`requests.choose`); here it is carried out. This is
+the one place where a request leaves for a replica.
+
+Owns: which links may be asked. Not here: links (`fogft.link`), answers (`dispatcher`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection, Iterable, Mapping, Sequence
+
+from fogft.link.port import Link
+from fogft.model.choices import Freshness
+from fogft.model.replica import ReplicaId
+from fogft.proxy.robot.replication import Replication
+from fogft.proxy.robot.request import Ledger
+from fogft.requests.choose import NEVER
+
+
+class Sender:
+    """Sends one service's requests.
+
+    Args:
+        ledger: The service's requests.
+        replication: What else replicas must have.
+
+    Attributes:
+        links: Those that may be asked, by replica.
+        able: The replicas that the policy may choose.
+        next_look: When the policy wants to be asked, as `offer_more` found it.
+    """
+
+    def __init__(self, ledger: Ledger, replication: Replication | None) -> None:
+        self._ledger = ledger
+        self._replication = replication
+        self._sending = threading.Lock()  # what replicas must have leaves in its order
+        self._in_burst = False
+        self.links: dict[int, Link] = {}
+        self.able: tuple[int, ...] = ()
+        self.next_look = NEVER
+
+    def burst(self, begins: bool) -> None:
+        """Have what is sent until the burst ends leave together, in few messages."""
+        self._in_burst = begins
+        if not begins:
+            for link in tuple(self.links.values()):
+                link.send()
+
+    def first(
+        self, request: bytes, payload: bytes, links: Mapping[int, Link], chosen: Sequence[int],
+        timeout_s: float,
+    ) -> None:  # fmt: skip
+        """Offer a new request to those that were chosen for it."""
+        name = self._ledger.spec.name
+        for replica in chosen:
+            if not links[replica].offer(name, request, payload, timeout_s, more=self._in_burst):
+                self._declined(request, replica, is_copy=True)
+        if len(chosen) > 1 and request not in self._ledger.requests:
+            # Answered before the last link had it: its answer could not reach that one.
+            self.forget(request, chosen)
+
+    def route(
+        self,
+        links: Sequence[Link],
+        versions: Mapping[ReplicaId, str],
+        leaving: Collection[ReplicaId],
+    ) -> None:
+        """Set the links that may be asked now, and offer them what they lack."""
+        routed = {key_of(link): link for link in links}
+        replication, now = self._replication, self._ledger.clock()
+        with self._ledger.lock:
+            added = [key for key, link in routed.items() if self.links.get(key) is not link]
+            self.links = routed
+            if replication is None or not replication.sends_requests:
+                self.able = tuple(routed)
+                self._ledger.requests.came(added)
+            if replication is not None:
+                known = {key: versions.get(x.peer.id, "") for key, x in routed.items()}
+                going = [key for key, link in routed.items() if link.peer.id in leaving]
+                replication.reach(added, now, known, going)
+        if added:
+            self.offer_more(now)
+        self.replicate()
+
+    def offer_more(self, now: float) -> None:
+        """Ask the policy about each request that may need a further replica."""
+        newest_first = self._ledger.spec.freshness is Freshness.LATEST
+        with self._ledger.lock:
+            links, requests = self.links, self._ledger.requests
+            steps = requests.more(self.able, now, newest_first=newest_first)
+            self.next_look = requests.choose.look_at
+        full: set[int] = set()  # who declined a request a moment ago is offered no other
+        for request, replica in steps:
+            if not self._offer(request, replica, links[replica], skip=replica in full):
+                full.add(replica)
+
+    def _offer(self, request: bytes, replica: int, link: Link, *, skip: bool) -> bool:
+        """Offer a request to a replica; return whether that has room."""
+        now = self._ledger.clock()
+        with self._ledger.lock:
+            requests = self._ledger.requests
+            if skip:
+                requests.passed_over(replica)
+                return False
+            pending = requests.attempt(request, replica, now)
+            if pending is None:
+                return True
+            self._ledger.outcomes.count["sent"] += 1
+            if pending.item.trace is not None:
+                pending.item.trace.asked.setdefault(replica, now)
+        payload, remaining_s = pending.item.payload, pending.deadline - now
+        if not link.offer(self._ledger.spec.name, request, payload, remaining_s):
+            self._declined(request, replica, is_copy=True)
+            return False
+        if request not in requests:  # it was answered meanwhile
+            self.forget(request, (replica,))
+        return True
+
+    def replicate(self) -> None:
+        """Send what else replicas must have."""
+        replication, ledger = self._replication, self._ledger
+        if replication is None:
+            return
+        with self._sending:
+            with ledger.lock:
+                links = self.links
+                sends = replication.take(ledger.clock(), ledger.spec.timeout_s)
+                ledger.outcomes.count["sent"] += sum(send.is_copy for send in sends)
+            for replica, id, payload, timeout_s, is_copy in sends:
+                link = links.get(replica)
+                if link is None or not link.offer(ledger.spec.name, id, payload, timeout_s):
+                    self._declined(id, replica, is_copy=is_copy)
+
+    def _declined(self, id: bytes, replica: int, *, is_copy: bool) -> None:
+        """A link did not take an attempt."""
+        with self._ledger.lock:
+            self._ledger.outcomes.count["sent"] -= is_copy
+            pending = self._ledger.requests.get(id)
+            if pending is not None and pending.item.trace is not None:
+                pending.item.trace.declined(replica, pending.open.get(replica))
+            if is_copy:
+                self._ledger.requests.declined(id, replica)
+            if self._replication is not None:
+                self._replication.declined(id, replica, self._ledger.clock())
+
+    def forget(self, request: bytes, replicas: Iterable[int]) -> None:
+        """Tell replicas that a request has ended, but those that shall go on with it."""
+        requests = self._ledger.requests
+        if requests.decide.hears_out(request):
+            return
+        for replica in replicas:
+            link = self.links.get(replica)
+            if link is not None and not requests.choose.awaits(request, replica):
+                link.forget(request)
+
+
+def key_of(link: Link) -> int:
+    """Return a small number for the replica of a link: slot and generation."""
+    id = link.peer.id
+    return id.slot << 32 | id.generation

@@ -1,0 +1,262 @@
+"""One service's requests that await an answer, with what chooses and what decides. Pure.
+
+Every step of a request's life is one method: it is begun, sent on, answered, refused, and
+closed. Each keeps the table, the policy and the decision in step, and returns what is to be
+done. Called under its owner's lock; the time is an argument.
+
+Owns: bringing `first_response`, `choose`, `decide` and `fallback` together.
+Not here: sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+from fogft.model.refusal import Effect, Refusal
+from fogft.requests.choose import NEVER, Choose
+from fogft.requests.decide import Decide, Judgement, Means
+from fogft.requests.fallback import FallbackTimer
+from fogft.requests.first_response import FirstResponse, Pending, Verdict
+
+
+class Item(Protocol):
+    """What must be known of what is kept with a request."""
+
+    payload: bytes
+
+
+T = TypeVar("T", bound=Item)
+
+
+class Judged(NamedTuple, Generic[T]):
+    """What an answer has brought about.
+
+    Attributes:
+        means: What it means for its request.
+        pending: The request that it answers; None where it comes too late, or is no success.
+        losers: Who else is to stop working on that.
+        verdict: What is to be done for the request, where it goes on.
+    """
+
+    means: Judgement
+    pending: Pending[T] | None = None
+    losers: Iterable[int] = ()
+    verdict: Verdict = Verdict.LATE
+
+
+class PendingRequests(Generic[T]):
+    """The requests of one service that await an answer.
+
+    Attributes:
+        held_bytes: Their bytes.
+        choose: Which replicas are asked.
+        decide: What answers mean.
+        fallback: When the fallback is asked; None where there never was one.
+    """
+
+    def __init__(self, choose: Choose, decide: Decide) -> None:
+        self._table: FirstResponse[T] = FirstResponse()
+        self.held_bytes = 0
+        self.choose = choose
+        self.decide = decide
+        self.fallback: FallbackTimer[Pending[T]] | None = None
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    def __contains__(self, request: bytes) -> bool:
+        return request in self._table
+
+    def get(self, request: bytes | None) -> Pending[T] | None:
+        """Return a request that still awaits its answer."""
+        return None if request is None else self._table.get(request)
+
+    def use(self, choose: Choose) -> None:
+        """Have another policy choose from now on; each request is put before it."""
+        self.choose = choose
+        self._table.reconsider()
+
+    # -- a request begins, and is sent to replicas ----------------------------------------
+
+    def begin(
+        self, request: bytes, item: T, able: Sequence[int], *, deadline: float, now: float
+    ) -> Sequence[int]:
+        """Enter a request; return which replicas it goes to at once.
+
+        Raises:
+            ValueError: The id is under way already.
+        """
+        chosen = self.choose.first(request, able, now)
+        pending = self._table.register(
+            request,
+            deadline=deadline,
+            item=item,
+            replicas=chosen,
+            now=now,
+            complete=len(chosen) == len(able),
+        )
+        self.held_bytes += len(item.payload)
+        self.decide.began(request, pending, able)
+        return chosen
+
+    def look_at(self, *, able: bool) -> float:
+        """Return when something may have to be sent though nothing else happens."""
+        at = self.choose.look_at
+        return at if self.fallback is None else min(at, self.fallback.look_at(able=able))
+
+    def more(
+        self, able: Sequence[int], now: float, *, newest_first: bool
+    ) -> list[tuple[bytes, int]]:
+        """Return which requests go to which further replicas now."""
+        self.choose.look_at = NEVER
+        short = self._table.short()
+        return [
+            (request, replica)
+            for request, pending in (short[::-1] if newest_first else short)
+            for replica in self.choose.more(
+                pending.open, self._table.candidates(pending, able, now), now
+            )
+        ]
+
+    def attempt(self, request: bytes, replica: int, now: float) -> Pending[T] | None:
+        """Enter a further attempt; None where it is not wanted any more."""
+        pending = self._table.attempt(request, replica, now)
+        if pending is None:
+            self.choose.declined(replica, full=False)
+        return pending
+
+    def passed_over(self, replica: int) -> None:
+        """A replica was not asked because it has just declined another request."""
+        self.choose.declined(replica, full=False)
+
+    def declined(self, request: bytes, replica: int) -> None:
+        """A replica's link did not take an attempt."""
+        self._table.declined(request, replica)
+        self.choose.declined(replica, full=True)
+
+    def came(self, replicas: Iterable[int]) -> None:
+        """These replicas can be asked (again)."""
+        for replica in replicas:
+            self._table.came(replica)
+
+    def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
+        """A replica has begun anew what some requests are about: what it said before is void."""
+        self._table.welcome(replica, about)
+
+    # -- how its attempts end -------------------------------------------------------------
+
+    def answered(
+        self, id: bytes, request: bytes | None, replica: int, answer: tuple[bytes, Any], now: float
+    ) -> Judged[T]:
+        """Take an answer.
+
+        Args:
+            id: Of the attempt.
+            request: What it is about; None for no request.
+            replica: Who answered.
+            answer: Its bytes, and what `Decide.read` makes of them.
+            now: Seconds.
+        """
+        payload, reading = answer
+        pending = self.get(request)
+        means = self.decide.judge(id, replica, payload, reading, pending)
+        if request is None:
+            return Judged(means)
+        if means is Means.SUCCESS:
+            _, pending = self._table.succeeded(request, now)
+            if pending is None:
+                self.choose.late(request, replica, now, answered=True)
+                return Judged(means)
+            losers = self.choose.answered(request, pending.open, replica, now)
+            self._closed(request, pending)
+            return Judged(means, pending, losers)
+        if means is Means.UNDECIDED:
+            verdict = self._table.failed(request, replica, now, counts=False, bar=True)
+            return Judged(means, None, (), Verdict.WAIT if pending is not None else verdict)
+        if means is Means.REJECTION or means is Means.WEAKER_REJECTION:
+            weaker = means is Means.WEAKER_REJECTION and pending is not None
+            kept = pending.rejection if weaker and pending is not None else None
+            verdict = self._table.rejected(request, replica, payload if kept is None else kept)
+            self._failed(request, replica, verdict, now, answered=True)
+            return Judged(Means.REJECTION, None, (), verdict)
+        return Judged(means)
+
+    def refused(self, request: bytes, replica: int, refusal: Refusal, now: float) -> Verdict:
+        """Take a refusal."""
+        verdict = self._table.failed(
+            request,
+            replica,
+            now,
+            counts=Effect.BLAMELESS not in refusal.effect,
+            bar=Effect.FINAL in refusal.effect,
+        )
+        self._failed(request, replica, verdict, now, answered=False)
+        return verdict
+
+    def _failed(
+        self, request: bytes, replica: int, verdict: Verdict, now: float, *, answered: bool
+    ) -> None:
+        if verdict is Verdict.LATE:
+            self.choose.late(request, replica, now, answered=answered)
+        else:
+            self.choose.failed(request, replica, now)
+
+    # -- a request ends -------------------------------------------------------------------
+
+    def settle(self, request: bytes, able: Iterable[int]) -> Pending[T] | None:
+        """Take a request out whose rejection is the answer: nobody else can be asked."""
+        pending = self._table.get(request)
+        if pending is None or pending.open or pending.rejection is None:
+            return None
+        if any(replica not in pending.barred for replica in able):
+            return None
+        self._table.close(request)
+        self._closed(request, pending)
+        return pending
+
+    def idle(self) -> list[bytes]:
+        """Return the requests that nobody works on."""
+        return [request for request, _ in self._table.idle()]
+
+    def stop(self, request: bytes, now: float) -> Pending[T] | None:
+        """Take a request out that its caller does not want any more."""
+        pending = self._table.close(request)
+        if pending is not None:
+            self._stopped(request, pending, now)
+        return pending
+
+    def expire(self, now: float) -> list[tuple[bytes, Pending[T]]]:
+        """Take out every request whose deadline has come, oldest first."""
+        expired = self._table.expire(now)
+        for request, pending in expired:
+            self.choose.stopped(request, pending.open, now, expired=True)
+            self.held_bytes -= len(pending.item.payload)
+            self.decide.closed(request, pending)
+        return expired
+
+    def fallback_answered(
+        self, request: bytes, now: float, *, ok: bool
+    ) -> tuple[Pending[T] | None, bool]:
+        """Take the fallback's answer; return the request that ends by it, and if that was overdue.
+
+        One that is overdue ends in any case, with the rejection that was kept, or with silence.
+        """
+        assert self.fallback is not None
+        overdue = self.fallback.answered(request)
+        if overdue is not None or not ok:
+            return overdue, True
+        _, pending = self._table.succeeded(request, now)
+        if pending is not None:
+            self._stopped(request, pending, now)
+        return pending, False
+
+    def _stopped(self, request: bytes, pending: Pending[T], now: float) -> None:
+        self.choose.stopped(request, pending.open, now)
+        self._closed(request, pending)
+
+    def _closed(self, request: bytes, pending: Pending[T]) -> None:
+        self.held_bytes -= len(pending.item.payload)
+        self.decide.closed(request, pending)
+        if self.fallback is not None:
+            self.fallback.ended(request)
