@@ -149,7 +149,14 @@ class PoolStore:
         return read
 
     def _read(self, raw: bytes) -> PoolSpec:
-        return self._parse(raw.decode(), self.identity().file)
+        try:
+            text = raw.decode()
+        except UnicodeDecodeError as error:
+            raise SpecError(
+                f"`{self.paths.spec}` is damaged: {error}",
+                "run `fogft up` to write it again, or `fogft down` to end the pool",
+            ) from None
+        return self._parse(text, self.identity().file)
 
     def _applied(self) -> bytes:
         try:

@@ -10,7 +10,7 @@ import pytest
 
 from fogft import disk
 from fogft.cloud.port import Launch
-from fogft.errors import CloudUnreachable, FogftError, PoolNotFound
+from fogft.errors import CloudUnreachable, FogftError, PoolNotFound, SpecError
 from fogft.model.replica import ReplicaId
 from fogft.pool.manager import shutdown
 from tests.pool.folder_cloud import ZONES
@@ -154,3 +154,17 @@ def test_of_two_at_once_one_ends_the_pool_and_neither_complains(scene: Scene) ->
         ended = sorted(len(down.result()) for down in downs)
     assert ended[0] == 0
     assert ended[1] >= 3
+
+
+def test_a_damaged_specification_neither_stops_its_repair_nor_the_end(scene: Scene) -> None:
+    """What a bad disk leaves is one clear error; `up` writes it anew and `down` needs none."""
+    scene.write(replicas=1)
+    scene.paths.spec.write_bytes(b"\xff\xfe\x00 not text")
+    with pytest.raises(SpecError, match="is damaged") as caught:
+        scene.store.spec()
+    assert "fogft down" in caught.value.hint
+    assert scene.write(replicas=1).changed
+    assert scene.store.spec().replicas == 1
+    scene.paths.spec.write_bytes(b"\xff\xfe\x00 not text")
+    scene.end()
+    assert not scene.paths.folder.exists()
