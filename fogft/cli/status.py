@@ -32,11 +32,19 @@ def status(
     refresh: Annotated[
         bool, typer.Option("--refresh", "-r", help="Have the manager observe the pool first.")
     ] = False,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print the JSON Schema of --json, and stop.")
+    ] = False,
 ) -> None:
     """Show a pool: its replicas, their links, and the outcome of requests.
 
     This is what the manager last saw, and how long ago.
     """
+    if schema:
+        from fogft.pool.commands.status_schema import status_schema
+
+        output.json_data(status_schema())
+        return
     from fogft.cli import status_text
     from fogft.pool.commands import composition
     from fogft.pool.commands.status import read, refreshed

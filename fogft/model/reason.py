@@ -6,7 +6,7 @@ Decisions compare causes. Words are made of a reason where people read it, by `r
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
 
@@ -149,14 +149,7 @@ class Reason:
 
     def to_plain(self) -> dict[str, Any]:
         """Return its JSON form: the cause and the data that it has."""
-        out: dict[str, Any] = {"cause": self.cause.value}
-        for name in _DATA:
-            value = getattr(self, name)
-            if value not in (None, "", ()):
-                out[name] = value
-        if self.because:
-            out["because"] = [one.to_plain() for one in self.because]
-        return out
+        return asdict(self, dict_factory=plain)
 
     @classmethod
     def from_plain(cls, raw: Mapping[str, Any]) -> Reason:
@@ -182,11 +175,17 @@ class Reason:
         return self.cause in _MOVES
 
 
-_DATA = [field.name for field in fields(Reason) if field.name not in ("cause", "because")]
 _MOVES = frozenset(
     {Cause.BETTER_SPREAD, Cause.BETTER_SCORE, Cause.SPOT_AGAIN, Cause.ON_DEMAND_AGAIN}
 )
 _NOT_THE_PLACE = _MOVES | {Cause.OUTDATED}
+
+
+def plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a plain map of a dataclass for `asdict`, of a reason without the data it has not."""
+    if items[0][0] != "cause":
+        return dict(items)
+    return {name: value for name, value in items if value not in (None, "", ())}
 
 
 def because(reason: Reason | None) -> tuple[Reason, ...]:

@@ -28,7 +28,7 @@ from typing import Any
 from fogft import disk
 from fogft.cloud.local import processes
 from fogft.errors import CloudError, StateError
-from fogft.model.reason import Reason
+from fogft.model.reason import Reason, plain
 from fogft.model.replica import MachinePhase, Placement, ReplicaId
 
 RECORD = "machine.json"
@@ -184,9 +184,7 @@ class MachineFolder:
 
     def write_state(self, state: State) -> None:
         """Say how far the machine has come. Raises `StateError` on a full disk."""
-        plain = asdict(state)
-        plain["failure"] = state.failure.to_plain() if state.failure is not None else None
-        disk.write_json(self.path / STATE, plain, durable=False)
+        disk.write_json(self.path / STATE, asdict(state, dict_factory=plain), durable=False)
 
     def notice_at(self) -> float | None:
         """Return when a preempted machine ends; None without a notice."""

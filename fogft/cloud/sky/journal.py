@@ -22,7 +22,7 @@ from typing import Any
 from fogft.cloud.sky.naming import cluster_name, replica_of
 from fogft.disk import locked, make_folder, read_json, write_json, write_whole
 from fogft.errors import StateError
-from fogft.model.reason import Reason
+from fogft.model.reason import Reason, plain
 from fogft.model.replica import Placement, ReplicaId
 
 
@@ -142,9 +142,7 @@ class Journal:
         return self._folder / f"{cluster_name(id)}.json"
 
     def _write(self, entry: Entry) -> None:
-        plain = asdict(entry)
-        plain["failure"] = entry.failure.to_plain() if entry.failure is not None else None
-        write_json(self._path(entry.id), plain)
+        write_json(self._path(entry.id), asdict(entry, dict_factory=plain))
 
 
 def _entry(value: Any, path: Path) -> Entry:

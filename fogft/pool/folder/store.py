@@ -17,7 +17,7 @@ from fogft.errors import PoolNotFound, SpecError, StateError
 from fogft.model.intent import Intent, from_json, to_json
 from fogft.model.membership import from_dict, to_dict
 from fogft.model.names import POOL_UID_PATTERN
-from fogft.model.reason import Reason
+from fogft.model.reason import Reason, plain
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import Event, History
@@ -214,8 +214,7 @@ class PoolStore:
         Raises:
             StateError: It cannot be written.
         """
-        fault = trial.fault.to_plain() if trial.fault is not None else None
-        disk.write_json(self.paths.trial, {**asdict(trial), "fault": fault})
+        disk.write_json(self.paths.trial, asdict(trial, dict_factory=plain))
 
     def intent(self) -> Intent:
         """Return what the user wants besides the file; nothing where nothing was asked."""

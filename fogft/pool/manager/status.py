@@ -6,12 +6,12 @@ Not here: how it is shown (`fogft.cli`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fogft.errors import StateError
-from fogft.model.reason import Cause, Reason
+from fogft.model.reason import Cause, Reason, plain
 from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
 from fogft.planning.observed.history import MOVING, Event, EventKind, History
 from fogft.reason_words import words
@@ -22,6 +22,10 @@ if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.pool.manager.proxy_report import ProxyReport
     from fogft.pool.manager.reconciler import Tick
 
+T = TypeVar("T")
+
+VERSION = 1
+"""Of the JSON form: goes up when a key goes or changes what it means, not when one comes."""
 WORDS = {
     EventKind.LAUNCH: "launched",
     EventKind.REFUSED: "refused",
@@ -53,14 +57,14 @@ class ReplicaStatus:
 
     slot: int
     generation: int
-    phase: str
+    phase: str = field(metadata={"words": tuple(phase.value for phase in Phase)})
     verdict: str
     location: str
     instance: str
     spot: bool
     usd_per_hour: float
     endpoint: str | None
-    link: str
+    link: str = field(metadata={"words": ("", *(state.value for state in LinkState))})
     rtt_s: float | None
     silent_for_s: float
     won: int
@@ -69,7 +73,7 @@ class ReplicaStatus:
     age_s: float | None
     detail: str
     differs: bool = False
-    reason: Mapping[str, Any] | None = None
+    reason: Reason | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,26 @@ class UpdateStatus:
     done: int
     of: int
     fault: str = ""
-    reason: Mapping[str, Any] | None = None
+    reason: Reason | None = None
+
+
+@dataclass(frozen=True)
+class EventStatus:
+    """Something that happened.
+
+    Attributes:
+        at: Seconds since the epoch.
+        event: In a word or three; see `WORDS`.
+        replica: ``slot.generation``; empty for what is of no replica.
+        detail: Why, in words; `reason` is the same as ``{cause, ...}``.
+    """
+
+    at: float
+    event: str = field(metadata={"words": tuple(WORDS.values())})
+    replica: str
+    location: str
+    detail: str
+    reason: Reason | None = None
 
 
 @dataclass(frozen=True)
@@ -115,10 +138,10 @@ class PoolStatus:
         ended: Why the manager has ended the pool by itself; empty while it runs.
         notes: Why the pool is not yet as wanted, in sentences.
         reasons: The same, one for each note, as ``{cause, ...}``.
+        version: Of this schema; see `fogft.pool.commands.status_schema`.
         topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
             how this machine's robot finds its gateways; empty where there are none.
-        events: The last things that happened: ``{at, event, replica, location, detail,
-            reason}``.
+        events: The last things that happened.
         applied: Digest of the pool file that was applied last.
     """
 
@@ -140,18 +163,19 @@ class PoolStatus:
     ended: str = ""
     excluded: Sequence[str] = ()
     notes: Sequence[str] = ()
-    reasons: Sequence[Mapping[str, Any]] = ()
+    reasons: Sequence[Reason] = ()
     replicas: Sequence[ReplicaStatus] = ()
     by_hand: Sequence[ReplicaStatus] = ()
     services: Sequence[ServiceStatus] = ()
-    events: Sequence[Mapping[str, Any]] = ()
+    events: Sequence[EventStatus] = ()
     applied: str = ""
     update: UpdateStatus | None = None
     topology: Mapping[str, Any] = field(default_factory=dict)
+    version: int = VERSION
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form."""
-        return asdict(self)
+        return asdict(self, dict_factory=plain)
 
 
 def from_json(raw: Any) -> PoolStatus:
@@ -161,14 +185,23 @@ def from_json(raw: Any) -> PoolStatus:
         StateError: It is none, or of another version of fogft.
     """
     try:
-        replicas = [ReplicaStatus(**replica) for replica in raw["replicas"]]
-        by_hand = [ReplicaStatus(**replica) for replica in raw.get("by_hand", ())]
-        services = [ServiceStatus(**service) for service in raw["services"]]
-        update = UpdateStatus(**raw["update"]) if raw.get("update") else None
-        found = {"replicas": replicas, "by_hand": by_hand, "services": services, "update": update}
+        update = raw["update"]
+        found = {
+            "replicas": [_with_reason(ReplicaStatus, one) for one in raw["replicas"]],
+            "by_hand": [_with_reason(ReplicaStatus, one) for one in raw["by_hand"]],
+            "services": [ServiceStatus(**one) for one in raw["services"]],
+            "events": [_with_reason(EventStatus, one) for one in raw["events"]],
+            "update": _with_reason(UpdateStatus, update) if update else None,
+            "reasons": [Reason.from_plain(one) for one in raw["reasons"]],
+        }
         return PoolStatus(**{**raw, **found})
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise StateError(f"not a status: {error}", "is the manager of another version?") from error
+
+
+def _with_reason(cls: Callable[..., T], raw: Mapping[str, Any]) -> T:
+    reason = raw["reason"]
+    return cls(**{**raw, "reason": Reason.from_plain(reason) if reason else None})
 
 
 def of_tick(
@@ -213,7 +246,7 @@ def of_tick(
         proxy_alive=proxy_alive,
         excluded=sorted(tick.intent.excluded),
         notes=[words(note) for note in said],
-        reasons=[note.to_plain() for note in said],
+        reasons=said,
         replicas=replicas,
         by_hand=[_started_by_hand(member, links, tick.spec) for member in by_hand],
         services=_services(tick.spec, heard, report),
@@ -229,7 +262,7 @@ def _update(tick: Tick) -> UpdateStatus | None:
     if update is None:
         return None
     fault = update.fault
-    return UpdateStatus(update.state.value, update.done, update.of, words(fault), _plain(fault))
+    return UpdateStatus(update.state.value, update.done, update.of, words(fault), fault)
 
 
 def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
@@ -240,10 +273,6 @@ def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
     links = [dict(one) for one in report.gateways] if report is not None else []
     robot = report.robot if report is not None else ""
     return {"robot": robot, **here.to_plain(), "links": links}
-
-
-def _plain(reason: Reason | None) -> dict[str, Any] | None:
-    return None if reason is None else reason.to_plain()
 
 
 def _without_certificate(tick: Tick) -> list[Reason]:
@@ -282,7 +311,7 @@ def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float)
         age_s=max(0.0, now - launched_at),
         detail=_detail(one),
         differs=link is not None and link.differs,
-        reason=_plain(one.why),
+        reason=one.why,
     )
 
 
@@ -339,12 +368,12 @@ def _services(
     ]
 
 
-def _event(event: Event) -> dict[str, Any]:
-    return {
-        "at": event.at,
-        "event": WORDS[event.kind],
-        "replica": "" if event.kind in MOVING else f"{event.slot}.{event.generation}",
-        "location": event.location,
-        "detail": words(event.reason),
-        "reason": _plain(event.reason),
-    }
+def _event(event: Event) -> EventStatus:
+    return EventStatus(
+        at=event.at,
+        event=WORDS[event.kind],
+        replica="" if event.kind in MOVING else f"{event.slot}.{event.generation}",
+        location=event.location,
+        detail=words(event.reason),
+        reason=event.reason,
+    )

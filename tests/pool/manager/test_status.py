@@ -102,9 +102,9 @@ def test_status_says_what_was_seen_and_survives_json() -> None:
     assert seen.services[0].ready_replicas == 3
     assert seen.services[0].counters["answered"] == 3
     assert seen.notes[-1] == "one more"
-    assert seen.reasons[-1] == {"cause": "trouble", "words": "one more"}
-    assert [r.reason for r in seen.replicas] == [None, {"cause": "preemption_notice"}, None]
-    assert seen.events[0]["event"] == "launched"
+    assert seen.reasons[-1] == Reason(Cause.TROUBLE, words="one more")
+    assert [r.reason for r in seen.replicas] == [None, Reason(Cause.NOTICE), None]
+    assert seen.events[0].event == "launched"
     again = status.from_json(json.loads(json.dumps(seen.to_json())))
     assert again.to_json() == json.loads(json.dumps(seen.to_json()))
 
