@@ -108,7 +108,7 @@ class AdmissionQueue(Generic[T]):
             queue.heap = [kept for kept in queue.heap if kept.item is not None]
             heapq.heapify(queue.heap)
 
-    def give_way(self, robot: str, deadline: float) -> T | None:
+    def evict(self, robot: str, deadline: float) -> T | None:
         """Take out what must go for a newcomer to fit in; None if the newcomer itself must.
 
         Args:

@@ -43,18 +43,18 @@ def test_turns_cannot_be_saved_up():
 
 def test_when_full_the_robot_with_most_gives_way():
     queue = filled(("chatty", 1.0), ("chatty", 7.0), ("chatty", 5.0))
-    assert queue.give_way("quiet", 9.0) == "chatty1"
+    assert queue.evict("quiet", 9.0) == "chatty1"
     assert len(queue) == 2
 
 
 def test_when_full_an_urgent_request_displaces_a_later_one_of_its_own_robot():
     queue = filled(("a", 1.0), ("a", 7.0))
-    assert queue.give_way("a", 3.0) == "a1"
-    assert queue.give_way("a", 9.0) is None
+    assert queue.evict("a", 3.0) == "a1"
+    assert queue.evict("a", 9.0) is None
 
 
 def test_equal_shares_displace_nobody():
-    assert filled(("a", 1.0), ("a", 1.0), ("b", 1.0)).give_way("b", 0.5) is None
+    assert filled(("a", 1.0), ("a", 1.0), ("b", 1.0)).evict("b", 0.5) is None
 
 
 robots = st.sampled_from("abc")
@@ -96,7 +96,7 @@ def test_each_comes_out_once_and_nobody_starves(operations):
             assert queue.remove(chosen.to_bytes(2, "big")) == chosen
             del waiting[chosen]
         elif operation == "give way":
-            gone = queue.give_way(robot, value)
+            gone = queue.evict(robot, value)
             if gone is not None:
                 del waiting[gone]
         present = {who for who, _ in waiting.values()}
@@ -123,7 +123,7 @@ def test_the_stalest_gives_way_to_a_newer_one_of_its_own_robot():
     queue: AdmissionQueue[str] = AdmissionQueue(latest=True)
     queue.put(b"old", "a", 1.0, "old")
     queue.put(b"new", "a", 7.0, "new")
-    assert queue.give_way("a", 0.5) is None
-    assert queue.give_way("a", 9.0) == "old"
+    assert queue.evict("a", 0.5) is None
+    assert queue.evict("a", 9.0) == "old"
     assert queue.ahead("a", 8.0) == 0
     assert queue.ahead("a", 5.0) == 1

@@ -43,7 +43,7 @@ class Forward(Protocol):
         """End a request that is no longer wanted."""
 
 
-class Passage:
+class Forwarded:
     """A request that passes through: who awaits its answer, and until when."""
 
     __slots__ = ("copies", "deadline", "id", "robot", "service")
@@ -86,11 +86,11 @@ class Forwarder:
         self._dispatchers: dict[str, Forward] = {}
         self._ready: frozenset[str] = frozenset()
         self._unready_since: dict[str, float] = {}
-        self._open: dict[bytes, Passage] = {}
+        self._open: dict[bytes, Forwarded] = {}
         self._by_robot: Counter[str] = Counter()
         self._kept: OrderedDict[bytes, tuple[float, bytes]] = OrderedDict()
         self.kept_bytes = 0
-        self._queue: SimpleQueue[Passage | None] = SimpleQueue()
+        self._queue: SimpleQueue[Forwarded | None] = SimpleQueue()
         self.passed = 0
         self.joined = 0
         self.refused: Counter[Refusal] = Counter()
@@ -125,10 +125,10 @@ class Forwarder:
                 return
             reason = None if kept is not None else self._reason_to_refuse(incoming)
             if kept is None and reason is None:
-                passage = Passage(incoming, now + incoming.remaining_s)
-                self._open[passage.id] = passage
-                self._by_robot[passage.robot] += 1
-                self._queue.put(passage)
+                forwarded = Forwarded(incoming, now + incoming.remaining_s)
+                self._open[forwarded.id] = forwarded
+                self._by_robot[forwarded.robot] += 1
+                self._queue.put(forwarded)
         if kept is not None:
             incoming.reply(kept[1])
         elif reason is not None:
@@ -153,71 +153,71 @@ class Forwarder:
 
     def _stop(self, id: bytes, reason: Refusal) -> None:
         with self._lock:
-            passage = self._take(id)
-        if passage is None:
+            forwarded = self._take(id)
+        if forwarded is None:
             return
-        self._dispatchers[passage.service].cancel(id)
-        for incoming in passage.copies:
+        self._dispatchers[forwarded.service].cancel(id)
+        for incoming in forwarded.copies:
             self._refuse(incoming, reason)
 
-    def _take(self, id: bytes) -> Passage | None:
+    def _take(self, id: bytes) -> Forwarded | None:
         """Take a request out. Under the lock."""
-        passage = self._open.pop(id, None)
-        if passage is not None:
-            self._by_robot[passage.robot] -= 1
-            if not self._by_robot[passage.robot]:
-                del self._by_robot[passage.robot]
-        return passage
+        forwarded = self._open.pop(id, None)
+        if forwarded is not None:
+            self._by_robot[forwarded.robot] -= 1
+            if not self._by_robot[forwarded.robot]:
+                del self._by_robot[forwarded.robot]
+        return forwarded
 
     # -- to replicas ----------------------------------------------------------------------
 
     def _pass_on(self) -> None:
-        while (passage := self._queue.get()) is not None:
+        while (forwarded := self._queue.get()) is not None:
             try:
-                self._forward(passage)
+                self._forward(forwarded)
             except Exception:  # in this thread nobody else would tell of it
-                log.exception("request_not_passed_on request=%s", passage.id.hex())
-                self._stop(passage.id, Refusal.LOST)
+                log.exception("request_not_passed_on request=%s", forwarded.id.hex())
+                self._stop(forwarded.id, Refusal.LOST)
 
-    def _forward(self, passage: Passage) -> None:
-        if self._open.get(passage.id) is not passage:
+    def _forward(self, forwarded: Forwarded) -> None:
+        if self._open.get(forwarded.id) is not forwarded:
             return  # stopped meanwhile
-        payload = passage.copies[-1].payload
-        left_s = passage.deadline - self._clock()
+        payload = forwarded.copies[-1].payload
+        left_s = forwarded.deadline - self._clock()
         if left_s <= 0:
-            self._stop(passage.id, Refusal.EXPIRED)
+            self._stop(forwarded.id, Refusal.EXPIRED)
             return
-        dispatcher = self._dispatchers[passage.service]
-        if not dispatcher.forward(passage.id, payload, passage, left_s):
-            self._stop(passage.id, Refusal.OVERLOADED)
+        dispatcher = self._dispatchers[forwarded.service]
+        if not dispatcher.forward(forwarded.id, payload, forwarded, left_s):
+            self._stop(forwarded.id, Refusal.OVERLOADED)
             return
         self.passed += 1
-        if self._open.get(passage.id) is not passage:
-            dispatcher.cancel(passage.id)  # stopped in between; answered is fine, too
+        if self._open.get(forwarded.id) is not forwarded:
+            dispatcher.cancel(forwarded.id)  # stopped in between; answered is fine, too
 
     def pass_on_waiting(self) -> None:
         """Pass on what was taken; for tests without a thread."""
         while not self._queue.empty():
-            passage = self._queue.get()
-            if passage is not None:
-                self._forward(passage)
+            forwarded = self._queue.get()
+            if forwarded is not None:
+                self._forward(forwarded)
 
     # -- from replicas (their links' threads) ---------------------------------------------
 
     def respond(self, handle: Any, payload: bytes) -> None:
         """Give an answer to all that await it, and keep it for copies that come later."""
-        passage: Passage = handle
+        forwarded: Forwarded = handle
         with self._lock:
-            if self._open.get(passage.id) is not passage:
+            if self._open.get(forwarded.id) is not forwarded:
                 return
-            self._take(passage.id)
-            self._keep(passage, payload)
+            self._take(forwarded.id)
+            self._keep(forwarded, payload)
             more = bool(self._open)
-        for incoming in passage.copies:
+        for incoming in forwarded.copies:
             incoming.reply(payload, more=more)
 
-    def _keep(self, passage: Passage, payload: bytes) -> None:
-        self._kept[passage.id] = (passage.deadline, payload)
+    def _keep(self, forwarded: Forwarded, payload: bytes) -> None:
+        self._kept[forwarded.id] = (forwarded.deadline, payload)
         self.kept_bytes += len(payload)
         while self.kept_bytes > self._kept_limit or len(self._kept) > 4 * self._held:
             _, (_, oldest) = self._kept.popitem(last=False)
@@ -239,15 +239,15 @@ class Forwarder:
         self._ready = ready
         hopeless = {n for n, since in self._unready_since.items() if now - since >= UNREADY_S}
         with self._lock:
-            passages = list(self._open.values())
+            all_forwarded = list(self._open.values())
             while self._kept and next(iter(self._kept.values()))[0] <= now:
                 _, (_, payload) = self._kept.popitem(last=False)
                 self.kept_bytes -= len(payload)
-        for passage in passages:
-            if passage.deadline <= now:
-                self._stop(passage.id, Refusal.EXPIRED)
-            elif passage.service in hopeless:
-                self._stop(passage.id, Refusal.NOT_READY)
+        for forwarded in all_forwarded:
+            if forwarded.deadline <= now:
+                self._stop(forwarded.id, Refusal.EXPIRED)
+            elif forwarded.service in hopeless:
+                self._stop(forwarded.id, Refusal.NOT_READY)
 
     def report(self) -> dict[str, Any]:
         """Return counters since the start."""

@@ -33,7 +33,7 @@ from fogft.topics import goals
 log = logging.getLogger(__name__)
 
 _ACCEPTED_KEPT = 16_384  # of each action, 200 bytes each
-_LINE_LIMIT = 512
+_QUEUE_LIMIT = 512
 _COPIES_LIMIT = 64
 _BYTES_LIMIT = 64 << 20  # of all goals that have no answer
 # An action server that has not answered for so long is given others beside it.
@@ -63,7 +63,7 @@ class _ActionServer:
     def __init__(self) -> None:
         self.life = 0
         self.death = "", -math.inf  # what part was seen to be gone, and when
-        self.line: deque[bytes] = deque()  # goals that it was not given yet
+        self.queue: deque[bytes] = deque()  # goals that it was not given yet
         self.open: dict[bytes, _Open] = {}
         self.accepted: OrderedDict[bytes, bytes] = OrderedDict()
 
@@ -133,7 +133,7 @@ class GoalsOnce:
                 known = server.open.get(goal)
                 if known is None:
                     known = server.open[goal] = _Open(incoming.payload)
-                    server.line.append(goal)
+                    server.queue.append(goal)
                 known.waiting.append((self._clock() + incoming.remaining_s, incoming))
         if answer is not None:
             incoming.reply(answer)
@@ -154,7 +154,7 @@ class GoalsOnce:
             return Refusal.OVERLOADED
         known = server.open.get(goal)
         if known is None:
-            return Refusal.OVERLOADED if len(server.line) >= _LINE_LIMIT else None
+            return Refusal.OVERLOADED if len(server.queue) >= _QUEUE_LIMIT else None
         return Refusal.OVERLOADED if len(known.waiting) >= _COPIES_LIMIT else None
 
     # -- to the action server -------------------------------------------------------------
@@ -164,9 +164,9 @@ class GoalsOnce:
         server = self._servers[service]
         while True:
             with self._lock:
-                if not server.line or server.at_work >= self._outstanding:
+                if not server.queue or server.at_work >= self._outstanding:
                     return
-                goal, life = server.line.popleft(), server.life
+                goal, life = server.queue.popleft(), server.life
                 known = server.open[goal]
                 known.begun_at, known.holds = self._clock(), True
                 payload, known.payload = known.payload, b""
@@ -241,7 +241,7 @@ class GoalsOnce:
                     if known.begun_at is None:
                         if not known.waiting:  # never begun: nobody wants it any more
                             del server.open[goal]
-                            server.line.remove(goal)
+                            server.queue.remove(goal)
                     elif now - known.begun_at > _PATIENCE_S:
                         known.holds = False
         for incoming in late:
@@ -262,7 +262,7 @@ class GoalsOnce:
                     server.life += 1
                     server.accepted.clear()
                     ended, server.open = server.open, {}
-                    server.line.clear()
+                    server.queue.clear()
                 self._refuse(name, ended.values(), Refusal.CRASHED)
 
     def left_ros(self) -> None:
@@ -273,8 +273,8 @@ class GoalsOnce:
         """
         for name, server in self._servers.items():
             with self._lock:
-                unbegun = [server.open.pop(goal) for goal in server.line]
-                server.line.clear()
+                unbegun = [server.open.pop(goal) for goal in server.queue]
+                server.queue.clear()
                 for known in server.open.values():
                     known.holds, known.unheard = False, True
             self._refuse(name, unbegun, Refusal.NOT_READY)

@@ -14,7 +14,7 @@ import logging
 from collections.abc import Callable, Mapping
 
 from fogft.errors import RosError
-from fogft.proxy.replica.service_queue import Line, Work
+from fogft.proxy.replica.service_queue import Job, ServiceQueue
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -31,19 +31,19 @@ class Interruptions:
 
     def __init__(self) -> None:
         self._clients: Mapping[str, RosClient] = {}
-        self._under_way: dict[str, tuple[Line, float]] = {}
+        self._under_way: dict[str, tuple[ServiceQueue, float]] = {}
 
     def use(self, clients: Mapping[str, RosClient]) -> None:
         """Set the clients of the cancel services, by the service that they interrupt."""
         self._clients = clients
 
-    def begin(self, work: Work, line: Line, now: float) -> bool:
+    def begin(self, job: Job, queue: ServiceQueue, now: float) -> bool:
         """Hold the service's next request back; whether there is something to be called."""
-        service = work.service
-        if service not in self._clients or service in self._under_way or not work.passed_on:
+        service = job.service
+        if service not in self._clients or service in self._under_way or not job.passed_on:
             return False
-        line.at_work += 1
-        self._under_way[service] = (line, now + _LIMIT_S)
+        queue.at_work += 1
+        self._under_way[service] = (queue, now + _LIMIT_S)
         return True
 
     def send(self, service: str, ended: Callable[[str], None]) -> bool:

@@ -1,17 +1,15 @@
 """The replica's side of its services: run each request once, answer every copy of it.
 
-A robot that lost its link sends what was in flight again, under the same request id. So
-the responder knows each id until its deadline: a copy joins the work in progress, or gets
-the kept answer, and is never run again.
+A copy (same request id) joins the work in progress, or gets the kept answer; it is never run again.
 
 At most `OUTSTANDING` requests a service are passed on at a time; the others wait here. An
 ordinary ROS service keeps the last ten requests that it has not yet begun and silently
 loses more, so what is passed on must never exceed that. What waits here past its deadline
 is never begun, nor what its robot no longer wants.
 
-Owns: the requests that this replica holds, and what becomes of them.
-Not here: in what order they run and how many (`service_queue`), readiness and `run` (`supervisor`),
-the wire, ROS.
+Owns: what becomes of the requests that this replica holds.
+Not here: which ids are known (`known_requests`), in what order they run and how many
+(`service_queue`), readiness and `run` (`supervisor`), links, ROS.
 """
 
 from __future__ import annotations
@@ -19,16 +17,15 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
-from typing import NamedTuple
 
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.interruption import Interruptions
-from fogft.proxy.replica.service_queue import Line, Work
+from fogft.proxy.replica.known_requests import KnownRequests, Remembered
+from fogft.proxy.replica.service_queue import Job, ServiceQueue
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -36,16 +33,6 @@ log = logging.getLogger(__name__)
 # The default depth of a service's queue (rmw_qos_profile_services_default). Kept true by
 # tests/proxy/test_processes.py, which sends a burst to an ordinary service.
 OUTSTANDING = 10
-_DEADLINES_KEPT = 1024  # of a service, of work that was forgotten
-
-
-class Remembered(NamedTuple):
-    """How much a `Responder` remembers."""
-
-    requests: int
-    deadlines: int
-    answers: int  # that copies of their requests would get
-    answer_bytes: int
 
 
 class Responder:
@@ -55,8 +42,7 @@ class Responder:
         is_ready: Whether a service can answer now.
         max_in_flight: Requests held at once; more are refused as overloaded, from whom has
             most waiting.
-        held_bytes: Their bytes together; more are refused as overloaded. The robots' windows
-            do not bound them: a robot that has its answer from elsewhere frees its window.
+        held_bytes: Their bytes together; more are refused as overloaded.
         outstanding: Requests passed on to one service at once, where no limit is given.
         limits: How many may be at work, by service, where it is not to be learned.
         latest: Services of which the newest request goes first.
@@ -98,20 +84,12 @@ class Responder:
         self._limits = dict(limits or {})
         self._latest = frozenset(latest)
         self._passing = passing
-        self._kept_bytes_limit = kept_bytes
-        self._kept_ids = kept_ids
         self._clock = clock
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
         self._interruptions = Interruptions()
-        self._work: OrderedDict[bytes, Work] = OrderedDict()
-        # One queue a service: its requests share a time-out, so the oldest expires first.
-        self._deadlines: dict[str, deque[tuple[float, bytes]]] = {}
-        self._lines: dict[str, Line] = {}
-        self._running = 0
-        self._held_bytes = 0
-        self._kept_bytes = 0
-        self._kept: OrderedDict[bytes, Work] = OrderedDict()
+        self._known = KnownRequests(kept_bytes, kept_ids)
+        self._queues: dict[str, ServiceQueue] = {}
         self.ran = 0
         self.ran_s = 0.0
         self.joined = 0
@@ -124,12 +102,12 @@ class Responder:
     @property
     def in_flight(self) -> int:
         """Requests that are held and not yet answered."""
-        return self._running
+        return self._known.held
 
     def report(self) -> dict[str, float]:
-        """Return what became of the work, as a probe's answer tells it."""
+        """Return what became of the job, as a probe's answer tells it."""
         return {
-            "held": self._running,
+            "held": self._known.held,
             "ran": self.ran,
             "ran_s": round(self.ran_s, 3),
             "saved": self.saved,
@@ -143,7 +121,7 @@ class Responder:
     @property
     def limits(self) -> dict[str, int]:
         """How many requests each service may have at once."""
-        return {name: line.limit.limit for name, line in self._lines.items()}
+        return {name: queue.limit.limit for name, queue in self._queues.items()}
 
     def use(
         self,
@@ -162,7 +140,7 @@ class Responder:
         id = incoming.request_id
         displaced = begun = None
         with self._lock:
-            known = self._work.get(id)
+            known = self._known.get(id)
             if known is not None:
                 self.joined += 1
                 if known.waiting is not None and not known.unwanted:
@@ -187,58 +165,45 @@ class Responder:
         else:
             self._pass_on(incoming.service)
 
-    def _accept(self, incoming: Incoming, now: float) -> Work | None:
+    def _accept(self, incoming: Incoming, now: float) -> Job | None:
         """Take a request; return it where it is to be passed on at once."""
-        work = Work(now + incoming.remaining_s, incoming)
-        service = work.service
-        line = self._lines[service]
-        self._work[work.id] = work
-        deadlines = self._deadlines.get(service)
-        if deadlines is None:
-            deadlines = self._deadlines[service] = deque()
-        deadlines.append((work.deadline, work.id))
-        if len(deadlines) > 2 * len(self._work) + _DEADLINES_KEPT:
-            self._deadlines[service] = self._live(deadlines)
-        self._running += 1
-        self._held_bytes += work.size
-        if line.open:
-            line.begin(work, now)
-            return work
-        line.put(work)
+        job = Job(now + incoming.remaining_s, incoming)
+        service = job.service
+        queue = self._queues[service]
+        self._known.add(job)
+        if queue.open:
+            queue.begin(job, now)
+            return job
+        queue.put(job)
         return None
 
-    def _live(self, deadlines: deque[tuple[float, bytes]]) -> deque[tuple[float, bytes]]:
-        """Return the deadlines without those of work that was forgotten or run anew."""
-        live = ((due, self._work.get(due[1])) for due in deadlines)
-        return deque(due for due, work in live if work is not None and work.deadline == due[0])
-
-    def _line(self, service: str) -> Line:
-        line = self._lines.get(service)
-        if line is None:
-            line = self._lines[service] = Line(
+    def _queue(self, service: str) -> ServiceQueue:
+        queue = self._queues.get(service)
+        if queue is None:
+            queue = self._queues[service] = ServiceQueue(
                 self._outstanding, self._limits.get(service), latest=service in self._latest
             )
-        return line
+        return queue
 
     def _reason_to_refuse(
         self, incoming: Incoming, now: float
-    ) -> tuple[Refusal | None, Work | None]:
+    ) -> tuple[Refusal | None, Job | None]:
         """Return why a request is not taken, None if it is, and what gives way to it."""
         service, remaining_s = incoming.service, incoming.remaining_s
         if remaining_s <= 0:
             return Refusal.EXPIRED, None
         if not self._is_ready(service) or service not in self._clients:
             return Refusal.NOT_READY, None
-        line = self._line(service)
+        queue = self._queue(service)
         deadline = now + remaining_s
-        if not line.open and line.hopeless(incoming.robot, deadline, remaining_s):
+        if not queue.open and queue.hopeless(incoming.robot, deadline, remaining_s):
             return Refusal.OVERLOADED, None
-        held_bytes = self._held_bytes + len(incoming.payload)
-        if held_bytes > self._held_bytes_limit and self._running:
+        held_bytes = self._known.held_bytes + len(incoming.payload)
+        if held_bytes > self._held_bytes_limit and self._known.held:
             return Refusal.OVERLOADED, None
-        if self._running < self._max_in_flight:
+        if self._known.held < self._max_in_flight:
             return None, None
-        displaced = line.give_way(incoming.robot, deadline)
+        displaced = queue.evict(incoming.robot, deadline)
         return (None, displaced) if displaced is not None else (Refusal.OVERLOADED, None)
 
     def cancel(self, ids: Iterable[bytes]) -> None:
@@ -249,22 +214,22 @@ class Responder:
         dropped, at_work = [], []
         with self._lock:
             for id in ids:
-                work = self._work.get(id)
-                if work is None or work.waiting is None or work.unwanted:
+                job = self._known.get(id)
+                if job is None or job.waiting is None or job.unwanted:
                     continue
-                work.unwanted = True
-                if self._line(work.service).remove(work):
+                job.unwanted = True
+                if self._queue(job.service).remove(job):
                     self.saved += 1
                     dropped.append(id)
-                elif work.passed_on:
-                    at_work.append(work)
+                elif job.passed_on:
+                    at_work.append(job)
         for id in dropped:
             self._end(id, Refusal.CANCELLED)
-        for work in at_work:
-            line = self._lines[work.service]
+        for job in at_work:
+            queue = self._queues[job.service]
             with self._lock:
-                held = self._interruptions.begin(work, line, self._clock())
-            if held and self._interruptions.send(work.service, self._interrupted):
+                held = self._interruptions.begin(job, queue, self._clock())
+            if held and self._interruptions.send(job.service, self._interrupted):
                 self.interrupted += 1
 
     def _interrupted(self, service: str) -> None:
@@ -276,29 +241,29 @@ class Responder:
 
     def _pass_on(self, service: str) -> None:
         """Give a service as much of what waits as it may have."""
-        line = self._lines[service]
+        queue = self._queues[service]
         while True:
             with self._lock:
-                work = line.take(self._clock())
-            if work is None:
+                job = queue.take(self._clock())
+            if job is None:
                 return
-            if work.passed_on:
-                self._call(work)
+            if job.passed_on:
+                self._call(job)
             else:
-                self._end(work.id, Refusal.EXPIRED)
+                self._end(job.id, Refusal.EXPIRED)
 
-    def _call(self, work: Work) -> bool:
+    def _call(self, job: Job) -> bool:
         """Give the service a request; return whether it was taken. If not, it has ended."""
         try:
-            payload, work.payload = work.payload, b""
-            on_response = partial(self._finished, work)
-            work.ticket = self._clients[work.service].call(payload, on_response)
+            payload, job.payload = job.payload, b""
+            on_response = partial(self._finished, job)
+            job.ticket = self._clients[job.service].call(payload, on_response)
         except RosError as error:
-            log.warning("request_not_passed_on service=%s reason=%r", work.service, str(error))
+            log.warning("request_not_passed_on service=%s reason=%r", job.service, str(error))
             hopeless = isinstance(error, Unreadable)
-            self._end(work.id, Refusal.MALFORMED if hopeless else Refusal.OVERLOADED)
+            self._end(job.id, Refusal.MALFORMED if hopeless else Refusal.OVERLOADED)
         except KeyError:
-            self._end(work.id, Refusal.NOT_READY)
+            self._end(job.id, Refusal.NOT_READY)
         else:
             self.ran += 1
             return True
@@ -308,81 +273,55 @@ class Responder:
     def remembered(self) -> Remembered:
         """How much of requests is remembered, answered ones included."""
         with self._lock:
-            deadlines = sum(map(len, self._deadlines.values()))
-            return Remembered(len(self._work), deadlines, len(self._kept), self._kept_bytes)
+            return self._known.remembered
 
-    def _finished(self, work: Work, payload: bytes) -> None:
+    def _finished(self, job: Job, payload: bytes) -> None:
         now = self._clock()
-        line = self._lines[work.service]
+        queue = self._queues[job.service]
         with self._lock:
-            waiting, work.waiting = work.waiting or [], None
-            if waiting and self._passing(work.service, payload):
-                self._work.pop(work.id, None)
-            elif waiting and not work.unwanted:
-                self._keep(work, payload)
+            waiting, job.waiting = job.waiting or [], None
             if waiting:
-                self._running -= 1
-                self._held_bytes -= work.size
-            more = line.at_work > 1
+                self._known.release(job)
+                if self._passing(job.service, payload):
+                    self._known.forget(job)
+                elif not job.unwanted:
+                    self._known.keep(job, payload)
+            more = queue.at_work > 1
         try:
             for incoming in waiting:
-                if work.unwanted:  # its bytes would be dropped at the other end
+                if job.unwanted:  # its bytes would be dropped at the other end
                     self._refuse(incoming, Refusal.LATE)
                 else:
                     incoming.reply(payload, more=more)
         finally:
-            self._over(work, line, now, wasted=not waiting or work.unwanted)
+            self._over(job, queue, now, wasted=not waiting or job.unwanted)
 
-    def _over(self, work: Work, line: Line, now: float, *, wasted: bool) -> None:
+    def _over(self, job: Job, queue: ServiceQueue, now: float, *, wasted: bool) -> None:
         """Give the room of finished work to what waits. After its replies: these cannot wait."""
         with self._lock:
-            line.finished(work, now)
-            self.ran_s += now - work.begun
+            queue.finished(job, now)
+            self.ran_s += now - job.begun
             if wasted:
                 self.wasted += 1
-                self.wasted_s += now - work.begun
-        if line:
-            self._pass_on(work.service)
-
-    def _keep(self, work: Work, answer: bytes) -> None:
-        """Keep an answer for copies, within the bounds. Under the lock."""
-        work.answer = answer
-        self._kept[work.id] = work
-        self._kept_bytes += len(answer)
-        while self._kept_bytes > self._kept_bytes_limit and self._kept:
-            _, oldest = self._kept.popitem(last=False)
-            self._kept_bytes -= len(oldest.answer or b"")
-            oldest.answer = None
-        if len(self._work) > self._kept_ids:
-            self._forget_oldest()
-
-    def _forget_oldest(self) -> None:
-        for id, work in self._work.items():
-            if work.waiting is None:
-                self._drop(id, work)
-                return
-
-    def _drop(self, id: bytes, work: Work) -> None:
-        del self._work[id]
-        if self._kept.pop(id, None) is not None:
-            self._kept_bytes -= len(work.answer or b"")
+                self.wasted_s += now - job.begun
+        if queue:
+            self._pass_on(job.service)
 
     def _end(self, id: bytes, reason: Refusal) -> None:
-        """End work without an answer: a copy that comes later may be run anew."""
+        """End a job without an answer: a copy that comes later may be run anew."""
         with self._lock:
-            work = self._work.get(id)
-            if work is None or work.waiting is None:
+            job = self._known.get(id)
+            if job is None or job.waiting is None:
                 return
-            del self._work[id]
-            waiting, work.waiting = work.waiting, None
-            self._running -= 1
-            self._held_bytes -= work.size
-            line = self._lines[work.service]
-            line.remove(work)
+            self._known.release(job)
+            self._known.forget(job)
+            waiting, job.waiting = job.waiting, None
+            queue = self._queues[job.service]
+            queue.remove(job)
             if reason is not Refusal.EXPIRED:
-                line.free(work)
-            elif work.passed_on:
-                line.overdue(work, self._clock())
+                queue.free(job)
+            elif job.passed_on:
+                queue.overdue(job, self._clock())
         for incoming in waiting:
             self._refuse(incoming, reason)
 
@@ -396,50 +335,36 @@ class Responder:
         What it had not been given is not blamed: it was just not ready for that.
         """
         with self._lock:
-            dead = [
-                work
-                for work in self._work.values()
-                if work.waiting is not None and service in (None, work.service)
-            ]
-            blamed = [work for work in dead if work.passed_on]
-            spared = [work for work in dead if not work.passed_on]
+            dead = self._known.unanswered(service)
+            blamed = [job for job in dead if job.passed_on]
+            spared = [job for job in dead if not job.passed_on]
             lost = []
-            for name, line in self._lines.items():
+            for name, queue in self._queues.items():
                 if service in (None, name):
-                    lost += line.abandoned(float("inf"))
+                    lost += queue.abandoned(float("inf"))
                     self._interruptions.ended(name)
-        for work in (*blamed, *lost):
-            self._forget_ticket(work)
-        for work in spared:  # first: room that the blamed leave is not for them
-            self._end(work.id, Refusal.NOT_READY)
-        for work in blamed:
-            self._end(work.id, Refusal.CRASHED)
+        for job in (*blamed, *lost):
+            self._forget_ticket(job)
+        for job in spared:  # first: room that the blamed leave is not for them
+            self._end(job.id, Refusal.NOT_READY)
+        for job in blamed:
+            self._end(job.id, Refusal.CRASHED)
 
     def tick(self) -> None:
         """Drop what is past its deadline. Call at about 10 Hz."""
         now = self._clock()
-        late: list[bytes] = []
         with self._lock:
-            for queue in self._deadlines.values():
-                while queue and queue[0][0] <= now:
-                    _, id = queue.popleft()
-                    work = self._work.get(id)
-                    if work is None or work.deadline > now:
-                        continue
-                    if work.waiting is None:
-                        self._drop(id, work)
-                    else:
-                        late.append(id)
-            abandoned = [work for line in self._lines.values() for work in line.abandoned(now)]
+            late = self._known.expired(now)
+            abandoned = [job for queue in self._queues.values() for job in queue.abandoned(now)]
             self._interruptions.tick(now)
         for id in late:
             self._end(id, Refusal.EXPIRED)
-        for work in abandoned:
-            self._forget_ticket(work)
-        for service in list(self._lines):
+        for job in abandoned:
+            self._forget_ticket(job)
+        for service in list(self._queues):
             self._pass_on(service)
 
-    def _forget_ticket(self, work: Work) -> None:
-        client = self._clients.get(work.service)
-        if client is not None and work.ticket is not None:
-            client.forget(work.ticket)
+    def _forget_ticket(self, job: Job) -> None:
+        client = self._clients.get(job.service)
+        if client is not None and job.ticket is not None:
+            client.forget(job.ticket)

@@ -1,4 +1,4 @@
-"""One service's work at a replica: what waits, what was passed on, and how many may be.
+"""The jobs of one service at a replica: what waits, what was passed on, and how many may be.
 
 In what order requests run is decided here and nowhere else (`take`). Called under the
 responder's lock.
@@ -15,12 +15,12 @@ from fogft.link.port import Incoming
 from fogft.requests.admission import AdmissionQueue
 from fogft.requests.concurrency import ConcurrencyLimit
 
-# Work whose deadline has passed is still in the service's hands and takes its room. After so
+# Job whose deadline has passed is still in the service's hands and takes its room. After so
 # long its response is taken for lost.
 _ABANDONED_AFTER_S = 60.0
 
 
-class Work:
+class Job:
     """A request that was accepted: who waits for it, and its answer once there is one."""
 
     __slots__ = (
@@ -37,15 +37,15 @@ class Work:
         self.size = len(first.payload)
         self.passed_on = False
         self.begun = 0.0  # when it was passed on, and
-        self.level = 0  # as the how manieth
+        self.level = 0  # how many were at work then, itself included
         self.unwanted = False  # its robot has its answer from elsewhere
         self.waiting: list[Incoming] | None = [first]  # None once it is done
         self.answer: bytes | None = None
         self.ticket: int | None = None
 
 
-class Line:
-    """The work of one service.
+class ServiceQueue:
+    """The jobs of one service.
 
     Args:
         most: What the service's own queue holds: never is more passed on, unless `given`.
@@ -54,77 +54,77 @@ class Line:
     """
 
     def __init__(self, most: int, given: int | None = None, *, latest: bool = False) -> None:
-        self._queue: AdmissionQueue[Work] = AdmissionQueue(latest=latest)
+        self._waiting: AdmissionQueue[Job] = AdmissionQueue(latest=latest)
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
-        self._overdue: deque[tuple[float, Work]] = deque()  # passed on, and past their deadline
+        self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
     def __len__(self) -> int:
-        return len(self._queue)
+        return len(self._waiting)
 
-    def put(self, work: Work) -> None:
-        """Let work wait for its turn."""
-        self._queue.put(work.id, work.robot, work.deadline, work)
+    def put(self, job: Job) -> None:
+        """Let a job wait for its turn."""
+        self._waiting.put(job.id, job.robot, job.deadline, job)
 
     @property
     def open(self) -> bool:
-        """Whether work that comes now is passed on at once: nothing waits, and there is room."""
-        return self.at_work < self.limit.limit and not len(self._queue)
+        """Whether a job that comes now is passed on at once: nothing waits, and there is room."""
+        return self.at_work < self.limit.limit and not len(self._waiting)
 
     def hopeless(self, robot: str, deadline: float, remaining_s: float) -> bool:
         """Whether a request would wait past its deadline, as far as is known."""
-        waiting = len(self._queue)
+        waiting = len(self._waiting)
         if not waiting or self.limit.wait_s(waiting, self.at_work) <= remaining_s:
             return False
-        return self.limit.wait_s(self._queue.ahead(robot, deadline), self.at_work) > remaining_s
+        return self.limit.wait_s(self._waiting.ahead(robot, deadline), self.at_work) > remaining_s
 
-    def give_way(self, robot: str, deadline: float) -> Work | None:
+    def evict(self, robot: str, deadline: float) -> Job | None:
         """Take out what must go so that a newcomer fits in; None if that must go itself."""
-        return self._queue.give_way(robot, deadline)
+        return self._waiting.evict(robot, deadline)
 
-    def take(self, now: float) -> Work | None:
+    def take(self, now: float) -> Job | None:
         """Return what is to be passed on next; None when nothing waits, or nothing more may be.
 
         What it returns may be past its deadline: then it was not begun and takes no room.
         """
         if self.at_work >= self.limit.limit:
             return None
-        work = self._queue.take()
-        if work is not None and work.deadline > now:
-            self.begin(work, now)
-        return work
+        job = self._waiting.take()
+        if job is not None and job.deadline > now:
+            self.begin(job, now)
+        return job
 
-    def begin(self, work: Work, now: float) -> None:
-        """Work is passed on. Work that comes while the line is `open` need not wait before."""
+    def begin(self, job: Job, now: float) -> None:
+        """Job is passed on. Job that comes while the line is `open` need not wait before."""
         self.at_work += 1
-        work.passed_on, work.begun, work.level = True, now, self.at_work
+        job.passed_on, job.begun, job.level = True, now, self.at_work
 
-    def remove(self, work: Work) -> bool:
-        """Take work out that waits; whether it did."""
-        return self._queue.remove(work.id) is not None
+    def remove(self, job: Job) -> bool:
+        """Take a job out that waits; whether it did."""
+        return self._waiting.remove(job.id) is not None
 
-    def finished(self, work: Work, now: float) -> None:
+    def finished(self, job: Job, now: float) -> None:
         """The service has answered."""
-        if work.passed_on:
-            self.limit.finished(work.level, now - work.begun, now)
-        self.free(work)
+        if job.passed_on:
+            self.limit.finished(job.level, now - job.begun, now)
+        self.free(job)
 
-    def free(self, work: Work) -> None:
-        """The service has no more to do with this work."""
-        if work.passed_on:
-            work.passed_on = False
+    def free(self, job: Job) -> None:
+        """The service has no more to do with this job."""
+        if job.passed_on:
+            job.passed_on = False
             self.at_work -= 1
 
-    def overdue(self, work: Work, now: float) -> None:
-        """Work that was passed on is past its deadline: it keeps its room for a while."""
-        self._overdue.append((now + _ABANDONED_AFTER_S, work))
+    def overdue(self, job: Job, now: float) -> None:
+        """Job that was passed on is past its deadline: it keeps its room for a while."""
+        self._overdue.append((now + _ABANDONED_AFTER_S, job))
 
-    def abandoned(self, now: float) -> list[Work]:
-        """Return the overdue work whose response is taken for lost; its room is free."""
+    def abandoned(self, now: float) -> list[Job]:
+        """Return the overdue jobs whose response is taken for lost; their room is free."""
         found = []
         while self._overdue and self._overdue[0][0] <= now:
-            work = self._overdue.popleft()[1]
-            if work.passed_on:
-                found.append(work)
-                self.free(work)
+            job = self._overdue.popleft()[1]
+            if job.passed_on:
+                found.append(job)
+                self.free(job)
         return found

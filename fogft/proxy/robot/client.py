@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -20,15 +20,15 @@ from fogft.errors import RosError
 from fogft.link.port import Answer, Dialer, GatewayView, Link, Peer
 from fogft.model import names
 from fogft.model.replica import LinkState, Member, Membership, ReplicaId
-from fogft.model.spec import HedgingMode, Part, ServiceSpec
+from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.link_reports import best_of, link_report, seen_through
 from fogft.proxy.robot.proxied_service import ProxiedService
 from fogft.proxy.robot.sending import key_of
-from fogft.proxy.robot.through_gateways import best_of, seen_through
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
-from fogft.proxy.robot.type_check import Define, Sameness
+from fogft.proxy.robot.type_check import Define, TypeCheck
 from fogft.records.record import SignedRecord
 from fogft.requests.choose import NEVER
 from fogft.ros.port import RosNode, RosTopics
@@ -74,7 +74,7 @@ class ClientProxy:
         define: Define | None = None,
         merge: Merge = lambda said: None,
     ) -> None:
-        self._sameness = Sameness(define)
+        self._type_check = TypeCheck(define)
         self._pool_uid = pool_uid
         self._node = node
         self._dialer = dialer
@@ -143,18 +143,7 @@ class ClientProxy:
 
     def _adopt(self, service: ProxiedService) -> None:
         """Have the dispatcher follow its service's spec, with a client of the fallback."""
-        spec = self._here(service.spec)
-        name = spec.fallback.service if spec.fallback is not None else ""
-        if name != service.fallback_name:
-            old, service.fallback, service.fallback_name = service.fallback, None, name
-            if name:
-                try:
-                    service.fallback = self._node.client(name, spec.type)
-                except RosError as error:
-                    log.error("fallback_not_usable service=%s reason=%r", spec.name, error.message)
-            if old is not None:
-                old.close()
-        service.dispatcher.adopt(spec, service.fallback)
+        service.adopt(self._here(service.spec), self._node)
 
     def _here(self, spec: ServiceSpec) -> ServiceSpec:
         """Return a service's policy as it is here: a request goes to one gateway, not to all.
@@ -239,7 +228,7 @@ class ClientProxy:
     def _drop(self, id: ReplicaId) -> None:
         self._members.pop(id, None)
         link = self._links.pop(id)
-        self._sameness.forget(id)
+        self._type_check.forget(id)
         self._route()  # first out of every route, then closed: what was open there is LOST
         link.close()
         log.info("link_dropped replica=%s", id.short)
@@ -301,7 +290,7 @@ class ClientProxy:
         return changed
 
     def _differences(self, link: Link) -> Mapping[str, str]:
-        return self._sameness.differences(link, [s.spec for s in self._services.values()])
+        return self._type_check.differences(link, [s.spec for s in self._services.values()])
 
     def _route(self) -> None:
         self._topics.route({key_of(link): link for link in self._links.values()})
@@ -311,7 +300,7 @@ class ClientProxy:
         for service in self._services.values():
             name = service.spec.name
             fit = [link for link in links if name not in differ[link.peer.id]]
-            service.dispatcher.route(may_be_asked(service.spec, fit, leaving), versions, leaving)
+            service.dispatcher.route(service.may_ask(fit, leaving), versions, leaving)
 
     def _versions(self) -> dict[ReplicaId, str]:
         return {id: member.version for id, member in self._members.items()}
@@ -348,9 +337,12 @@ class ClientProxy:
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
         replicas, gateways, behind = [], [], []
+        dispatchers = [service.dispatcher for service in self._services.values()]
         for id, link in sorted(self._links.items()):
             member = self._members.get(id)
-            report = self._link_report(link)
+            report = link_report(
+                link, dispatchers, self._differences(link), draining=self._draining(link)
+            )
             if member is None or not member.gateway:
                 replicas.append(report)
                 continue
@@ -374,37 +366,6 @@ class ClientProxy:
         """Services that at least one link calls ready."""
         return frozenset(name for link in list(self._links.values()) for name in link.ready)
 
-    def _link_report(self, link: Link) -> dict[str, Any]:
-        status = link.status()
-        answer = status.probe_answer
-        differ = self._differences(link)
-        ours = next(iter(differ.values()), "") if link.usable else ""
-        id = link.peer.id
-        ended = [s.dispatcher.outcomes.by(id) for s in self._services.values()]
-        return {
-            "slot": id.slot,
-            "generation": id.generation,
-            "state": status.state.value,
-            "ready": sorted(link.ready - differ.keys()),
-            "differs": bool(ours),
-            "offered": dict(answer.offered) if answer and link.usable else {},
-            "draining": self._draining(link),
-            "at_risk": bool(answer and answer.at_risk),
-            "disagrees": any(s.dispatcher.disagrees(key_of(link)) for s in self._services.values()),
-            "heard_age_s": status.heard_age_s,
-            "silent_for_s": status.silent_for_s,
-            "rtt_s": status.rtt_s,
-            "in_flight": status.in_flight,
-            "reopened": status.reopened,
-            "won": sum(s.dispatcher.outcomes.won_by(id) for s in self._services.values()),
-            "restarts": answer.restarts if answer else 0,
-            "answered": sum(well for well, _ in ended),
-            "failed": sum(ill for _, ill in ended),
-            "work": dict(answer.work) if answer else {},
-            **({"uplinks": list(status.uplinks)} if status.uplinks else {}),
-            "detail": status.detail or ours or (answer.detail if answer else ""),
-        }
-
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, of the services that are traced."""
         with self._lock:
@@ -420,24 +381,6 @@ class ClientProxy:
             for id in list(self._links):
                 self._drop(id)
             self._topics.close()
-
-
-def may_be_asked(
-    spec: ServiceSpec, links: Sequence[Link], leaving: Collection[ReplicaId]
-) -> list[Link]:
-    """Return the links by which a service's requests may go.
-
-    Args:
-        spec: The service. Replicas of a stateful one are brought to readiness by what is sent.
-        links: Those whose replicas have the service's type as we have it.
-        leaving: The replicas that are to go soon.
-    """
-    if spec.state is not None:
-        return [link for link in links if link.usable]
-    ready = [link for link in links if spec.name in link.ready]
-    if spec.part is Part.CANCEL:  # who is told to stop may leave; who is asked to work not
-        return ready
-    return [link for link in ready if link.peer.id not in leaving] or ready
 
 
 def _good_members(membership: Membership) -> dict[ReplicaId, Member]:

@@ -6,9 +6,12 @@ Owns: offering and withdrawing it. Not here: when (`fogft.requests.advertising`)
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection, Sequence
 
 from fogft.errors import RosError
-from fogft.model.spec import ServiceSpec
+from fogft.link.port import Link
+from fogft.model.replica import ReplicaId
+from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.requests.advertising import Advertising
 from fogft.ros.port import RosClient, RosNode, RosServer
@@ -27,10 +30,38 @@ class ProxiedService:
         self.spec = spec
         self.dispatcher = dispatcher
         self.server: RosServer | None = None
-        self.fallback: RosClient | None = None
-        self.fallback_name = ""
+        self._fallback: RosClient | None = None
+        self._fallback_name = ""
         self.trouble = ""
         self._advertising = Advertising()
+
+    def adopt(self, spec: ServiceSpec, node: RosNode) -> None:
+        """Have the dispatcher follow a policy, with a client of its fallback service."""
+        name = spec.fallback.service if spec.fallback is not None else ""
+        if name != self._fallback_name:
+            old, self._fallback, self._fallback_name = self._fallback, None, name
+            if name:
+                try:
+                    self._fallback = node.client(name, spec.type)
+                except RosError as error:
+                    log.error("fallback_not_usable service=%s reason=%r", spec.name, error.message)
+            if old is not None:
+                old.close()
+        self.dispatcher.adopt(spec, self._fallback)
+
+    def may_ask(self, links: Sequence[Link], leaving: Collection[ReplicaId]) -> list[Link]:
+        """Return the links by which its requests may go.
+
+        Args:
+            links: Those whose replicas have the service's type as we have it.
+            leaving: The replicas that are to go soon.
+        """
+        if self.spec.state is not None:  # replicas are brought to readiness by what is sent
+            return [link for link in links if link.usable]
+        ready = [link for link in links if self.spec.name in link.ready]
+        if self.spec.part is Part.CANCEL:  # who is told to stop may leave; who is to work not
+            return ready
+        return [link for link in ready if link.peer.id not in leaving] or ready
 
     def advertise(self, node: RosNode, now: float) -> None:
         """Offer or withdraw it, as it should be now (monotonic seconds)."""
@@ -63,7 +94,7 @@ class ProxiedService:
 
     def close(self) -> None:
         """Withdraw it from ROS, and let go of what its dispatcher holds."""
-        for end in (self.server, self.fallback):
+        for end in (self.server, self._fallback):
             if end is not None:
                 end.close()
         self.dispatcher.close()

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 Define = Callable[[str], Definition]
 
 
-class Sameness:
+class TypeCheck:
     """Compares what replicas tell of their types with what they are here.
 
     Args:

@@ -1,20 +1,63 @@
-"""Replicas as they are seen through gateways, put as if they were linked directly. Pure.
+"""What `proxy-status.json` says of each replica: linked directly, or seen through gateways. Pure.
 
-So that the manager judges them as it judges all others: a gateway that is silent is a link
-that is silent. Seen through several gateways, the best sight of a replica counts.
+Seen through a gateway a replica is put as if it were linked directly, so that the manager judges
+it as it judges all others: a gateway that is silent is a link that is silent. Seen through
+several gateways, the best sight of a replica counts.
 
 Owns: those reports. Not here: the links (`client`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-from fogft.link.port import GatewayView, LinkStatus
+from fogft.link.port import GatewayView, Link, LinkStatus
 from fogft.model.replica import LinkState
+from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.sending import key_of
 
 _ORDER = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
+
+
+def link_report(
+    link: Link, dispatchers: Collection[Dispatcher], differ: Mapping[str, str], *, draining: bool
+) -> dict[str, Any]:
+    """Return what is reported of a link.
+
+    Args:
+        link: It.
+        dispatchers: Of all services.
+        differ: Services that its replica cannot answer for us, and why.
+        draining: Its replica is to be left alone.
+    """
+    status, id = link.status(), link.peer.id
+    answer = status.probe_answer
+    ours = next(iter(differ.values()), "") if link.usable else ""
+    ended = [dispatcher.outcomes.by(id) for dispatcher in dispatchers]
+    return {
+        "slot": id.slot,
+        "generation": id.generation,
+        "state": status.state.value,
+        "ready": sorted(link.ready - differ.keys()),
+        "differs": bool(ours),
+        "offered": dict(answer.offered) if answer and link.usable else {},
+        "draining": draining,
+        "at_risk": bool(answer and answer.at_risk),
+        "disagrees": any(dispatcher.disagrees(key_of(link)) for dispatcher in dispatchers),
+        "heard_age_s": status.heard_age_s,
+        "silent_for_s": status.silent_for_s,
+        "rtt_s": status.rtt_s,
+        "in_flight": status.in_flight,
+        "reopened": status.reopened,
+        "won": sum(dispatcher.outcomes.won_by(id) for dispatcher in dispatchers),
+        "restarts": answer.restarts if answer else 0,
+        "answered": sum(well for well, _ in ended),
+        "failed": sum(ill for _, ill in ended),
+        "work": dict(answer.work) if answer else {},
+        **({"uplinks": list(status.uplinks)} if status.uplinks else {}),
+        "detail": status.detail or ours or (answer.detail if answer else ""),
+    }
 
 
 def seen_through(status: LinkStatus, gateway: str) -> list[dict[str, Any]]:

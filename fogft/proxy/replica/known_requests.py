@@ -1,0 +1,129 @@
+"""The requests that a replica knows: each id once, with its answer while that is kept. Pure.
+
+A robot that lost its link sends what was in flight again, under the same id. So an id is known
+until its deadline, and its answer is kept for copies as long as there is room.
+
+Owns: ids, their deadlines, kept answers and their bounds. Called under the responder's lock.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from typing import NamedTuple
+
+from fogft.proxy.replica.service_queue import Job
+
+_DEADLINES_KEPT = 1024  # of a service, of jobs that were forgotten
+
+
+class Remembered(NamedTuple):
+    """How much is remembered."""
+
+    requests: int
+    deadlines: int
+    answers: int  # that copies of their requests would get
+    answer_bytes: int
+
+
+class KnownRequests:
+    """The jobs that are held, and those that were answered not long ago.
+
+    Args:
+        kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
+        kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
+
+    Attributes:
+        held: How many are not answered yet.
+        held_bytes: Their bytes.
+    """
+
+    def __init__(self, kept_bytes: int, kept_ids: int) -> None:
+        self._kept_bytes_limit = kept_bytes
+        self._kept_ids = kept_ids
+        self._jobs: OrderedDict[bytes, Job] = OrderedDict()
+        # One queue a service: its requests share a time-out, so the oldest expires first.
+        self._deadlines: dict[str, deque[tuple[float, bytes]]] = {}
+        self._kept: OrderedDict[bytes, Job] = OrderedDict()
+        self._kept_bytes = 0
+        self.held = 0
+        self.held_bytes = 0
+
+    @property
+    def remembered(self) -> Remembered:
+        """How much is remembered, answered requests included."""
+        deadlines = sum(map(len, self._deadlines.values()))
+        return Remembered(len(self._jobs), deadlines, len(self._kept), self._kept_bytes)
+
+    def get(self, id: bytes) -> Job | None:
+        """Return a job that is known."""
+        return self._jobs.get(id)
+
+    def unanswered(self, service: str | None) -> list[Job]:
+        """Return the jobs that somebody waits for, of one service or of all."""
+        return [
+            job
+            for job in self._jobs.values()
+            if job.waiting is not None and service in (None, job.service)
+        ]
+
+    def add(self, job: Job) -> None:
+        """Hold a new job."""
+        self._jobs[job.id] = job
+        deadlines = self._deadlines.setdefault(job.service, deque())
+        deadlines.append((job.deadline, job.id))
+        if len(deadlines) > 2 * len(self._jobs) + _DEADLINES_KEPT:
+            self._deadlines[job.service] = self._live(deadlines)
+        self.held += 1
+        self.held_bytes += job.size
+
+    def _live(self, deadlines: deque[tuple[float, bytes]]) -> deque[tuple[float, bytes]]:
+        """Return the deadlines without those of jobs that were forgotten or run anew."""
+        live = ((due, self._jobs.get(due[1])) for due in deadlines)
+        return deque(due for due, job in live if job is not None and job.deadline == due[0])
+
+    def release(self, job: Job) -> None:
+        """A job is held no more."""
+        self.held -= 1
+        self.held_bytes -= job.size
+
+    def forget(self, job: Job) -> None:
+        """Forget a job that is held no more: a copy is run anew."""
+        del self._jobs[job.id]
+
+    def keep(self, job: Job, answer: bytes) -> None:
+        """Keep the answer to a job for copies, within the bounds."""
+        job.answer = answer
+        self._kept[job.id] = job
+        self._kept_bytes += len(answer)
+        while self._kept_bytes > self._kept_bytes_limit and self._kept:
+            _, oldest = self._kept.popitem(last=False)
+            self._kept_bytes -= len(oldest.answer or b"")
+            oldest.answer = None
+        if len(self._jobs) > self._kept_ids:
+            self._forget_oldest()
+
+    def _forget_oldest(self) -> None:
+        for job in self._jobs.values():
+            if job.waiting is None:
+                self._drop(job)
+                return
+
+    def _drop(self, job: Job) -> None:
+        del self._jobs[job.id]
+        if self._kept.pop(job.id, None) is not None:
+            self._kept_bytes -= len(job.answer or b"")
+
+    def expired(self, now: float) -> list[bytes]:
+        """Forget what is past its deadline; return the ids that somebody still waits for."""
+        late = []
+        for deadlines in self._deadlines.values():
+            while deadlines and deadlines[0][0] <= now:
+                _, id = deadlines.popleft()
+                job = self._jobs.get(id)
+                if job is None or job.deadline > now:
+                    continue
+                if job.waiting is None:
+                    self._drop(job)
+                else:
+                    late.append(id)
+        return late
