@@ -188,7 +188,7 @@ def plan_once(
     first: Standing | None = None
     begun = [need.slot for need in needs if not history.generation(need.slot)]
     short = _stand_ins_missing(sized.groups, counts, others, standing_in, begun)
-    kept_free = bool(short) and not standing_in and room > 1  # one of them stands in
+    kept_free = _kept_free(len(short), room, census) if not standing_in else 0
     for need in needs:
         if not buyer.buy(need, room=room - kept_free):
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
@@ -243,6 +243,15 @@ def plan_once(
         waits=waits,
         restless=restless,
     )
+
+
+def _kept_free(short: int, room: int, census: Census) -> int:
+    """Return how many of the machines that there is room for are to be stand-ins.
+
+    One, as long as somebody serves. Else a spot machine may be refused, and boots no faster.
+    """
+    serves = any(s.judged.may_serve for s in (*census.good, *census.replaced))
+    return max(0, min(1 if serves else short, short, room - 1))
 
 
 def _stand_ins_missing(
