@@ -25,7 +25,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from fogft.requests.choose import NEVER
+from fogft.model.spec import HedgingMode, ServiceSpec
+from fogft.requests.choose import NEVER, All, Choose, Failover
 from fogft.requests.latency import Latencies
 from fogft.requests.token_bucket import TokenBucket
 
@@ -270,3 +271,10 @@ class Adaptive:
                 for replica, known in sorted(self._replicas.items())
             },
         }
+
+
+def policy(spec: ServiceSpec) -> Choose:
+    """Return what chooses for a service, as its `hedging` says."""
+    if spec.hedging is HedgingMode.ADAPTIVE:
+        return Adaptive(spec.hedging_budget)
+    return Failover() if spec.hedging is HedgingMode.FAILOVER else All()

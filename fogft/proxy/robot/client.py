@@ -3,8 +3,8 @@
 It follows the membership (one link a member), advertises each service as if it were local
 once a replica can answer it, and hands requests to that service's `Dispatcher`.
 
-Owns: which links exist, and which of them each service uses now.
-Not here: files and signals (`process`), requests (`dispatcher`).
+Owns: the services, and which links each of them uses now.
+Not here: which links there are (`links`), files and signals (`process`), requests (`dispatcher`).
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 from fogft.errors import RosError
-from fogft.link.port import Answer, Dialer, GatewayView, Link, Peer
+from fogft.link.port import Answer, Dialer, GatewayView, Link
 from fogft.model import names
-from fogft.model.replica import LinkState, Member, Membership, ReplicaId
+from fogft.model.replica import Membership, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.proxy.robot.link_reports import best_of, link_report, seen_through
+from fogft.proxy.robot.links import Links
 from fogft.proxy.robot.proxied_service import ProxiedService
 from fogft.proxy.robot.sending import key_of
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
@@ -38,16 +38,10 @@ log = logging.getLogger(__name__)
 _TICK_S = 0.02
 
 
-class MakeDispatcher(Protocol):
-    """Makes the dispatcher of a service."""
-
-    def __call__(
-        self,
-        spec: ServiceSpec,
-        respond: Callable[[Any, bytes], None],
-        wake: Callable[[], None],
-    ) -> Dispatcher:
-        """Make it, given how to respond and how to have `tick` called soon."""
+# Makes the dispatcher of a service, given how to respond and how to have `tick` called soon.
+MakeDispatcher = Callable[
+    [ServiceSpec, Callable[[Any, bytes], None], Callable[[], None]], Dispatcher
+]
 
 
 class ClientProxy:
@@ -82,8 +76,7 @@ class ClientProxy:
         self._clock = clock
         self._lock = threading.RLock()
         self._services: dict[str, ProxiedService] = {}
-        self._links: dict[ReplicaId, Link] = {}
-        self._members: dict[ReplicaId, Member] = {}
+        self._links = Links(dialer, self, self._keys)
         self._version = (0, 0)
         self._membership: Membership | None = None
         self._through_gateways = False
@@ -116,16 +109,14 @@ class ClientProxy:
                 self._services[spec.name] = self._new_service(spec)
                 keys_changed = True
             if keys_changed:
-                for id in list(self._links):
-                    self._redial(id)
+                self._links.redial()
         self._change()
 
     def pass_topics(self, topics: Iterable[TopicSpec], node: RosTopics) -> None:
         """Pass these topics and no others; `node` publishes and subscribes on the robot's side."""
         with self._lock:
             if self._topics.serve(topics, node):
-                for id in list(self._links):
-                    self._redial(id)
+                self._links.redial()
         self._change()
 
     def _new_service(self, spec: ServiceSpec) -> ProxiedService:
@@ -165,19 +156,17 @@ class ClientProxy:
                 return False
             self._version = version
             self._membership = membership
-            members = {} if self._shut_out(membership) else _good_members(membership)
+            good = (m for m in membership.members if m.certificate_name not in membership.revoked)
+            members = {} if self._shut_out(membership) else {m.id: m for m in good}
             through = any(member.gateway for member in members.values())
             if through != self._through_gateways:
                 self._through_gateways = through
                 for service in self._services.values():
                     self._adopt(service)
-            for id in [id for id in self._links if id not in members]:
+            for id in self._links.missing(members):
                 self._drop(id)
-            for id, member in members.items():
-                old = self._members.get(id)
-                self._members[id] = member
-                if old is None or old.endpoint != member.endpoint:
-                    self._redial(id)
+            for member in members.values():
+                self._links.reach(member)
         self._change()
         return True
 
@@ -207,31 +196,20 @@ class ClientProxy:
     def redial(self) -> None:
         """Dial everybody anew, by other uplinks; what is in flight is sent again."""
         with self._lock:
-            for id in list(self._links):
-                self._redial(id)
+            self._links.redial()
         self._change()
 
-    def _redial(self, id: ReplicaId) -> None:
-        member = self._members[id]
-        old = self._links.get(id)
-        peer = Peer(id, member.endpoint, member.certificate_name)
-        keys = {
-            s.spec.name: names.service_key(self._pool_uid, id.slot, s.spec.name, s.spec.type)
-            for s in self._services.values()
-        } | self._topics.keys(self._pool_uid, id.slot)
-        self._links[id] = self._dialer.dial(peer, keys, self)
-        who = f"gateway={member.gateway}" if member.gateway else f"replica={id.short}"
-        log.info("link_dialled %s endpoint=%s", who, member.endpoint)
-        if old is not None:
-            old.close()
+    def _keys(self, slot: int) -> dict[str, str]:
+        """Return the keys of all services and topics at a slot."""
+        specs = [service.spec for service in self._services.values()]
+        services = {s.name: names.service_key(self._pool_uid, slot, s.name, s.type) for s in specs}
+        return services | self._topics.keys(self._pool_uid, slot)
 
     def _drop(self, id: ReplicaId) -> None:
-        self._members.pop(id, None)
-        link = self._links.pop(id)
+        link = self._links.remove(id)
         self._type_check.forget(id)
         self._route()  # first out of every route, then closed: what was open there is LOST
         link.close()
-        log.info("link_dropped replica=%s", id.short)
 
     # -- events of links (their threads) --------------------------------------------------
 
@@ -279,7 +257,7 @@ class ClientProxy:
         with self._lock:
             if changed:
                 self._route()
-            for link in self._links.values():
+            for link in self._links:
                 link.flush()
             self._topics.tick()
             looks = [service.dispatcher.tick() for service in self._services.values()]
@@ -293,30 +271,21 @@ class ClientProxy:
         return self._type_check.differences(link, [s.spec for s in self._services.values()])
 
     def _route(self) -> None:
-        self._topics.route({key_of(link): link for link in self._links.values()})
-        differ = {id: self._differences(link) for id, link in self._links.items()}
-        versions, links = self._versions(), list(self._links.values())
-        leaving = frozenset(link.peer.id for link in links if self._draining(link))
+        links = list(self._links)
+        self._topics.route({key_of(link): link for link in links})
+        differ = {link.peer.id: self._differences(link) for link in links}
+        versions = self._links.versions()
+        leaving = frozenset(link.peer.id for link in links if self._links.draining(link))
         for service in self._services.values():
-            name = service.spec.name
-            fit = [link for link in links if name not in differ[link.peer.id]]
+            fit = [link for link in links if service.spec.name not in differ[link.peer.id]]
             service.dispatcher.route(service.may_ask(fit, leaving), versions, leaving)
-
-    def _versions(self) -> dict[ReplicaId, str]:
-        return {id: member.version for id, member in self._members.items()}
-
-    def _draining(self, link: Link) -> bool:
-        member = self._members.get(link.peer.id)
-        return link.draining or (member is not None and member.draining)
 
     # -- what people see ------------------------------------------------------------------
 
     @property
     def uplink_suspected(self) -> bool:
         """Whether all links that ever answered (two at least) have fallen silent together."""
-        states = [link.status() for link in self._links.values()]
-        heard = [status for status in states if status.heard_age_s is not None]
-        return len(heard) > 1 and all(status.state is not LinkState.UP for status in heard)
+        return self._links.silent_together
 
     def report(self) -> dict[str, Any]:
         """Return links and services as `proxy-status.json` has them."""
@@ -336,19 +305,8 @@ class ClientProxy:
 
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
-        replicas, gateways, behind = [], [], []
         dispatchers = [service.dispatcher for service in self._services.values()]
-        for id, link in sorted(self._links.items()):
-            member = self._members.get(id)
-            report = link_report(
-                link, dispatchers, self._differences(link), draining=self._draining(link)
-            )
-            if member is None or not member.gateway:
-                replicas.append(report)
-                continue
-            gateways.append({"name": member.gateway, "endpoint": member.endpoint, **report})
-            behind += seen_through(link.status(), member.gateway)
-        return [*replicas, *best_of(behind)], gateways
+        return self._links.reports(dispatchers, self._differences)
 
     def behind(self) -> tuple[GatewayView, ...]:
         """Return what is seen of each replica, as a gateway tells its robots."""
@@ -358,13 +316,12 @@ class ClientProxy:
 
     def types_behind(self) -> dict[str, Definition]:
         """Return the definitions of types as replicas told them, as a gateway passes them on."""
-        answers = [link.status().probe_answer for link in list(self._links.values())]
-        return {name: told for a in answers if a is not None for name, told in a.types.items()}
+        return self._links.types()
 
     @property
     def ready(self) -> frozenset[str]:
         """Services that at least one link calls ready."""
-        return frozenset(name for link in list(self._links.values()) for name in link.ready)
+        return self._links.ready
 
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, of the services that are traced."""
@@ -378,17 +335,9 @@ class ClientProxy:
     def close(self) -> None:
         """Close every link. The ROS node is its owner's to close."""
         with self._lock:
-            for id in list(self._links):
-                self._drop(id)
+            for link in self._links:
+                self._drop(link.peer.id)
             self._topics.close()
-
-
-def _good_members(membership: Membership) -> dict[ReplicaId, Member]:
-    return {
-        member.id: member
-        for member in membership.members
-        if member.certificate_name not in membership.revoked
-    }
 
 
 def _same_kind(one: ServiceSpec, other: ServiceSpec) -> bool:

@@ -1,16 +1,15 @@
 """One proxied service on the robot: send a request to replicas, return the answer.
 
-All requests live one life: registered, sent to replicas, answered, delivered; or the deadline
-comes, or the caller takes it back. What differs between services is put in:
+All requests live one life: registered, sent, answered, delivered; or the deadline comes, or the
+caller takes it back. What differs between services is put in:
 
 * *choose* (`requests.choose`): which replicas are asked first, which next, and when;
 * *decide* (`requests.decide`): what an answer means;
 * *deliver* (`delivery`): how the end reaches the caller;
 * *replicate* (`replication`): what else replicas must have, of actions and stateful services.
 
-`submit` is called by the thread that takes ROS requests and never blocks: a link takes an
-attempt or says no. Answers come from the links' threads, which may not send; whatever must be
-sent because of them is left to the next `tick`, which `wake` brings about.
+`submit` is called by the thread that takes ROS requests and never blocks. Answers come from the
+links' threads, which may not send: that is left to the next `tick`, which `wake` brings about.
 
 Owns: that life. Not here: sending (`sending`), links (`fogft.link`), ROS.
 Design: docs/design/dispatcher.md.
@@ -28,17 +27,16 @@ from typing import Any
 from fogft.errors import RosError
 from fogft.link.port import Answer, Link
 from fogft.log_limits import worth_logging
-from fogft.metrics.outcomes import Outcome, Outcomes
+from fogft.metrics.outcomes import Outcome
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.model.spec import HedgingMode, ServiceSpec
+from fogft.model.spec import ServiceSpec
 from fogft.proxy.robot.delivery import Delivery, Respond
 from fogft.proxy.robot.replication import Replication
 from fogft.proxy.robot.request import Ledger, Request
 from fogft.proxy.robot.sending import Sender, key_of
-from fogft.requests.adaptive import Adaptive
-from fogft.requests.choose import All, Choose, Failover
+from fogft.requests.adaptive import policy
 from fogft.requests.decide import Accepts, Decide, FirstSuccess, Means
 from fogft.requests.first_response import Verdict
 from fogft.requests.pending import PendingRequests
@@ -52,7 +50,7 @@ class Dispatcher:
 
     Args:
         spec: The service and its policy.
-        respond: Sends a response to the caller of a handle. Any thread.
+        respond: Sends a response to a caller. Any thread.
         decide: What answers mean; the first success unless given.
         replication: What else replicas must have.
         ok_of: Returns, for a name of a boolean response field, whether a response is a success;
@@ -62,6 +60,9 @@ class Dispatcher:
         clock: Monotonic seconds.
         max_pending_bytes: Requests kept at once, in bytes; more are turned away and counted.
         max_pending: The same, by number.
+
+    Attributes:
+        outcomes: What became of its requests.
     """
 
     def __init__(
@@ -87,9 +88,10 @@ class Dispatcher:
         self._replication = replication
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
-        self._requests: PendingRequests[Request] = PendingRequests(_policy(spec), self._decide)
+        self._requests: PendingRequests[Request] = PendingRequests(policy(spec), self._decide)
         self._ledger = Ledger(spec, self._requests, clock)
         self._lock = self._ledger.lock
+        self.outcomes = self._ledger.outcomes
         self._sender = Sender(self._ledger, replication)
         self._delivery = Delivery(self._ledger, respond, empty_response, self._sender.forget)
 
@@ -101,11 +103,6 @@ class Dispatcher:
         return self._ledger.spec
 
     @property
-    def outcomes(self) -> Outcomes:
-        """What became of its requests."""
-        return self._ledger.outcomes
-
-    @property
     def waiting(self) -> int:
         """How many requests have no answer yet."""
         return len(self._requests)
@@ -113,9 +110,9 @@ class Dispatcher:
     @property
     def able(self) -> bool:
         """Whether a request that comes now can be answered."""
-        replication = self._replication
-        if replication is not None and replication.sends_requests:
-            return replication.ready
+        order = self._replication
+        if order is not None and order.sends_requests:
+            return order.ready
         return bool(self._sender.able)
 
     def submit(self, payload: bytes, handle: Any) -> None:
@@ -128,10 +125,11 @@ class Dispatcher:
         Raises:
             ValueError: A request with this id is under way.
         """
-        now, requests, outcomes = self._clock(), self._requests, self._ledger.outcomes
+        now, requests, outcomes = self._clock(), self._requests, self.outcomes
         with self._lock:
             outcomes.received(len(payload))
-            if self._is_full(len(payload)):
+            over = requests.held_bytes + len(payload) > self.max_pending_bytes
+            if over or len(requests) >= self.max_pending:
                 self._turn_away(request)
                 return False
             links, able = self._sender.links, self._sender.able
@@ -150,15 +148,11 @@ class Dispatcher:
             self._wake()
         return True
 
-    def _is_full(self, size: int) -> bool:
-        over = self._requests.held_bytes + size > self.max_pending_bytes
-        return over or len(self._requests) >= self.max_pending
-
     def _turn_away(self, request: bytes) -> None:
         """Count a request that is not taken. Under the lock."""
-        count = self._ledger.outcomes.count
+        count = self.outcomes.count
         count["turned_away"] += 1
-        self._ledger.outcomes.note(request, Outcome.TURNED_AWAY, took_s=0.0)
+        self.outcomes.note(request, Outcome.TURNED_AWAY, took_s=0.0)
         if worth_logging(count["turned_away"]):
             log.warning("request_turned_away service=%s reason=%r count=%d",
                         self.spec.name, "pending is full", count["turned_away"])  # fmt: skip
@@ -171,7 +165,7 @@ class Dispatcher:
         """End a request that its caller no longer wants; unknown ids are fine."""
         with self._lock:
             pending = self._requests.stop(request, self._clock())
-            self._ledger.outcomes.count["cancelled"] += pending is not None
+            self.outcomes.count["cancelled"] += pending is not None
         if pending is not None:
             self._sender.forget(request, tuple(pending.open))
 
@@ -188,7 +182,7 @@ class Dispatcher:
         except RosError:  # no response of this type
             self._refused(id, replica, answer, Refusal.MALFORMED)
             return
-        now, outcomes = self._clock(), self._ledger.outcomes
+        now, outcomes = self._clock(), self.outcomes
         with self._lock:
             request = self._request_of(answer)
             means, pending, losers, verdict = self._requests.answered(
@@ -205,9 +199,8 @@ class Dispatcher:
             with self._lock:
                 outcomes.served(id)
             outcomes.late()
-        elif means is Means.UNDECIDED:
-            if verdict is Verdict.LATE:
-                outcomes.late()
+        elif means is Means.UNDECIDED and verdict is Verdict.LATE:
+            outcomes.late()
         elif means is Means.REJECTION and request is not None:
             with self._lock:
                 outcomes.rejected(id)
@@ -222,7 +215,7 @@ class Dispatcher:
 
     def late(self, link: Link, request: bytes) -> None:
         """Count an answer that came after its link was told to forget the request."""
-        self._ledger.outcomes.late()
+        self.outcomes.late()
 
     def _refused(self, id: ReplicaId, replica: int, answer: Answer, refusal: Refusal) -> None:
         """A replica has refused an attempt, or its link has lost it."""
@@ -233,16 +226,16 @@ class Dispatcher:
         self._failed(id, replica, request, refusal)
 
     def _failed(self, id: ReplicaId, replica: int, request: bytes | None, refusal: Refusal) -> None:
-        now, verdict = self._clock(), Verdict.LATE
+        now = self._clock()
         with self._lock:
-            self._ledger.outcomes.refusal(refusal, None if request is None else id)
+            self.outcomes.refusal(refusal, None if request is None else id)
             pending = self._requests.get(request)
             if pending is not None and pending.item.trace is not None:
                 pending.item.trace.refused[replica] = refusal
-            if request is not None:
-                verdict = self._requests.refused(request, replica, refusal, now)
-        if request is not None:
-            self._after(request, verdict)
+            if request is None:
+                return
+            verdict = self._requests.refused(request, replica, refusal, now)
+        self._after(request, verdict)
 
     def _after(self, request: bytes, verdict: Verdict) -> None:
         """If nobody works on a request: end it, or have another replica asked at once."""
@@ -280,7 +273,7 @@ class Dispatcher:
             self._ledger.adopt(spec)
             self._delivery.adopt(spec, fallback)
             if (old.hedging, old.hedging_budget) != (spec.hedging, spec.hedging_budget):
-                self._requests.use(_policy(spec))
+                self._requests.use(policy(spec))
                 log.info("hedging_changed service=%s to=%s", spec.name, spec.hedging.value)
         self._wake()
 
@@ -294,7 +287,7 @@ class Dispatcher:
 
         Args:
             links: Those whose replica is ready; where replicas are brought to readiness, all.
-            versions: What each replica of the pool runs, reached or not.
+            versions: What each replica of the pool runs.
             leaving: The replicas that are to go soon.
         """
         self._sender.route(links, versions, leaving)
@@ -333,19 +326,19 @@ class Dispatcher:
         return look_at
 
     def close(self) -> None:
-        """It is not used any more."""
-        if self._replication is not None:
-            with self._lock:
+        """Let go of what is held outside."""
+        with self._lock:
+            if self._replication is not None:
                 self._replication.close()
 
     # -- what people see ------------------------------------------------------------------
 
     def disagrees(self, replica: int) -> bool:
-        """Whether a replica's answers have differed repeatedly, and count no more."""
+        """Whether a replica's answers count no more."""
         return replica in self._decide.flagged
 
     def trace(self) -> list[dict[str, Any]]:
-        """Return how requests ended since the last call; none where the spec wants no trace."""
+        """Return how requests ended since the last call, where that is traced."""
         with self._lock:
             return self._ledger.take_trace()
 
@@ -354,15 +347,9 @@ class Dispatcher:
         requests = self._requests
         with self._lock:
             return {
-                **self._ledger.outcomes.report(),
+                **self.outcomes.report(),
                 "pending": len(requests) + len(requests.fallback or ()),
                 "pending_bytes": requests.held_bytes,
                 "hedging": requests.choose.report(),
                 **self._decide.report(),
             }
-
-
-def _policy(spec: ServiceSpec) -> Choose:
-    if spec.hedging is HedgingMode.ADAPTIVE:
-        return Adaptive(spec.hedging_budget)
-    return Failover() if spec.hedging is HedgingMode.FAILOVER else All()
