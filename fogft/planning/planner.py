@@ -238,8 +238,10 @@ def plan_once(
         health=health,
         # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
         # Who moves is not to go before the one that comes serves: all others do, and are needed.
+        # Room kept for stand-ins that they did not take is left for the next pass.
         closed=not (ends or endings.draining or census.ending or excess)
-        and (moves or not census.replaced),
+        and (moves or not census.replaced)
+        and not (kept_free and waits),
         waits=waits,
         restless=restless,
     )
