@@ -16,7 +16,7 @@ Not here: how many are wanted (`sizing`), where they go (`placement`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,6 +70,14 @@ class Group:
 def is_stand_in(slot: int) -> bool:
     """Whether a slot is that of an on-demand machine that stands in for a spot one."""
     return slot % BLOCK >= STAND_INS
+
+
+def group_of(groups: Sequence[Group], slot: int) -> Group:
+    """Return the group that a slot's replica counts for: its own, else the last ordinary one."""
+    if len(groups) == 1:
+        return groups[0]
+    ordinary = [group for group in groups if group.name != CRITICAL]
+    return next((group for group in groups if group.owns(slot)), ordinary[-1])
 
 
 def groups_of(spec: PoolSpec) -> tuple[Group, ...]:

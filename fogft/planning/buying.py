@@ -16,25 +16,25 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
-from fogft.model.groups import Group, is_stand_in
+from fogft.model.groups import Group, group_of, is_stand_in
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
-from fogft.planning.endings import Census, Standing
+from fogft.planning.classification import Classification
 from fogft.planning.listing import Listing, catalogue
-from fogft.planning.needs import Need, home
+from fogft.planning.needs import Need
 from fogft.planning.observed.backoff import (
     EVERYWHERE,
     Backoff,
     avoided,
-    disappointing,
-    rested_longest,
-    resting,
+    backing_off,
+    backing_off_longest,
+    recently_failed,
 )
 from fogft.planning.observed.hazard import UNKNOWN, hazards, penalty
-from fogft.planning.observed.health import Verdict
+from fogft.planning.observed.health import Assessment, Verdict
 from fogft.planning.observed.history import History
 from fogft.planning.placement import Choice, Market
 
@@ -62,13 +62,13 @@ class Buyer:
     intent: Intent
     observed: Observed
     history: History
-    census: Census
+    machines: Classification
     groups: Sequence[Group]
     cap: float | None
-    standing_in: Sequence[Standing] = ()
+    standing_in: Sequence[Assessment] = ()
     launches: list[PlannedLaunch] = field(default_factory=list)
     notes: list[Reason] = field(default_factory=list)
-    sacrificed: list[tuple[Standing, Reason]] = field(default_factory=list)
+    sacrificed: list[tuple[Assessment, Reason]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._catalogue = catalogue(self.observed.offers)
@@ -81,7 +81,7 @@ class Buyer:
 
     @cached_property
     def _spent_before(self) -> float:
-        return sum(self._price(s) for s in self.census.everyone())
+        return sum(self._price(s) for s in self.machines.everyone())
 
     @property
     def _spent(self) -> float:
@@ -91,8 +91,8 @@ class Buyer:
         return spent
 
     @property
-    def _resting(self) -> Mapping[str, Backoff]:
-        return resting(self.history, self.observed.now)
+    def _backing_off(self) -> Mapping[str, Backoff]:
+        return backing_off(self.history, self.observed.now)
 
     @property
     def _avoided(self) -> Mapping[str, float]:
@@ -108,7 +108,7 @@ class Buyer:
         if len(self.launches) >= room:
             if need.stands_in:
                 return False
-            old = need.replaces.short if need.replaces else ""
+            old = need.replaces.id.short if need.replaces else ""
             self.notes.append(Reason(Cause.SURGE_FULL, slot=need.slot, replica=old))
             return False
         choice, reason = self._choose(need, self.budget)
@@ -130,23 +130,23 @@ class Buyer:
         full = self._full(group) if spot else frozenset()
         key = (group.offers, spot, at_leisure, full)
         if key not in self._markets:
-            resting = self._resting
+            backing_off = self._backing_off
             if at_leisure:
-                resting = {**disappointing(self.history, self.observed.now), **resting}
-            self._markets[key] = self._market(group, spot, resting, full)
+                backing_off = {**recently_failed(self.history, self.observed.now), **backing_off}
+            self._markets[key] = self._market(group, spot, backing_off, full)
         return self._markets[key]
 
     def _market(
         self,
         group: Group,
         spot: bool | None,
-        resting: Mapping[str, Backoff],
+        backing_off: Mapping[str, Backoff],
         full: Collection[str] = (),
     ) -> Market:
         return Market(
             self._listing(group, spot),
-            resting=resting,
-            avoid=(*self._avoided, *(s.location for s in self.census.lost)),
+            backing_off=backing_off,
+            avoid=(*self._avoided, *(s.placement.location for s in self.machines.lost)),
             full=full,
             hazards=self.hazards,
         )
@@ -155,9 +155,9 @@ class Buyer:
         """Return the locations that hold half of a group already, where on-demand can stand in."""
         if not group.on_demand.fallback or len(self._listing(group, True).supplies) < 2:
             return frozenset()
-        stay = (*self.census.good, *self.census.replaced)
-        here = [s.judged.machine.placement for s in stay if home(self.groups, s.slot) is group]
-        here += [x.offer.placement for x in self.launches if home(self.groups, x.slot) is group]
+        stay = (*self.machines.good, *self.machines.replaced)
+        here = [s.machine.placement for s in stay if group_of(self.groups, s.slot) is group]
+        here += [x.offer.placement for x in self.launches if group_of(self.groups, x.slot) is group]
         count = Counter(place.location for place in here if place.spot)
         most = max(1, math.ceil(group.replicas / 2))
         return frozenset(location for location, held in count.items() if held >= most)
@@ -175,7 +175,7 @@ class Buyer:
         return found
 
     def whole_market(self, group: Group, spot: bool | None) -> Market:
-        """Return what is sold to a group where nothing rests and nothing is avoided."""
+        """Return what is sold to a group where nothing backs off or is avoided."""
         key = (group.offers, spot)
         if key not in self._whole:
             self._whole[key] = Market(self._listing(group, spot), hazards=self.hazards)
@@ -185,19 +185,21 @@ class Buyer:
         return self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale)
 
     def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
-        """Return the market of what rests longest, where all rests; None to wait for another."""
+        """Return the market of what failed longest ago, where all backs off; None to wait."""
         coming = self.launches or any(
-            not s.ever_ready for s in self.census.good if s not in self.standing_in
+            not s.ever_ready for s in self.machines.good if s not in self.standing_in
         )
-        if coming or EVERYWHERE in self._resting:
+        if coming or EVERYWHERE in self._backing_off:
             return None
-        supply = rested_longest(self.market(group, spot).resting.items(), self.observed.now)
+        supply = backing_off_longest(
+            self.market(group, spot).backing_off.items(), self.observed.now
+        )
         if supply is None:
             return None
-        resting = {k: v for k, v in self._resting.items() if k != supply}
-        return self._market(group, spot, resting, self._full(group) if spot else ())
+        backing_off = {k: v for k, v in self._backing_off.items() if k != supply}
+        return self._market(group, spot, backing_off, self._full(group) if spot else ())
 
-    def kind(self, group: Group, without: Standing | None) -> bool | None:
+    def kind(self, group: Group, without: Assessment | None) -> bool | None:
         """Return whether a group's next machine is spot (True); None where it does not matter.
 
         Args:
@@ -206,33 +208,33 @@ class Buyer:
         """
         if not group.on_demand.base and not group.on_demand.fallback:
             return None
-        stay = [s for s in (*self.census.good, *self.census.replaced) if s is not without]
-        placed = [(s.slot, s.judged.machine.placement) for s in stay]
+        stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
+        placed = [(s.slot, s.machine.placement) for s in stay]
         placed += [(launch.slot, launch.offer.placement) for launch in self.launches]
         on_demand = sum(
             not place.spot
             for slot, place in placed
-            if home(self.groups, slot) is group and not is_stand_in(slot)
+            if group_of(self.groups, slot) is group and not is_stand_in(slot)
         )
         return on_demand >= group.on_demand.base
 
-    def places(self, without: Standing | None) -> list[Placement]:
+    def places(self, without: Assessment | None) -> list[Placement]:
         """Return where our replicas are and will be."""
-        stay = [s for s in (*self.census.good, *self.census.replaced) if s is not without]
-        taken = [s.judged.machine.placement for s in stay]
+        stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
+        taken = [s.machine.placement for s in stay]
         return taken + [launch.offer.placement for launch in self.launches]
 
-    def _price(self, standing: Standing) -> float:
+    def _price(self, replica: Assessment) -> float:
         """Return what a machine costs: as ordered, or more where its spot price has risen."""
-        placement = standing.judged.machine.placement
-        return max(standing.usd_per_hour, self._catalogue.prices.get(placement, 0.0))
+        placement = replica.machine.placement
+        return max(replica.machine.usd_per_hour, self._catalogue.prices.get(placement, 0.0))
 
     def _choose(self, need: Need, budget: float | None) -> tuple[Choice, Reason]:
         old = need.replaces
         avoid = set()
         why = old.why if old is not None else None
         if old is not None and (why is None or why.place_at_fault):
-            avoid.add(old.location)
+            avoid.add(old.placement.location)
         taken = self.places(old)
         spot = False if need.stands_in else self.kind(need.group, old)
         moves = why is not None and why.is_move
@@ -247,22 +249,22 @@ class Buyer:
 
     def _make_room(self, need: Need, cap: float) -> None:
         """Under a cap, a silent machine that blocks its own replacement goes first."""
-        left = cap - self._spent + sum(self._price(s) for s in self.census.ending)
+        left = cap - self._spent + sum(self._price(s) for s in self.machines.ending)
         if self._choose(need, left)[0].offer is not None:
             return  # what is being ended already makes room enough
-        for standing in self.census.lost:
-            if standing.verdict is not Verdict.UNRESPONSIVE:
+        for replica in self.machines.lost:
+            if replica.verdict is not Verdict.UNRESPONSIVE:
                 continue
-            if self._choose(need, left + self._price(standing))[0].offer is not None:
-                full = Reason(Cause.BUDGET_FULL, because=because(standing.why))
-                self.sacrificed.append((standing, full))
+            if self._choose(need, left + self._price(replica))[0].offer is not None:
+                full = Reason(Cause.BUDGET_FULL, because=because(replica.why))
+                self.sacrificed.append((replica, full))
                 return
 
     def fits_beside(self, need: Need) -> bool:
         """Whether the budget has room for a successor beside the one that it replaces."""
         return self._choose(need, self.budget)[0].offer is not None
 
-    def fits_instead(self, need: Need, old: Standing) -> bool:
+    def fits_instead(self, need: Need, old: Assessment) -> bool:
         """Whether there is room for a successor once the one that it replaces is gone."""
         if self.cap is None:
             return True
@@ -270,6 +272,6 @@ class Buyer:
         return self._choose(need, left)[0].offer is not None
 
     def _next_generation(self, slot: int) -> int:
-        listed = [s.id.generation for s in self.census.everyone() if s.slot == slot]
+        listed = [s.id.generation for s in self.machines.everyone() if s.slot == slot]
         known = [self.history.generation(slot), self.intent.drained.get(slot, 0)]
         return max([*known, *listed]) + 1

@@ -6,17 +6,15 @@ Not here: health (`health`), and moving those that could be better placed (`migr
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
-from fogft.model.groups import BLOCK, replica_hash
+from fogft.model.groups import BLOCK, Group, group_of, replica_hash
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Observed
 from fogft.model.spec import PoolSpec
-from fogft.planning.endings import Census, Standing, is_outdated
-from fogft.planning.needs import part
-from fogft.planning.observed.health import Health, Verdict
+from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.sizing import Size
 
 _ORDER = {Cause.DRAINED: 0, Cause.EXCLUDED: 1, Cause.OUTDATED: 3}  # all others between
@@ -24,71 +22,132 @@ _LOST = (Verdict.LEAVING, Verdict.UNRESPONSIVE)
 _DOUBTED = (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES)
 
 
-def take_census(
+@dataclass
+class Classification:
+    """Every machine of the pool, by what it is to the pool.
+
+    Attributes:
+        good: Serve or will serve.
+        replaced: Work, but shall be replaced, new before old.
+        lost: Leaving or unresponsive: replaced at once, and not counted as machines.
+        failed: Launches that failed: ended at once, not counted.
+        aborted: Not wanted as they are, and never served: ended at once.
+        ending: Already asked to end.
+    """
+
+    good: list[Assessment] = field(default_factory=list)
+    replaced: list[Assessment] = field(default_factory=list)
+    lost: list[Assessment] = field(default_factory=list)
+    failed: list[Assessment] = field(default_factory=list)
+    aborted: list[Assessment] = field(default_factory=list)
+    ending: list[Assessment] = field(default_factory=list)
+
+    def everyone(self) -> Iterator[Assessment]:
+        """Yield every machine."""
+        yield from self.good
+        yield from self.replaced
+        yield from self.lost
+        yield from self.failed
+        yield from self.aborted
+        yield from self.ending
+
+    def without(self, others: Collection[Assessment]) -> Classification:
+        """Return the same without some of those that work."""
+        good = [s for s in self.good if s not in others]
+        replaced = [s for s in self.replaced if s not in others]
+        return replace(self, good=good, replaced=replaced)
+
+    def part(self, groups: Sequence[Group], group: Group) -> Classification:
+        """Return the part that counts for a group; it is not to be changed."""
+        if len(groups) == 1:
+            return self
+        return Classification(
+            *(
+                [s for s in kind if group_of(groups, s.slot) is group]
+                for kind in (
+                    self.good,
+                    self.replaced,
+                    self.lost,
+                    self.failed,
+                    self.aborted,
+                    self.ending,
+                )
+            )
+        )
+
+    @property
+    def live(self) -> int:
+        """Machines that count against `replicas + max_surge`.
+
+        Not those that are lost or have failed, whether or not they were asked to end.
+        """
+        exempt = (Verdict.FAILED, Verdict.LEAVING, Verdict.UNRESPONSIVE)
+        kept = len(self.good) + len(self.replaced) + len(self.aborted)
+        return kept + sum(s.verdict not in exempt for s in self.ending)
+
+
+def classify(
     spec: PoolSpec,
     intent: Intent,
     observed: Observed,
     *,
     health: Health,
     size: Size,
-) -> Census:
+) -> Classification:
     """Sort every machine of the pool."""
-    census = Census()
+    machines = Classification()
     failed = Verdict.FAILED
     blocks = {group.block for group in size.groups}
-    for judged in health.replicas:
-        standing, verdict = Standing(judged), judged.verdict
-        if observed.ending and standing.id in observed.ending:
-            census.ending.append(standing)
-        elif verdict is failed:
-            census.failed.append(standing)
-        elif verdict in _LOST:
-            census.lost.append(standing)
-        elif why := _unwanted(spec, intent, standing, blocks):
-            standing.reason = why
-            if _is_young(standing, health) or _never_served(standing, health):
-                census.aborted.append(standing)
-            else:
-                census.replaced.append(standing)
+    for replica in health.replicas:
+        if observed.ending and replica.id in observed.ending:
+            machines.ending.append(replica)
+        elif replica.verdict is failed:
+            machines.failed.append(replica)
+        elif replica.verdict in _LOST:
+            machines.lost.append(replica)
+        elif why := _unwanted(spec, intent, replica, blocks):
+            goes = replica._replace(unwanted=why)
+            never_served = _is_young(goes, health) or _never_served(goes, health)
+            (machines.aborted if never_served else machines.replaced).append(goes)
         else:
-            census.good.append(standing)
-    _supersede(census, health, size)
-    census.replaced.sort(key=lambda s: (_rank(s), s.id))
-    census.lost.sort(key=lambda s: (s.verdict is not Verdict.LEAVING, s.id))
-    return census
+            machines.good.append(replica)
+    _supersede(machines, health, size)
+    machines.replaced.sort(key=lambda s: (_rank(s), s.id))
+    machines.lost.sort(key=lambda s: (s.verdict is not Verdict.LEAVING, s.id))
+    return machines
 
 
-def _supersede(census: Census, health: Health, size: Size) -> None:
+def _supersede(machines: Classification, health: Health, size: Size) -> None:
     """Of two good ones in one slot the older goes, where there is one too many.
 
     So a replica that moves is ended when its successor serves, and not the other way round.
     """
-    newest = {s.slot: s.id.generation for s in census.good}  # in the order of generations
-    if len(newest) == len(census.good):
+    newest = {s.slot: s.id.generation for s in machines.good}  # in the order of generations
+    if len(newest) == len(machines.good):
         return
     for group, wanted in zip(size.groups, size.counts, strict=True):
-        here = part(census, size.groups, group)
+        here = machines.part(size.groups, group)
         surplus = len(here.good) + len(here.replaced) - wanted
         old = [s for s in here.good if s.id.generation < newest[s.slot]]
-        for standing in old[: max(0, surplus)]:
-            census.good.remove(standing)
-            why = Reason(Cause.SUPERSEDED, replica=f"{standing.slot}.{newest[standing.slot]}")
-            young = _is_young(standing, health)
-            goes = replace(standing, reason=why)
-            (census.aborted if young else census.replaced).append(goes)
+        for replica in old[: max(0, surplus)]:
+            machines.good.remove(replica)
+            why = Reason(Cause.SUPERSEDED, replica=f"{replica.slot}.{newest[replica.slot]}")
+            young = _is_young(replica, health)
+            goes = replica._replace(unwanted=why)
+            (machines.aborted if young else machines.replaced).append(goes)
 
 
 def _unwanted(
-    spec: PoolSpec, intent: Intent, standing: Standing, blocks: Collection[int]
+    spec: PoolSpec, intent: Intent, replica: Assessment, blocks: Collection[int]
 ) -> Reason | None:
     """Return why a working replica is to be replaced; None when it is not."""
-    machine, slot = standing.judged.machine, standing.slot
-    if intent.drained and intent.is_drained(slot, standing.id.generation):
+    machine, slot = replica.machine, replica.slot
+    if intent.drained and intent.is_drained(slot, replica.id.generation):
         return Reason(Cause.DRAINED)
     if intent.excluded and intent.is_excluded(machine.placement.location):
         return Reason(Cause.EXCLUDED, location=machine.placement.location)
-    if standing.verdict in _DOUBTED:
-        return standing.judged.why
+    if replica.verdict in _DOUBTED:
+        return replica.why
     if slot // BLOCK not in blocks:
         return Reason(Cause.NO_GROUP)
     if machine.spec_hash != replica_hash(spec, slot):
@@ -96,22 +155,22 @@ def _unwanted(
     return None
 
 
-def _rank(standing: Standing) -> int:
-    why = standing.why
+def _rank(replica: Assessment) -> int:
+    why = replica.why
     return 2 if why is None else _ORDER.get(why.cause, 2)
 
 
-def _is_young(standing: Standing, health: Health) -> bool:
+def _is_young(replica: Assessment, health: Health) -> bool:
     """Whether it certainly never served, so that it can be ended at once."""
-    if standing.judged.machine.phase is MachinePhase.PROVISIONING:
+    if replica.machine.phase is MachinePhase.PROVISIONING:
         return True
     known = health.links_known and not health.uplink_suspected
-    return known and not standing.ever_ready and not standing.answers
+    return known and not replica.ever_ready and not replica.answers
 
 
-def _never_served(standing: Standing, health: Health) -> bool:
+def _never_served(replica: Assessment, health: Health) -> bool:
     """Whether an outdated one answers probes and has never had a service ready: it is no loss."""
     known = health.links_known and not health.uplink_suspected
-    link = standing.judged.link
-    served = standing.ever_ready or (link is not None and bool(link.ready))
-    return known and not served and is_outdated(standing)
+    link = replica.link
+    served = replica.ever_ready or (link is not None and bool(link.ready))
+    return known and not served and replica.is_outdated

@@ -25,7 +25,7 @@ from fogft.planning.availability import Expected, expected
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
 from fogft.planning.listing import is_possible
-from fogft.planning.observed.backoff import AVOID_MEMORY_S, EVERYWHERE, avoided, resting
+from fogft.planning.observed.backoff import AVOID_MEMORY_S, EVERYWHERE, avoided, backing_off
 from fogft.planning.observed.history import History
 from fogft.planning.placement import crowding, domains
 from fogft.planning.planner import plan
@@ -190,7 +190,7 @@ class _Reasons:
         self._now = observed.now
         self._intent = intent
         self._losses: Mapping[str, list[float]] = history.losses
-        self._resting = resting(history, observed.now)
+        self._backing_off = backing_off(history, observed.now)
         self._avoided = avoided(history, observed.now)
         self._scale = scale
         self._picks: dict[str, list[_Pick]] = {}
@@ -220,10 +220,10 @@ class _Reasons:
             return Reason(Cause.IMPOSSIBLE_PRICE, usd_per_hour=offer.usd_per_hour)
         if self._intent.is_excluded(location):
             return Reason(Cause.EXCLUDED)
-        rest = self._resting.get(offer.placement.supply) or self._resting.get(EVERYWHERE)
-        if rest is not None:
-            left_s, last = rest.until - self._now, Reason(rest.cause)
-            return Reason(Cause.BACKING_OFF, seconds=left_s, count=rest.failures, because=(last,))
+        pause = self._backing_off.get(offer.placement.supply) or self._backing_off.get(EVERYWHERE)
+        if pause is not None:
+            left_s, last = pause.until - self._now, Reason(pause.cause)
+            return Reason(Cause.BACKING_OFF, seconds=left_s, count=pause.failures, because=(last,))
         picks = self._picks.get(offer.group, [])
         if not picks:
             return Reason(Cause.OTHER_KIND)

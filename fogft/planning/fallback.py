@@ -16,18 +16,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fogft.model.groups import is_stand_in
-from fogft.planning.endings import Census, Standing
+from fogft.planning.classification import Classification
+from fogft.planning.observed.health import Assessment
 
 # A quarter of all losses come within minutes of the order.
 SETTLED_S = 60.0
 
 
-def stand_ins(census: Census) -> list[Standing]:
+def stand_ins(machines: Classification) -> list[Assessment]:
     """Return the machines that stand in for others, and are not lost."""
-    return [s for s in (*census.good, *census.replaced) if is_stand_in(s.slot)]
+    return [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
 
 
-def missing(wanted: int, here: Census, standing_in: Sequence[Standing]) -> int:
+def missing(wanted: int, here: Classification, standing_in: Sequence[Assessment]) -> int:
     """Return how many more stand-ins are called for.
 
     Args:
@@ -41,16 +42,16 @@ def missing(wanted: int, here: Census, standing_in: Sequence[Standing]) -> int:
     return wanted - ready - first - len(standing_in)
 
 
-def spare(wanted: int, here: Census, standing_in: Sequence[Standing], now: float) -> int:
+def spare(wanted: int, here: Classification, standing_in: Sequence[Assessment], now: float) -> int:
     """Return how many stand-ins are no longer needed, given enough others that have settled."""
     settled = sum(_is_settled(s, now) for s in (*here.good, *here.replaced))
-    kept = sum(not s.reason for s in standing_in)
+    kept = sum(not s.unwanted for s in standing_in)
     return kept - max(0, wanted - settled)
 
 
-def _is_settled(standing: Standing, now: float) -> bool:
+def _is_settled(replica: Assessment, now: float) -> bool:
     """Whether a replica serves, and has been ready for long enough to be relied on."""
-    record = standing.record
-    if not standing.judged.serving or record is None or record.first_ready_at is None:
+    record = replica.record
+    if not replica.serving or record is None or record.first_ready_at is None:
         return False
     return now - record.first_ready_at >= SETTLED_S

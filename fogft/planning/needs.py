@@ -10,9 +10,10 @@ import itertools
 from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
-from fogft.model.groups import CRITICAL, Group, is_stand_in
+from fogft.model.groups import Group, group_of, is_stand_in
 from fogft.model.reason import Cause, Reason, because
-from fogft.planning.endings import Census, Standing
+from fogft.planning.classification import Classification
+from fogft.planning.observed.health import Assessment
 from fogft.planning.observed.history import History
 
 
@@ -27,29 +28,14 @@ class Need(NamedTuple):
     slot: int
     reason: Reason
     group: Group
-    replaces: Standing | None = None
+    replaces: Assessment | None = None
     stands_in: bool = False
-
-
-def home(groups: Sequence[Group], slot: int) -> Group:
-    """Return the group that a slot's replica counts for: its own, else the last ordinary one."""
-    if len(groups) == 1:
-        return groups[0]
-    ordinary = [group for group in groups if group.name != CRITICAL]
-    return next((group for group in groups if group.owns(slot)), ordinary[-1])
-
-
-def part(census: Census, groups: Sequence[Group], group: Group) -> Census:
-    """Return the part of a census that counts for a group; it is not to be changed."""
-    if len(groups) == 1:
-        return census
-    return census.of(lambda slot: home(groups, slot) is group)
 
 
 def needed_launches(
     groups: Sequence[Group],
     counts: Sequence[int],
-    census: Census,
+    machines: Classification,
     history: History,
     *,
     settling: bool = False,
@@ -61,45 +47,49 @@ def needed_launches(
     """
     needs: list[Need] = []
     for group, wanted in zip(groups, counts, strict=True):
-        here = part(census, groups, group)
+        here = machines.part(groups, group)
         if wanted > len(here.good) + len(here.replaced):
             needs += _missing(group, wanted, here, history)
-    if needs or not census.replaced or census.ending or settling:
+    if needs or not machines.replaced or machines.ending or settling:
         return needs
-    if any(not s.ever_ready for s in census.good):  # one is coming
+    if any(not s.ever_ready for s in machines.good):  # one is coming
         return []
-    return _replacement(groups, counts, census)
+    return _replacement(groups, counts, machines)
 
 
-def _replacement(groups: Sequence[Group], counts: Sequence[int], census: Census) -> list[Need]:
+def _replacement(
+    groups: Sequence[Group], counts: Sequence[int], machines: Classification
+) -> list[Need]:
     """Return the launch of one successor; none where none is called for."""
-    for standing in census.replaced:
-        group = home(groups, standing.slot)
-        here = part(census, groups, group)
+    for replica in machines.replaced:
+        group = group_of(groups, replica.slot)
+        here = machines.part(groups, group)
         if len(here.good) + len(here.replaced) <= counts[list(groups).index(group)]:
             # Its slot, unless a good one lives there: that one then stands for another.
             used = {s.slot for s in (*here.good, *here.replaced)}
             taken = {s.slot for s in here.good}
-            free = standing.slot not in taken and group.owns(standing.slot)
-            slot = standing.slot if free else _lowest_free(group, used)
-            return [Need(slot, _replaces(standing), group, standing)]
+            free = replica.slot not in taken and group.owns(replica.slot)
+            slot = replica.slot if free else _lowest_free(group, used)
+            return [Need(slot, _replaces(replica), group, replica)]
     return []
 
 
-def _missing(group: Group, wanted: int, census: Census, history: History) -> Iterator[Need]:
-    missing = wanted - len(census.good) - len(census.replaced)
-    used = {s.slot for s in (*census.good, *census.replaced)}
+def _missing(
+    group: Group, wanted: int, machines: Classification, history: History
+) -> Iterator[Need]:
+    missing = wanted - len(machines.good) - len(machines.replaced)
+    used = {s.slot for s in (*machines.good, *machines.replaced)}
     vacant = [
         s
-        for s in census.lost
+        for s in machines.lost
         if s.slot not in used and group.owns(s.slot) and not is_stand_in(s.slot)
     ]
     lost_slots = {s.slot for s in vacant}
-    for standing in vacant:
-        if missing > 0 and standing.slot not in used:
-            used.add(standing.slot)
+    for replica in vacant:
+        if missing > 0 and replica.slot not in used:
+            used.add(replica.slot)
             missing -= 1
-            yield Need(standing.slot, _replaces(standing), group, standing)
+            yield Need(replica.slot, _replaces(replica), group, replica)
     used |= lost_slots
     for _ in range(missing):
         slot = _lowest_free(group, used)
@@ -117,8 +107,8 @@ def _lowest_free(group: Group, used: set[int]) -> int:
     return next(slot for slot in itertools.count(group.first_slot) if slot not in used)
 
 
-def _replaces(standing: Standing) -> Reason:
-    return Reason(Cause.REPLACES, replica=standing.short, because=because(standing.why))
+def _replaces(replica: Assessment) -> Reason:
+    return Reason(Cause.REPLACES, replica=replica.id.short, because=because(replica.why))
 
 
 def _vacancy(slot: int, history: History) -> Reason:

@@ -68,28 +68,28 @@ class Market:
 
     Args:
         listing: What is sold, in order.
-        resting: Supplies in backoff, see `Placement.supply`.
+        backing_off: Supplies in backoff, see `Placement.supply`.
         avoid: Locations to use only when no other is left: one was lost there lately.
         full: Locations that hold as many replicas as may be lost at once.
         hazards: Location -> losses per hour, as far as known.
 
     Attributes:
-        resting: The supplies that it would have, where all that it sells rests; else empty.
+        backing_off: The supplies that it would have, where all that it sells backs off; else empty.
     """
 
     def __init__(
         self,
         listing: Listing,
         *,
-        resting: Mapping[str, Backoff] | None = None,
+        backing_off: Mapping[str, Backoff] | None = None,
         avoid: Collection[str] = (),
         full: Collection[str] = (),
         hazards: Mapping[str, float] | None = None,
     ) -> None:
-        rests = resting or {}
+        pauses = backing_off or {}
         self._avoid = frozenset(avoid)
         self._nothing = listing.trouble
-        self.resting: Mapping[str, Backoff] = {}
+        self.backing_off: Mapping[str, Backoff] = {}
         self.rows, self._clouds = listing.rows, listing.clouds
         if hazards:
             self.rows = _weighed(self.rows, hazards)
@@ -98,18 +98,18 @@ class Market:
             self._clouds = frozenset([row.cloud for row in self.rows])
             if not self.rows and not self._nothing:
                 self._nothing = Reason(Cause.LOCATION_FULL)
-        asleep = listing.supplies.intersection(rests) if rests else frozenset()
-        if asleep:
-            self.rows = tuple([row for row in self.rows if row.supply not in asleep])
+        left_out = listing.supplies.intersection(pauses) if pauses else frozenset()
+        if left_out:
+            self.rows = tuple([row for row in self.rows if row.supply not in left_out])
             self._clouds = frozenset([row.cloud for row in self.rows])
-        if EVERYWHERE in rests:
-            rest = rests[EVERYWHERE]
+        if EVERYWHERE in pauses:
+            pause = pauses[EVERYWHERE]
             self._nothing = Reason(
-                Cause.BACKING_OFF, count=rest.failures, because=(Reason(rest.cause),)
+                Cause.BACKING_OFF, count=pause.failures, because=(Reason(pause.cause),)
             )
-        elif asleep and not self.rows:
-            self.resting = {place: rests[place] for place in sorted(asleep)}
-            failures = (Reason(rest.cause, location=at) for at, rest in self.resting.items())
+        elif left_out and not self.rows:
+            self.backing_off = {place: pauses[place] for place in sorted(left_out)}
+            failures = (Reason(pause.cause, location=at) for at, pause in self.backing_off.items())
             self._nothing = Reason(Cause.ALL_BACKING_OFF, because=tuple(failures))
 
     def choose(
@@ -174,12 +174,12 @@ def choose(
     *,
     taken: Collection[Placement],
     excluded: Collection[str] = (),
-    resting: Mapping[str, Backoff] | None = None,
+    backing_off: Mapping[str, Backoff] | None = None,
     avoid: Collection[str] = (),
     budget_usd_per_hour: float | None = None,
     scale: Scale | None = None,
 ) -> Choice:
     """Choose among offers once; see `Market`."""
     listing = catalogue(offers).listing(None, None, excluded, scale or Scale())
-    market = Market(listing, resting=resting, avoid=avoid)
+    market = Market(listing, backing_off=backing_off, avoid=avoid)
     return market.choose(taken, budget_usd_per_hour=budget_usd_per_hour)

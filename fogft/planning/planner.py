@@ -5,31 +5,30 @@ depends on is an argument, so a bug report that quotes the arguments is a failin
 and planning again after a crash is always safe. docs/design/planner.md has the flow.
 
 Owns: the order of the steps, and what holds the pool within its cap.
-Not here: the steps: how many (`sizing`), who is ill (`health`), who is what (`census`), what
-is missing (`needs`), where it goes (`buying`, `placement`), who moves (`migration`), who ends
-(`endings`).
+Not here: the steps: how many (`sizing`), who is ill (`health`), who is what
+(`classification`), what is missing (`needs`), where it goes (`buying`, `placement`), who moves
+(`migration`), who ends (`endings`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
-from fogft.model.groups import Group
+from fogft.model.groups import Group, group_of
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning import fallback, migration, rollout
 from fogft.planning.buying import Buyer, PlannedLaunch
-from fogft.planning.classification import take_census
-from fogft.planning.endings import Census, Endings, Standing, choose_endings, is_outdated
-from fogft.planning.needs import Need, home, needed_launches, part, stand_in
-from fogft.planning.observed.health import Health, judge
+from fogft.planning.classification import Classification, classify
+from fogft.planning.endings import Endings, choose_endings
+from fogft.planning.needs import Need, needed_launches, stand_in
+from fogft.planning.observed.health import Assessment, Health, judge
 from fogft.planning.observed.history import History
 from fogft.planning.placement import EPSILON_USD
-from fogft.planning.projected_state import under_way
+from fogft.planning.projected_state import projected_state
 from fogft.planning.sizing import Size, size
 
 __all__ = ["Plan", "PlannedEnd", "PlannedLaunch", "plan"]
@@ -55,8 +54,8 @@ class Plan(NamedTuple):
         wanted: How many replicas should be ready.
         health: What the plan was based on; None when the cloud could not tell.
         closed: It is known without trying that planning again while it is under way adds nothing.
-        waits: For a location's rest to end: a launch that is needed, or a stand-in's return.
-        restless: Who would move if they had stayed long enough and no location rested.
+        waits: For a location's backoff to end: a launch that is needed, or a stand-in's return.
+        restless: Who would move if they had stayed long enough and no location backed off.
     """
 
     wanted: int
@@ -103,7 +102,7 @@ def plan(
     for _ in range(MOST_PASSES):
         if latest.closed or not _changes(latest, history):
             break
-        world, memory = under_way(
+        world, memory = projected_state(
             pool_uid,
             spec,
             observed,
@@ -155,25 +154,25 @@ def plan_once(
         return _stopping(health, observed)
 
     sized = size(spec, intent, observed, health.running if spec.availability else 0)
-    census = take_census(spec, intent, observed, health=health, size=sized)
-    counts, excess = _within_cap(sized, census)
+    machines = classify(spec, intent, observed, health=health, size=sized)
+    counts, excess = _within_cap(sized, machines)
     wanted = sum(counts)
-    standing_in = fallback.stand_ins(census)
-    others = census.without(standing_in) if standing_in else census
+    standing_in = fallback.stand_ins(machines)
+    others = machines.without(standing_in) if standing_in else machines
     buyer = Buyer(
         spec,
         intent,
         observed,
         history,
-        census,
+        machines,
         sized.groups,
         sized.max_usd_per_hour,
         standing_in=standing_in,
     )
     settling = bool(others.replaced) and rollout.is_settling(others, observed.now)
     needs = needed_launches(sized.groups, counts, others, history, settling=settling)
-    may_move = not needs and not standing_in and len(census.good) == wanted and spec.max_surge > 0
-    may_move = may_move and migration.is_quiet(census, health)
+    may_move = not needs and not standing_in and len(machines.good) == wanted and spec.max_surge > 0
+    may_move = may_move and migration.is_quiet(machines, health)
     waits = False
     restless = migration.restless(buyer) if may_move else frozenset()
     moves = False
@@ -181,14 +180,14 @@ def plan_once(
         found = migration.mover(buyer, observed.now, restless)
         moves = found is not None
         if found is not None:
-            census.good.remove(found.standing)
-            census.replaced.append(replace(found.standing, reason=found.why))
-            needs = needed_launches(sized.groups, counts, census, history)
-    room = wanted + spec.max_surge - census.live
-    first: Standing | None = None
+            machines.good.remove(found.replica)
+            machines.replaced.append(found.replica._replace(unwanted=found.why))
+            needs = needed_launches(sized.groups, counts, machines, history)
+    room = wanted + spec.max_surge - machines.live
+    first: Assessment | None = None
     begun = [need.slot for need in needs if not history.generation(need.slot)]
     short = _stand_ins_missing(sized.groups, counts, others, standing_in, begun)
-    kept_free = _kept_free(len(short), room, census) if not standing_in else 0
+    kept_free = _kept_free(len(short), room, machines) if not standing_in else 0
     for need in needs:
         if not buyer.buy(need, room=room - kept_free):
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
@@ -199,12 +198,12 @@ def plan_once(
         buyer.buy(need, room=room)
     held: Sequence[ReplicaId] = ()
     if settling:
-        held = [s.id for s in others.replaced if is_outdated(s) and not s.draining_since]
+        held = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
     endings = Endings()
     for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
-        here = part(others, sized.groups, group)
-        mine = [s for s in standing_in if home(sized.groups, s.slot) is group]
-        makes_room = first is not None and home(sized.groups, first.slot) is group
+        here = others.part(sized.groups, group)
+        mine = [s for s in standing_in if group_of(sized.groups, s.slot) is group]
+        makes_room = first is not None and group_of(sized.groups, first.slot) is group
         endings.add(
             choose_endings(
                 count,
@@ -222,7 +221,7 @@ def plan_once(
         )
     ends = [
         PlannedEnd(s.id, s.why or Reason(Cause.NOT_WANTED))
-        for s in (*census.failed, *census.aborted)
+        for s in (*machines.failed, *machines.aborted)
     ]
     ends += [PlannedEnd(s.id, why) for s, why in endings.now]
     ends += [PlannedEnd(s.id, why) for s, why in buyer.sacrificed if s.id not in endings.ids]
@@ -239,28 +238,28 @@ def plan_once(
         # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
         # Who moves is not to go before the one that comes serves: all others do, and are needed.
         # Room kept for stand-ins that they did not take is left for the next pass.
-        closed=not (ends or endings.draining or census.ending or excess)
-        and (moves or not census.replaced)
+        closed=not (ends or endings.draining or machines.ending or excess)
+        and (moves or not machines.replaced)
         and not (kept_free and waits),
         waits=waits,
         restless=restless,
     )
 
 
-def _kept_free(short: int, room: int, census: Census) -> int:
+def _kept_free(short: int, room: int, machines: Classification) -> int:
     """Return how many of the machines that there is room for are to be stand-ins.
 
     One, as long as somebody serves. Else a spot machine may be refused, and boots no faster.
     """
-    serves = any(s.judged.may_serve for s in (*census.good, *census.replaced))
+    serves = any(s.may_serve for s in (*machines.good, *machines.replaced))
     return max(0, min(1 if serves else short, short, room - 1))
 
 
 def _stand_ins_missing(
     groups: Sequence[Group],
     counts: Sequence[int],
-    others: Census,
-    standing_in: Sequence[Standing],
+    others: Classification,
+    standing_in: Sequence[Assessment],
     begun: Sequence[int],
 ) -> list[Need]:
     """Return the stand-ins called for, where some slots get their first machine now."""
@@ -269,9 +268,9 @@ def _stand_ins_missing(
     for group, count in zip(groups, counts, strict=True):
         if not group.on_demand.fallback:
             continue
-        here = [s for s in standing_in if home(groups, s.slot) is group and not s.reason]
-        lacking = fallback.missing(count, part(others, groups, group), here)
-        for _ in range(lacking - sum(home(groups, slot) is group for slot in begun)):
+        here = [s for s in standing_in if group_of(groups, s.slot) is group and not s.unwanted]
+        lacking = fallback.missing(count, others.part(groups, group), here)
+        for _ in range(lacking - sum(group_of(groups, slot) is group for slot in begun)):
             need = stand_in(group, used)
             used.add(need.slot)
             needs.append(need)
@@ -284,35 +283,35 @@ def _stopping(health: Health, observed: Observed) -> Plan:
     return Plan(0, terminations=ends, notes=(Reason(Cause.STOPPING),), health=health)
 
 
-def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Standing | None:
+def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Assessment | None:
     """Return the outdated one that has to end before its successor can be launched, if it may."""
     old = need.replaces
-    if old is None or not is_outdated(old) or old not in buyer.census.replaced:
+    if old is None or not old.is_outdated or old not in buyer.machines.replaced:
         return None
     fits = buyer.fits_instead(need, old)
     if not fits or (max_surge and buyer.fits_beside(need)):
         return None
-    if not rollout.may_go_first(old, buyer.census, wanted):
+    if not rollout.may_go_first(old, buyer.machines, wanted):
         buyer.notes.append(Reason(Cause.NO_ROOM_TO_UPDATE, slot=need.slot))
         return None
     buyer.notes.append(Reason(Cause.OLD_BEFORE_NEW, slot=need.slot))
     return old
 
 
-def _within_cap(sized: Size, census: Census) -> tuple[Sequence[int], list[Reason]]:
+def _within_cap(sized: Size, machines: Classification) -> tuple[Sequence[int], list[Reason]]:
     """Return how many are wanted of each group: one fewer while those at hand exceed the cap.
 
     No launch exceeds the cap: this is for one that was lowered, by a schedule or in the file.
     The last group gives first, one at a time, and one replica always stays.
     """
     cap, counts, groups = sized.max_usd_per_hour, list(sized.counts), sized.groups
-    if cap is None or len(census.good) < 2:
+    if cap is None or len(machines.good) < 2:
         return counts, []
-    cost = sum(s.usd_per_hour for s in census.good)
+    cost = sum(s.machine.usd_per_hour for s in machines.good)
     if cost <= cap + EPSILON_USD:
         return counts, []
-    if census.replaced or census.ending or len(census.good) > sum(counts):
+    if machines.replaced or machines.ending or len(machines.good) > sum(counts):
         return counts, []  # it shrinks already
-    index = max(i for i, group in enumerate(groups) if part(census, groups, group).good)
-    counts[index] = min(counts[index], len(part(census, groups, groups[index]).good) - 1)
+    index = max(i for i, group in enumerate(groups) if machines.part(groups, group).good)
+    counts[index] = min(counts[index], len(machines.part(groups, groups[index]).good) - 1)
     return counts, [Reason(Cause.OVER_CAP, usd_per_hour=cost, limit_usd_per_hour=cap)]

@@ -19,7 +19,7 @@ from fogft.planning.buying import PlannedLaunch
 from fogft.planning.observed.history import Event, EventKind, History
 
 
-def under_way(
+def projected_state(
     pool_uid: str,
     spec: PoolSpec,
     observed: Observed,

@@ -20,8 +20,8 @@ from fogft.model.groups import replica_hash
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkState, Machine
 from fogft.model.spec import PoolSpec
-from fogft.planning.endings import Census, Standing, is_outdated
-from fogft.planning.observed.health import Health, Judged, Verdict
+from fogft.planning.classification import Classification
+from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.observed.history import History
 
 # A new replica has to serve for so long before the next one is replaced, or its version is good.
@@ -58,7 +58,7 @@ class Trial:
     """What is remembered of the file that was applied last.
 
     Attributes:
-        file: Its digest: what is remembered holds for no other.
+        file: Its cache: what is remembered holds for no other.
         began_at: When the manager first saw it, in seconds since the epoch.
         fault: Why it was given up; None while it is not.
     """
@@ -126,7 +126,7 @@ def fault(
     return None
 
 
-def _does_not_start(judged: Judged) -> Reason | None:
+def _does_not_start(judged: Assessment) -> Reason | None:
     why = judged.why
     if judged.verdict is Verdict.FAILED and why is not None and why.cause in _THE_VERSIONS:
         return replace(why, words=why.words.partition("\n")[0])
@@ -140,7 +140,7 @@ def _does_not_start(judged: Judged) -> Reason | None:
     return None
 
 
-def _errors(new: list[Judged], old: list[Judged]) -> Reason | None:
+def _errors(new: list[Assessment], old: list[Assessment]) -> Reason | None:
     """Return how the new version's answers are worse than the old one's, if they surely are."""
     failed, asked = _counts(new)
     old_failed, old_asked = _counts(old)
@@ -152,7 +152,7 @@ def _errors(new: list[Judged], old: list[Judged]) -> Reason | None:
     return Reason(Cause.MORE_ERRORS, because=shares)
 
 
-def _counts(replicas: list[Judged]) -> tuple[int, int]:
+def _counts(replicas: list[Assessment]) -> tuple[int, int]:
     links = [judged.link for judged in replicas if judged.link is not None]
     failed = sum(link.failed for link in links)
     return failed, failed + sum(link.answered for link in links)
@@ -205,7 +205,7 @@ def is_whole(
     )
 
 
-def _settles(history: History, judged: Judged, now: float, settle_s: float) -> bool:
+def _settles(history: History, judged: Assessment, now: float, settle_s: float) -> bool:
     record = history.record(judged.id.slot, judged.id.generation)
     ready_at = record.first_ready_at if record is not None else None
     return ready_at is None or 0 <= now - ready_at < settle_s
@@ -245,26 +245,26 @@ def describe(
 # -- what the planner asks --------------------------------------------------------------------
 
 
-def is_settling(census: Census, now: float) -> bool:
+def is_settling(machines: Classification, now: float) -> bool:
     """Whether a newcomer has yet to prove itself before the update goes on."""
-    if not any(is_outdated(s) for s in census.replaced):
+    if not any(s.is_outdated for s in machines.replaced):
         return False
     return any(
         (ready_at := s.record.first_ready_at if s.record else None) is not None
         and 0 <= now - ready_at < SETTLE_S
-        for s in census.good
+        for s in machines.good
     )
 
 
-def may_go_first(standing: Standing, census: Census, wanted: int) -> bool:
+def may_go_first(replica: Assessment, machines: Classification, wanted: int) -> bool:
     """Whether an outdated one may end before its successor exists: all others serve.
 
     So at least one always answers, and never more than one is missing.
     """
-    if not standing.judged.may_serve:
+    if not replica.may_serve:
         return True
-    others = [s for s in (*census.good, *census.replaced) if s.id != standing.id]
-    serving = sum(s.judged.serving for s in others)
+    others = [s for s in (*machines.good, *machines.replaced) if s.id != replica.id]
+    serving = sum(s.serving for s in others)
     return serving >= max(1, wanted - 1)
 
 

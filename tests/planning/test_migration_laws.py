@@ -12,7 +12,7 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer
 from fogft.planning import migration
 from fogft.planning.buying import Buyer
-from fogft.planning.classification import take_census
+from fogft.planning.classification import classify
 from fogft.planning.observed.health import judge
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.sizing import size
@@ -66,17 +66,17 @@ def buyer(world: World) -> Buyer:
     """What the planner asks who is to move."""
     health = judge(UID, world.spec, world.observed, world.history)
     sized = size(world.spec, world.intent, world.observed)
-    census = take_census(world.spec, world.intent, world.observed, health=health, size=sized)
+    machines = classify(world.spec, world.intent, world.observed, health=health, size=sized)
     cap = sized.max_usd_per_hour
     seen = world.observed, world.history
-    return Buyer(world.spec, world.intent, *seen, census, sized.groups, cap)
+    return Buyer(world.spec, world.intent, *seen, machines, sized.groups, cap)
 
 
 @given(quiet())
 def test_nobody_moves_who_would_not_if_nothing_rested_or_were_avoided(world: World) -> None:
     """To ask the restless alone who moves, and where to, is to ask everybody."""
     asked = buyer(world)
-    everybody = [standing.id for standing in asked.census.good]
+    everybody = [replica.id for replica in asked.machines.good]
     found = migration.mover(asked, world.now, everybody)
     narrowed = migration.mover(asked, world.now, migration.restless(asked))
     assert found == narrowed

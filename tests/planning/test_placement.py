@@ -61,13 +61,13 @@ def test_choice_is_deterministic(offers: list[Offer], taken: list[Placement], se
 def test_excluded_and_resting_are_never_chosen(offers: list[Offer], place: Placement) -> None:
     """Neither what the user excluded nor what is in backoff."""
     excluded = choose(offers, taken=[], excluded=[f"{place.cloud}/{place.region}"])
-    resting = choose(offers, taken=[], resting={place.location: REST})
+    backing_off = choose(offers, taken=[], backing_off={place.location: REST})
     if excluded.offer is not None:
         region = (excluded.offer.placement.cloud, excluded.offer.placement.region)
         assert region != (place.cloud, place.region)
-    if resting.offer is not None:
-        assert resting.offer.placement.location != place.location
-    for choice in (excluded, resting):
+    if backing_off.offer is not None:
+        assert backing_off.offer.placement.location != place.location
+    for choice in (excluded, backing_off):
         assert (choice.offer is None) == bool(choice.why_not)
 
 
@@ -81,19 +81,19 @@ def test_avoided_location_is_the_last_resort(offers: list[Offer], place: Placeme
 
 
 def test_each_reason_is_told_apart() -> None:
-    """No offers, all excluded, all resting, too dear, and nothing anywhere."""
+    """No offers, all excluded, all backing_off, too dear, and nothing anywhere."""
     place = Placement("c1", "r1", "a", "m1")
     offer = Offer(place, 0.5)
     assert choose([], taken=[]).why_not == Reason(Cause.NOTHING_OFFERED)
     assert choose([offer], taken=[], excluded=["c1"]).why_not == Reason(Cause.ALL_EXCLUDED)
     full = Reason(Cause.CAPACITY, location="c1/r1/a")
-    assert choose([offer], taken=[], resting={place.location: REST}).why_not == Reason(
+    assert choose([offer], taken=[], backing_off={place.location: REST}).why_not == Reason(
         Cause.ALL_BACKING_OFF, because=(full,)
     )
     assert choose([offer], taken=[], budget_usd_per_hour=0.4).why_not == Reason(
         Cause.OVER_BUDGET, usd_per_hour=0.5, limit_usd_per_hour=0.4
     )
-    assert choose([offer], taken=[], resting={EVERYWHERE: REST}).why_not == Reason(
+    assert choose([offer], taken=[], backing_off={EVERYWHERE: REST}).why_not == Reason(
         Cause.BACKING_OFF, count=1, because=(Reason(Cause.CAPACITY),)
     )
 

@@ -1,28 +1,25 @@
-"""How long a location is left alone after it disappointed. Pure.
+"""How long a location is left alone after failures. Pure.
 
-A location sells spot machines and on-demand ones. Either supply may run short while the other
-does not, so each rests by itself. Failures are refused launches (no capacity, no quota),
-launches that failed, and replicas that died young. After n failures in a row a location rests for
+A location sells spot machines and on-demand ones; each supply backs off by itself. Failures are
+refused launches (no capacity, no quota), launches that failed, and replicas that died young. After
+n failures in a row a supply is not tried for
 
     min(BASE_S * 2 ** (n - 1), LIMIT_S)
 
-seconds from the last one; NO_ROOM_S in place of BASE_S where it had no room, so that a round
-over all locations ends before the first is asked again. A replica that becomes ready there, or
-FORGIVE_S without a failure, wipes the slate clean. A failed `setup` is the pool file's fault,
-not the location's: it is counted against `EVERYWHERE`, so a broken file does not tour the world
-at the user's expense.
+seconds from the last one; NO_ROOM_S in place of BASE_S where it had no room, so that a round over
+all locations ends before the first is asked again. A replica that becomes ready there, or
+FORGIVE_S without a failure, ends it. A failed `setup` is the pool file's fault, not the location's:
+it counts against `EVERYWHERE`, so that a broken file is not tried in one location after the other.
 
-A location where a replica was lost unasked is not at rest, but it is avoided: used only when
-no other is left, for
+A location where a replica was lost is avoided: used only when no other is left, for
 
     min(AVOID_S * 2 ** (n - 1), AVOID_LIMIT_S)
 
 seconds after the last of n losses within AVOID_MEMORY_S.
 
-When every location rests, waiting helps nobody: then the one that was left alone for longest is
-tried, one try in EAGER_S. And a replica that could move, but need not, asks no location that
-refused within FORGIVE_S and has not proved itself since. Events from the future, which a clock
-that jumped back leaves behind, count for nothing.
+While all supplies back off, the one whose last failure is oldest is tried, one try in EAGER_S. A
+replica that could move, but need not, asks no location that refused within FORGIVE_S and has had
+none ready since. Events from the future, left by a clock that was set back, count for nothing.
 """
 
 from __future__ import annotations
@@ -33,7 +30,7 @@ from operator import itemgetter
 from typing import NamedTuple
 
 from fogft.model.reason import Cause
-from fogft.planning.observed.expiring import Lasting
+from fogft.planning.observed.expiring import Expiring
 from fogft.planning.observed.history import Failure, History
 
 BASE_S = 5.0
@@ -50,7 +47,7 @@ _AT = itemgetter(0)
 
 
 class Backoff(NamedTuple):
-    """A location at rest.
+    """A supply that must not be tried yet.
 
     Attributes:
         since: Of the last failure, in seconds since the epoch.
@@ -69,76 +66,80 @@ class _Outlook(NamedTuple):
     """What a supply's failures and proofs say of it.
 
     Attributes:
-        rest: Whatever was the pool file's fault is left out.
-        rest_changes: When it ends or gets shorter; infinity where there is none.
+        pause: Whatever was the pool file's fault is left out.
+        backoff_changes: When it ends or gets shorter; infinity where there is none.
         setup: The failures that are the pool file's fault, those of late among them.
-        disappointment: It has failed of late, and not proved itself since.
+        recent_failure: It has failed of late, and not proved itself since.
     """
 
-    rest: Backoff | None
-    rest_changes: float
+    pause: Backoff | None
+    backoff_changes: float
     setup: Sequence[Failure]
-    disappointment: Backoff | None
+    recent_failure: Backoff | None
 
 
 class _Supplies(NamedTuple):
     """The outlooks of all supplies together."""
 
-    resting: Mapping[str, Backoff]
-    rests_change: float
+    backing_off: Mapping[str, Backoff]
+    backoff_changes: float
     setup: Sequence[Failure]
-    disappointing: Mapping[str, Backoff]
+    recently_failed: Mapping[str, Backoff]
 
 
-def resting(history: History, now: float) -> Mapping[str, Backoff]:
+def backing_off(history: History, now: float) -> Mapping[str, Backoff]:
     """Return the supplies (`Placement.supply`) that must not be tried now, with the reason.
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """
     supplies = history.of_supplies(_outlook, _summed_up, now)
     everywhere = _everywhere(history, supplies.setup, now) if supplies.setup else None
-    return supplies.resting if everywhere is None else {**supplies.resting, EVERYWHERE: everywhere}
+    return (
+        supplies.backing_off
+        if everywhere is None
+        else {**supplies.backing_off, EVERYWHERE: everywhere}
+    )
 
 
-def disappointing(history: History, now: float) -> Mapping[str, Backoff]:
+def recently_failed(history: History, now: float) -> Mapping[str, Backoff]:
     """Return the supplies that failed within FORGIVE_S and have not proved themselves since.
 
     Only the last failure is told.
     """
-    return history.of_supplies(_outlook, _summed_up, now).disappointing
+    return history.of_supplies(_outlook, _summed_up, now).recently_failed
 
 
-def _outlook(history: History, supply: str, now: float) -> Lasting[_Outlook | None]:
+def _outlook(history: History, supply: str, now: float) -> Expiring[_Outlook | None]:
     lately, until = _lately(history.failures[supply], now)
     if not lately:
-        return Lasting(None, until)
+        return Expiring(None, until)
     proven_at = history.proven_at(supply)
     bad = lately if lately[0].at > proven_at else [f for f in lately if f.at > proven_at]
     setup = [f for f in lately if f.cause is Cause.SETUP]
-    rest = _backoff([f for f in bad if f.cause is not Cause.SETUP] if setup else bad, now)
-    rest_changes = NEVER if rest is None else min([rest.until, *_shortened(lately, rest)])
-    disappointment = None
+    pause = _backoff([f for f in bad if f.cause is not Cause.SETUP] if setup else bad, now)
+    backoff_changes = NEVER if pause is None else min([pause.until, *_shortened(lately, pause)])
+    recent_failure = None
     if bad:
         last = bad[-1]
-        disappointment = Backoff(last.at + FORGIVE_S, 1, last.cause, since=last.at)
-    if history.failures[supply][-1].at <= now:  # to forgive the others changes a rest at most
+        recent_failure = Backoff(last.at + FORGIVE_S, 1, last.cause, since=last.at)
+    if history.failures[supply][-1].at <= now:  # to forgive the others changes a pause at most
         until = lately[-1].at + FORGIVE_S
-    until = min(until, rest_changes)
-    return Lasting(_Outlook(rest, rest_changes, setup, disappointment), until)
+    until = min(until, backoff_changes)
+    return Expiring(_Outlook(pause, backoff_changes, setup, recent_failure), until)
 
 
 def _summed_up(outlooks: Mapping[str, _Outlook]) -> _Supplies:
-    resting, disappointing = {}, {}
+    backing_off, recently_failed = {}, {}
     setup: list[Failure] = []
     change = NEVER
     for supply, one in outlooks.items():
-        if one.rest is not None:
-            resting[supply] = one.rest
-            change = min(change, one.rest_changes)
-        if one.disappointment is not None:
-            disappointing[supply] = one.disappointment
+        if one.pause is not None:
+            backing_off[supply] = one.pause
+            change = min(change, one.backoff_changes)
+        if one.recent_failure is not None:
+            recently_failed[supply] = one.recent_failure
         setup += one.setup
-    return _Supplies(resting, change, setup, disappointing)
+    return _Supplies(backing_off, change, setup, recently_failed)
 
 
 def _everywhere(history: History, setup: Sequence[Failure], now: float) -> Backoff | None:
@@ -146,15 +147,15 @@ def _everywhere(history: History, setup: Sequence[Failure], now: float) -> Backo
     return backoff([f for f in setup if f.at > proven_at], now)
 
 
-def rested_longest(resting: Iterable[tuple[str, Backoff]], now: float) -> str | None:
-    """Return the supply to try although it rests, as all do; None to wait.
+def backing_off_longest(backing_off: Iterable[tuple[str, Backoff]], now: float) -> str | None:
+    """Return the supply to try although it backs off, as all do; None to wait.
 
     Only what had no room is tried: a full account or a launch that fails does not get better by it.
     """
-    known = list(resting)
-    if any(now - rest.since < EAGER_S for _, rest in known):
+    known = list(backing_off)
+    if any(now - pause.since < EAGER_S for _, pause in known):
         return None
-    full = [(rest.since, supply) for supply, rest in known if rest.cause is Cause.CAPACITY]
+    full = [(pause.since, supply) for supply, pause in known if pause.cause is Cause.CAPACITY]
     return min(full, default=(0.0, None))[1]
 
 
@@ -175,22 +176,22 @@ def _lately(failures: Sequence[Failure], now: float) -> tuple[Sequence[Failure],
 
 
 def backoff(failures: list[Failure], now: float) -> Backoff | None:
-    """Return the rest that a run of failures earns, or None when it is over."""
+    """Return the pause that a run of failures earns, or None when it is over."""
     return _backoff(sorted([f for f in failures if 0 <= now - f.at < FORGIVE_S], key=_AT), now)
 
 
 def _backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
-    """Return the rest that failures earn, of which none is forgiven, in order of time."""
+    """Return the pause that failures earn, of which none is forgiven, in order of time."""
     if not recent:
         return None
     last = recent[-1]
     # Waiting a little does not help where the account is full.
-    until = last.at + (LIMIT_S if last.cause is Cause.QUOTA else rest_s(len(recent), last.cause))
+    until = last.at + (LIMIT_S if last.cause is Cause.QUOTA else backoff_s(len(recent), last.cause))
     return None if now >= until else Backoff(until, len(recent), last.cause, since=last.at)
 
 
-def rest_s(failures: int, cause: Cause | None = None) -> float:
-    """Return how long so many failures in a row make a location rest, in seconds."""
+def backoff_s(failures: int, cause: Cause | None = None) -> float:
+    """Return how long so many failures in a row make a supply back off, in seconds."""
     base_s = NO_ROOM_S if cause is Cause.CAPACITY else BASE_S
     return min(base_s * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
 
@@ -214,19 +215,19 @@ def avoided(history: History, now: float) -> Mapping[str, float]:
     return history.of_losses(_avoidance, _all_avoided, now).until
 
 
-def _avoidance(history: History, location: str, now: float) -> Lasting[_Avoidance | None]:
+def _avoidance(history: History, location: str, now: float) -> Expiring[_Avoidance | None]:
     losses = history.losses[location]
     first = bisect_right(losses, now - AVOID_MEMORY_S)
     end = bisect_right(losses, now, lo=first)
     holds = losses[end] if end < len(losses) else NEVER
     if first == end:
-        return Lasting(None, holds)
+        return Expiring(None, holds)
     until = losses[end - 1] + min(AVOID_S * 2.0 ** min(end - first - 1, 16), AVOID_LIMIT_S)
     forgotten = losses[first] + AVOID_MEMORY_S
     holds = min(holds, forgotten)
     if until <= now:
-        return Lasting(None, holds)
-    return Lasting(_Avoidance(until, min(until, forgotten)), min(holds, until))
+        return Expiring(None, holds)
+    return Expiring(_Avoidance(until, min(until, forgotten)), min(holds, until))
 
 
 def _all_avoided(locations: Mapping[str, _Avoidance]) -> _Avoided:
@@ -238,7 +239,7 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
     """Return when, if nothing happens, another location may be chosen; infinity for never.
 
     Args:
-        waits: For the end of a rest; see `Plan`.
+        waits: For the end of a pause; see `Plan`.
         restless: Somebody could be better off elsewhere.
     """
     supplies = history.of_supplies(_outlook, _summed_up, now)
@@ -246,27 +247,27 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
     if supplies.setup:
         times += _everywhere_changes(history, supplies.setup, now)
     if waits:
-        rests = resting(history, now)
-        last = max([rest.since for rest in rests.values()], default=-NEVER)
-        times += [supplies.rests_change, last + EAGER_S]
+        pauses = backing_off(history, now)
+        last = max([pause.since for pause in pauses.values()], default=-NEVER)
+        times += [supplies.backoff_changes, last + EAGER_S]
     if restless:
-        times += [rest.until for rest in supplies.disappointing.values()]
+        times += [pause.until for pause in supplies.recently_failed.values()]
     if waits or restless:  # a stand-in does not return to where one was just lost
         times.append(history.of_losses(_avoidance, _all_avoided, now).change)
     return min([at for at in times if at > now], default=NEVER)
 
 
 def _everywhere_changes(history: History, setup: Sequence[Failure], now: float) -> Sequence[float]:
-    rest = _everywhere(history, setup, now)
-    if rest is None:
+    pause = _everywhere(history, setup, now)
+    if pause is None:
         return ()
     lately = [f for failures in history.failures.values() for f in _lately(failures, now)[0]]
-    return (rest.until, *_shortened(lately, rest))
+    return (pause.until, *_shortened(lately, pause))
 
 
-def _shortened(lately: Iterable[Failure], rest: Backoff) -> Sequence[float]:
-    """Return when failures are forgiven by which a rest may end early."""
-    forgiven = [f.at + FORGIVE_S for f in lately if f.at + FORGIVE_S < rest.until]
-    if rest_s(rest.failures - len(forgiven), rest.cause) < rest.until - rest.since:
+def _shortened(lately: Iterable[Failure], pause: Backoff) -> Sequence[float]:
+    """Return when failures are forgiven by which a pause may end early."""
+    forgiven = [f.at + FORGIVE_S for f in lately if f.at + FORGIVE_S < pause.until]
+    if backoff_s(pause.failures - len(forgiven), pause.cause) < pause.until - pause.since:
         return forgiven
     return ()

@@ -16,14 +16,14 @@ _UNTIL = attrgetter("until")
 
 
 @dataclass
-class Lasting(Generic[T]):
+class Expiring(Generic[T]):
     """Something that is so until before `until`, unless something happens."""
 
     value: T
     until: float
 
 
-class Digest(Generic[T, S]):
+class TtlCache(Generic[T, S]):
     """What follows from the events of each of several places, kept as long as it is so.
 
     Args:
@@ -34,11 +34,11 @@ class Digest(Generic[T, S]):
     def __init__(self, outdated: set[str], sum_up: Callable[[Mapping[str, T]], S]) -> None:
         self.outdated = outdated
         self._sum_up = sum_up
-        self._known: dict[str, Lasting[T | None]] = {}
+        self._known: dict[str, Expiring[T | None]] = {}
         self._whole = sum_up({})
         self._since, self._until = float("-inf"), float("inf")
 
-    def at(self, now: float, work_out: Callable[[str], Lasting[T | None]]) -> S:
+    def at(self, now: float, work_out: Callable[[str], Expiring[T | None]]) -> S:
         """Return what is so at a time, all places summed up; None at a place is left out."""
         if now < self._since:  # the clock was set back
             self.outdated.update(self._known)
@@ -55,7 +55,7 @@ class Digest(Generic[T, S]):
         return self._whole
 
 
-def outdate(digests: Mapping[Any, Digest[Any, Any]], place: str) -> None:
+def outdate(caches: Mapping[Any, TtlCache[Any, Any]], place: str) -> None:
     """Have a place worked out anew in all of them."""
-    for digest in digests.values():
-        digest.outdated.add(place)
+    for cache in caches.values():
+        cache.outdated.add(place)

@@ -10,6 +10,7 @@ Not here: what to do about it (`planner`).
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from fogft.model.replica import (
     MachinePhase,
     Observed,
     Phase,
+    Placement,
     ReplicaId,
     by_id,
 )
@@ -52,14 +54,15 @@ _UP, _CONNECTING = LinkState.UP, LinkState.CONNECTING
 _RUNNING, _READY, _GOOD = MachinePhase.RUNNING, Phase.READY, Verdict.GOOD
 
 
-class Judged(NamedTuple):
-    """One of our machines with all that is known of it.
+class Assessment(NamedTuple):
+    """One of our machines with all that is known and decided of it.
 
     Attributes:
         record: What is remembered of it; None for nothing.
         serving: Its link is up and its services are ready: ending it would be felt.
         may_serve: It served once and nothing proves that it does not serve now.
-        why: The verdict's reason; None when good.
+        fault: Why the verdict is not good; None when it is.
+        unwanted: Why it is to be replaced although it works; None for no reason.
     """
 
     machine: Machine
@@ -69,12 +72,58 @@ class Judged(NamedTuple):
     verdict: Verdict
     serving: bool
     may_serve: bool
-    why: Reason | None = None
+    fault: Reason | None = None
+    unwanted: Reason | None = None
 
     @property
     def id(self) -> ReplicaId:
         """The replica."""
         return self.machine.id
+
+    @property
+    def slot(self) -> int:
+        """Its slot."""
+        return self.machine.id.slot
+
+    @property
+    def placement(self) -> Placement:
+        """Where it runs, and on what."""
+        return self.machine.placement
+
+    @property
+    def why(self) -> Reason | None:
+        """Why it is replaced, or what is wrong with it."""
+        return self.unwanted or self.fault
+
+    @property
+    def is_outdated(self) -> bool:
+        """Whether it is replaced for its version alone."""
+        return self.unwanted is not None and self.unwanted.cause is Cause.OUTDATED
+
+    @property
+    def ready_at(self) -> float | None:
+        """When it first served; None for never."""
+        return self.record.first_ready_at if self.record is not None else None
+
+    @property
+    def ever_ready(self) -> bool:
+        """Whether it ever served."""
+        return self.serving or self.ready_at is not None
+
+    @property
+    def answers(self) -> bool:
+        """Whether its server proxy answers."""
+        return self.link is not None and self.link.state is _UP
+
+    @property
+    def draining_since(self) -> float | None:
+        """When it was marked to go."""
+        return self.record.draining_since if self.record is not None else None
+
+    @property
+    def marked_at(self) -> float:
+        """When it was marked to go; infinity for never: who was marked first goes first."""
+        return math.inf if self.draining_since is None else self.draining_since
 
 
 class Health(NamedTuple):
@@ -85,7 +134,7 @@ class Health(NamedTuple):
         links_known: There is a fresh report; without one nobody is doubted.
     """
 
-    replicas: tuple[Judged, ...]
+    replicas: tuple[Assessment, ...]
     uplink_suspected: bool
     links_known: bool
 
@@ -158,16 +207,16 @@ def _judge_one(
     link: LinkReport | None,
     record: Record | None,
     serving: bool,
-) -> Judged:
+) -> Assessment:
     if serving and _is_well(machine, link):  # as nearly all are
-        return Judged(machine, link, record, _READY, _GOOD, True, True)
+        return Assessment(machine, link, record, _READY, _GOOD, True, True)
     verdict, why = _verdict(context, machine, link, record, serving)
     may_serve = serving
     if not serving and record is not None and record.first_ready_at is not None:
         answers = link is not None and link.state is _UP
         may_serve = not answers and verdict not in (Verdict.UNRESPONSIVE, Verdict.FAILED)
     phase = _phase(machine, verdict, serving)
-    return Judged(machine, link, record, phase, verdict, serving, may_serve, why)
+    return Assessment(machine, link, record, phase, verdict, serving, may_serve, why)
 
 
 def _is_well(machine: Machine, link: LinkReport | None) -> bool:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 from fogft.errors import StateError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import supply
-from fogft.planning.observed.expiring import Digest, Lasting, outdate
+from fogft.planning.observed.expiring import Expiring, TtlCache, outdate
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -167,8 +167,8 @@ class History:
         self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
         self.version = 0  # of all facts: counts events
         # What follows from failures and proofs of each supply, and from losses at each location.
-        self._of_supplies: dict[Callable[..., Any], Digest[Any, Any]] = {}
-        self._of_losses: dict[Callable[..., Any], Digest[Any, Any]] = {}
+        self._of_supplies: dict[Callable[..., Any], TtlCache[Any, Any]] = {}
+        self._of_losses: dict[Callable[..., Any], TtlCache[Any, Any]] = {}
         for event in events:
             self.add(event)
 
@@ -322,7 +322,7 @@ class History:
 
     def of_supplies(
         self,
-        work_out: Callable[[History, str, float], Lasting[T | None]],
+        work_out: Callable[[History, str, float], Expiring[T | None]],
         sum_up: Callable[[Mapping[str, T]], S],
         now: float,
     ) -> S:
@@ -338,7 +338,7 @@ class History:
 
     def of_losses(
         self,
-        work_out: Callable[[History, str, float], Lasting[T | None]],
+        work_out: Callable[[History, str, float], Expiring[T | None]],
         sum_up: Callable[[Mapping[str, T]], S],
         now: float,
     ) -> S:
@@ -362,16 +362,16 @@ class History:
 
     def _follows(
         self,
-        digests: dict[Callable[..., Any], Digest[Any, Any]],
+        caches: dict[Callable[..., Any], TtlCache[Any, Any]],
         places: Iterable[str],
-        work_out: Callable[[History, str, float], Lasting[T | None]],
+        work_out: Callable[[History, str, float], Expiring[T | None]],
         sum_up: Callable[[Mapping[str, T]], S],
         now: float,
     ) -> S:
-        digest = digests.get(work_out)
-        if digest is None:
-            digest = digests[work_out] = Digest(set(places), sum_up)
-        whole: S = digest.at(now, lambda place: work_out(self, place, now))
+        cache = caches.get(work_out)
+        if cache is None:
+            cache = caches[work_out] = TtlCache(set(places), sum_up)
+        whole: S = cache.at(now, lambda place: work_out(self, place, now))
         return whole
 
     @property

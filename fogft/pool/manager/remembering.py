@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from fogft.model.reason import Reason
 from fogft.model.replica import LinkState, Observed, ReplicaId
-from fogft.planning.observed.health import Health, Judged, Verdict
+from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.pool.folder.store import Store
 from fogft.reason_words import words
@@ -69,7 +69,7 @@ class Remembering:
         """Note who became ready, stopped to be, or failed, as observed at `now`.
 
         Args:
-            health: Judged by this very history.
+            health: Assessment by this very history.
         """
         for judged in health.replicas:
             machine, record = judged.machine, judged.record
@@ -98,5 +98,5 @@ class Remembering:
                 self.add(EventKind.FAILED, id, reason=judged.why, at=now)
 
 
-def _answers(judged: Judged) -> bool:
+def _answers(judged: Assessment) -> bool:
     return judged.link is not None and judged.link.state is LinkState.UP

@@ -18,7 +18,7 @@ from fogft.reason_words import words
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.model.spec import PoolSpec
-    from fogft.planning.observed.health import Judged
+    from fogft.planning.observed.health import Assessment
     from fogft.pool.manager.proxy_report import ProxyReport
     from fogft.pool.manager.reconciler import Tick
 
@@ -285,7 +285,9 @@ def _without_certificate(tick: Tick) -> list[Reason]:
     ]
 
 
-def _replica(one: Judged, leaving: set[ReplicaId], history: History, now: float) -> ReplicaStatus:
+def _replica(
+    one: Assessment, leaving: set[ReplicaId], history: History, now: float
+) -> ReplicaStatus:
     machine, link = one.machine, one.link
     record = history.record(one.id.slot, one.id.generation)
     launched_at = record.launched_at if record is not None else machine.launched_at
@@ -343,7 +345,7 @@ def _started_by_hand(
     )
 
 
-def _detail(one: Judged) -> str:
+def _detail(one: Assessment) -> str:
     """Return what is worth knowing of a replica: what is wrong, else what is being done."""
     link, progress = one.link, one.machine.progress
     if one.why is not None:

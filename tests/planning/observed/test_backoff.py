@@ -15,10 +15,10 @@ from fogft.planning.observed.backoff import (
     LIMIT_S,
     NO_ROOM_S,
     avoided,
+    backing_off,
     backoff,
-    disappointing,
     next_change,
-    resting,
+    recently_failed,
 )
 from fogft.planning.observed.history import Event, EventKind, Failure, History
 
@@ -54,14 +54,14 @@ def test_rest_doubles_up_to_the_limit(count: int, cause: Cause) -> None:
 def test_a_success_wipes_the_slate_clean() -> None:
     """A replica that became ready there ends the row of failures."""
     events = [*refused(0, 1), *refused(1, 2), *refused(2, 3)]
-    assert PLACE in resting(History(events), 3)
+    assert PLACE in backing_off(History(events), 3)
     ready = [Event(2, EventKind.LAUNCH, 1, 1, PLACE), Event(3, EventKind.READY, 1, 1)]
-    assert PLACE not in resting(History([*events, *ready]), 4)
+    assert PLACE not in backing_off(History([*events, *ready]), 4)
 
 
 def test_quota_rests_as_long_as_possible() -> None:
     """A full account does not get better by asking again soon."""
-    rest = resting(History(refused(0, 1, Cause.QUOTA)), 1)[PLACE]
+    rest = backing_off(History(refused(0, 1, Cause.QUOTA)), 1)[PLACE]
     assert (rest.until, rest.cause) == (LIMIT_S, Cause.QUOTA)
 
 
@@ -73,7 +73,7 @@ def test_early_death_counts_and_a_late_one_does_not() -> None:
             Event(5, EventKind.READY, 0, 1),
             Event(died_at, EventKind.GONE, 0, 1),
         ]
-        assert (PLACE in resting(History(events), died_at + 1)) is counts
+        assert (PLACE in backing_off(History(events), died_at + 1)) is counts
 
 
 def test_failed_setup_is_held_against_the_file_not_the_place() -> None:
@@ -82,9 +82,9 @@ def test_failed_setup_is_held_against_the_file_not_the_place() -> None:
         Event(0, EventKind.LAUNCH, 0, 1, PLACE),
         Event(9, EventKind.FAILED, 0, 1, "", Reason(Cause.SETUP)),
     ]
-    found = resting(History(events), 10)
+    found = backing_off(History(events), 10)
     assert set(found) == {EVERYWHERE}
-    assert EVERYWHERE not in resting(History(events), 9 + BASE_S)
+    assert EVERYWHERE not in backing_off(History(events), 9 + BASE_S)
 
 
 def test_an_ended_replica_is_no_failure() -> None:
@@ -94,8 +94,8 @@ def test_an_ended_replica_is_no_failure() -> None:
         Event(1, EventKind.ENDING, 0, 1),
         Event(2, EventKind.ENDED, 0, 1),
     ]
-    assert not resting(History(events), 3)
-    assert OTHER not in resting(History(events), 3)
+    assert not backing_off(History(events), 3)
+    assert OTHER not in backing_off(History(events), 3)
 
 
 HAPPENINGS = st.lists(
@@ -127,7 +127,7 @@ def test_what_is_remembered_of_places_is_what_follows_from_all_events(happenings
         for event in happened:
             asked.add(event)
         anew = History(events)
-        for question in (resting, disappointing, avoided):
+        for question in (backing_off, recently_failed, avoided):
             assert question(asked, now) == question(anew, now)
 
 
