@@ -17,11 +17,6 @@ def words(reason: Reason | None) -> str:
     return make if isinstance(make, str) else make(reason)
 
 
-def first_line(reason: Reason | None) -> str:
-    """Return it on one line: without the end of a log."""
-    return words(reason).partition("\n")[0]
-
-
 def _with_words(reason: Reason) -> str:
     name = reason.cause.value.replace("_", " ")
     rest = reason.words or _main(reason)

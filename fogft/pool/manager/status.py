@@ -7,7 +7,7 @@ Not here: how it is shown (`fogft.cli`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fogft.errors import StateError
@@ -248,7 +248,7 @@ def of_tick(
         notes=[words(note) for note in said],
         reasons=said,
         replicas=replicas,
-        by_hand=[_started_by_hand(member, links, tick.spec) for member in by_hand],
+        by_hand=[_started_by_hand(id, links.get(id), tick.spec) for id in by_hand],
         services=_services(tick.spec, heard, report),
         events=[_event(event) for event in recent],
         topology=_topology(tick, report if proxy_alive else None),
@@ -266,7 +266,6 @@ def _update(tick: Tick) -> UpdateStatus | None:
 
 
 def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
-
     here = tick.membership.topology if tick.membership is not None else tick.spec.topology
     if not here:
         return {}
@@ -288,41 +287,35 @@ def _without_certificate(tick: Tick) -> list[Reason]:
 def _replica(
     one: Assessment, leaving: set[ReplicaId], history: History, now: float
 ) -> ReplicaStatus:
-    machine, link = one.machine, one.link
+    machine = one.machine
     record = history.record(one.id.slot, one.id.generation)
     launched_at = record.launched_at if record is not None else machine.launched_at
-    phase = one.phase
-    if one.id in leaving and phase is not Phase.GONE:
-        phase = Phase.DRAINING
-    return ReplicaStatus(
-        slot=one.id.slot,
-        generation=one.id.generation,
-        phase=phase.value,
+    leaves = one.id in leaving and one.phase is not Phase.GONE
+    return replace(
+        _linked(one.id, Phase.DRAINING if leaves else one.phase, one.link),
         verdict=one.verdict.value,
         location=machine.placement.location,
         instance=machine.placement.instance,
         spot=machine.placement.spot,
         usd_per_hour=machine.usd_per_hour,
         endpoint=machine.endpoint,
-        link=link.state.value if link is not None else "",
-        rtt_s=link.rtt_s if link is not None else None,
-        silent_for_s=link.silent_for_s if link is not None else 0.0,
-        won=link.won if link is not None else 0,
-        in_flight=link.in_flight if link is not None else 0,
-        restarts=link.restarts if link is not None else 0,
         age_s=max(0.0, now - launched_at),
         detail=_detail(one),
-        differs=link is not None and link.differs,
         reason=one.why,
     )
 
 
-def _started_by_hand(
-    id: ReplicaId, links: Mapping[ReplicaId, LinkReport], spec: PoolSpec
-) -> ReplicaStatus:
-    link = links.get(id) or LinkReport(id, LinkState.CONNECTING, detail="it was not found yet")
+def _started_by_hand(id: ReplicaId, link: LinkReport | None, spec: PoolSpec) -> ReplicaStatus:
+    if link is None:
+        return replace(_linked(id, Phase.STARTING, None), detail="it was not found yet")
     ready = link.state is LinkState.UP and {s.name for s in spec.services} <= link.ready
     phase = Phase.DRAINING if link.draining else Phase.READY if ready else Phase.STARTING
+    return _linked(id, phase, link)
+
+
+def _linked(id: ReplicaId, phase: Phase, link: LinkReport | None) -> ReplicaStatus:
+    """Return what a link says of a replica of which no cloud says anything."""
+    known = link or LinkReport(id, LinkState.CONNECTING)
     return ReplicaStatus(
         slot=id.slot,
         generation=id.generation,
@@ -333,15 +326,15 @@ def _started_by_hand(
         spot=False,
         usd_per_hour=0.0,
         endpoint=None,
-        link=link.state.value if id in links else "",
-        rtt_s=link.rtt_s,
-        silent_for_s=link.silent_for_s,
-        won=link.won,
-        in_flight=link.in_flight,
-        restarts=link.restarts,
+        link=link.state.value if link is not None else "",
+        rtt_s=known.rtt_s,
+        silent_for_s=known.silent_for_s,
+        won=known.won,
+        in_flight=known.in_flight,
+        restarts=known.restarts,
         age_s=None,
-        detail=link.detail,
-        differs=link.differs,
+        detail=known.detail,
+        differs=known.differs,
     )
 
 
