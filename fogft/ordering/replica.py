@@ -1,8 +1,7 @@
 """A replica of a stateful service: apply by number, one at a time, and nothing else. Pure.
 
-What happens comes in by methods; what to do comes out as effects, in the order in which
-they are to be done. The service works on one thing at a time: a request, a snapshot or a
-restore. Each gets a serial number; what ends under an older one is of no interest.
+What happens comes in by methods; what to do comes out as effects, in their order. The service works
+on one thing at a time, under a serial number; what ends under an older one is of no interest.
 
 Owns: which state the service is in, which term is obeyed, which answers are kept.
 Not here: calling the service and answering (`fogft.proxy.replica.ordered_responder`).
@@ -189,7 +188,7 @@ class OrderedReplica(Generic[T]):
         return [self._has_joined(to)]
 
     def _is_behind(self, index: int) -> bool:
-        """Whether the state after this number is one that has been left behind."""
+        """Whether the state after this number has been left behind."""
         return self.joined and index < self._expected
 
     def _has_joined(self, to: T) -> Reply[T]:
@@ -214,8 +213,7 @@ class OrderedReplica(Generic[T]):
         if index <= self.position.index:
             if index not in self.kept:
                 return [Refuse(to, Refusal.FORGOTTEN)]
-            answer = self.kept[index]
-            return [Refuse(to, Refusal.MALFORMED) if answer is None else Reply(to, answer)]
+            return [self._answer(to, self.kept[index])]
         work = self._work
         if work is not None and work.op is Op.APPLY and work.index == index:
             work.waiting.append(to)
@@ -224,6 +222,9 @@ class OrderedReplica(Generic[T]):
             self._queue[index].waiting.append(to)
             return []
         return None
+
+    def _answer(self, to: T, answer: bytes | None) -> Effect[T]:
+        return Refuse(to, Refusal.MALFORMED) if answer is None else Reply(to, answer)
 
     def _apply(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
         known = self._recall(index, to)
@@ -283,8 +284,7 @@ class OrderedReplica(Generic[T]):
     def done(self, serial: int, answer: bytes | None) -> list[Effect[T]]:
         """The service has ended what began under this serial; None if it failed.
 
-        A request whose bytes the service could not read has failed: it counts as applied,
-        for it is the same on every replica.
+        A request that it could not read counts as applied: it is the same on every replica.
         """
         work = self._work
         if work is None or work.serial != serial:
@@ -295,10 +295,7 @@ class OrderedReplica(Generic[T]):
             self.applied += 1
             self.position = Position(work.epoch, work.index)
             self._keep(work.index, answer)
-            out = [
-                Refuse(to, Refusal.MALFORMED) if answer is None else Reply(to, answer)
-                for to in work.waiting
-            ]
+            out = [self._answer(to, answer) for to in work.waiting]
         elif work.op is Op.SNAPSHOT:
             out = [
                 Refuse(to, Refusal.NOT_READY)

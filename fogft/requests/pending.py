@@ -11,7 +11,7 @@ Not here: sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from fogft.model.refusal import Effect, Refusal
 from fogft.requests.choose import NEVER, Choose
@@ -27,22 +27,7 @@ class Item(Protocol):
 
 
 T = TypeVar("T", bound=Item)
-
-
-class Judged(NamedTuple, Generic[T]):
-    """What an answer has brought about.
-
-    Attributes:
-        means: What it means for its request.
-        pending: The request that it answers; None where it comes too late, or is no success.
-        losers: Who else is to stop working on that.
-        verdict: What is to be done for the request, where it goes on.
-    """
-
-    means: Judgement
-    pending: Pending[T] | None = None
-    losers: Iterable[int] = ()
-    verdict: Verdict = Verdict.LATE
+Judged = tuple[Judgement, Pending[T] | None, Iterable[int], Verdict]
 
 
 class PendingRequests(Generic[T]):
@@ -100,10 +85,11 @@ class PendingRequests(Generic[T]):
         self.decide.began(request, pending, able)
         return chosen
 
-    def look_at(self, *, able: bool) -> float:
-        """Return when something may have to be sent though nothing else happens."""
-        at = self.choose.look_at
-        return at if self.fallback is None else min(at, self.fallback.look_at(able=able))
+    def fallback_from(self, request: bytes, now: float, *, able: bool) -> float:
+        """Note a request for the fallback; return when that may have to be asked next."""
+        assert self.fallback is not None
+        self.fallback.submitted(request, now)
+        return self.fallback.look_at(able=able)
 
     def more(
         self, able: Sequence[int], now: float, *, newest_first: bool
@@ -146,8 +132,14 @@ class PendingRequests(Generic[T]):
 
     # -- how its attempts end -------------------------------------------------------------
 
-    def answered(
-        self, id: bytes, request: bytes | None, replica: int, answer: tuple[bytes, Any], now: float
+    def answered(  # noqa: PLR0917 - for each answer: a value to hold them costs more than they do
+        self,
+        id: bytes,
+        request: bytes | None,
+        replica: int,
+        payload: bytes,
+        reading: Any,
+        now: float,
     ) -> Judged[T]:
         """Take an answer.
 
@@ -155,32 +147,37 @@ class PendingRequests(Generic[T]):
             id: Of the attempt.
             request: What it is about; None for no request.
             replica: Who answered.
-            answer: Its bytes, and what `Decide.read` makes of them.
+            payload: Its bytes.
+            reading: What `Decide.read` makes of them.
             now: Seconds.
+
+        Returns:
+            What it means; the request that it answers, None where it comes too late or is no
+            success; who else is to stop working on that; what is to be done where it goes on.
         """
-        payload, reading = answer
-        pending = self.get(request)
+        pending = None if request is None else self._table.get(request)
         means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
-            return Judged(means)
+            return means, None, (), Verdict.LATE
         if means is Means.SUCCESS:
             _, pending = self._table.succeeded(request, now)
             if pending is None:
                 self.choose.late(request, replica, now, answered=True)
-                return Judged(means)
+                return means, None, (), Verdict.LATE
             losers = self.choose.answered(request, pending.open, replica, now)
             self._closed(request, pending)
-            return Judged(means, pending, losers)
+            return means, pending, losers, Verdict.WON
+        verdict = Verdict.LATE
         if means is Means.UNDECIDED:
             verdict = self._table.failed(request, replica, now, counts=False, bar=True)
-            return Judged(means, None, (), Verdict.WAIT if pending is not None else verdict)
-        if means is Means.REJECTION or means is Means.WEAKER_REJECTION:
-            weaker = means is Means.WEAKER_REJECTION and pending is not None
+            verdict = verdict if pending is None else Verdict.WAIT
+        elif means is Means.REJECTION or means is Means.WEAKER_REJECTION:
+            weaker = means is Means.WEAKER_REJECTION
             kept = pending.rejection if weaker and pending is not None else None
             verdict = self._table.rejected(request, replica, payload if kept is None else kept)
             self._failed(request, replica, verdict, now, answered=True)
-            return Judged(Means.REJECTION, None, (), verdict)
-        return Judged(means)
+            means = Means.REJECTION
+        return means, None, (), verdict
 
     def refused(self, request: bytes, replica: int, refusal: Refusal, now: float) -> Verdict:
         """Take a refusal."""

@@ -25,7 +25,7 @@ from functools import partial
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
-from fogft.model.spec import Part
+from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.replica.responder import OUTSTANDING
 from fogft.ros.port import RosClient
 from fogft.topics import goals
@@ -286,3 +286,13 @@ class GoalsOnce:
                 client.forget(known.ticket)
             for _, incoming in known.waiting:
                 incoming.refuse(reason if known.begun_at is not None else Refusal.NOT_READY)
+
+
+def for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool]:
+    """Return what says whether an answer holds for the moment only.
+
+    A replica that comes later is asked for a result as soon as it is given the goal: it may answer
+    that before it knows the goal.
+    """
+    results = {s.name for s in services if s.part is Part.RESULT}
+    return lambda service, answer: service in results and goals.is_unknown(answer)

@@ -2,10 +2,9 @@
 
 A copy (same request id) joins the work in progress, or gets the kept answer; it is never run again.
 
-At most `OUTSTANDING` requests a service are passed on at a time; the others wait here. An
-ordinary ROS service keeps the last ten requests that it has not yet begun and silently
-loses more, so what is passed on must never exceed that. What waits here past its deadline
-is never begun, nor what its robot no longer wants.
+At most `OUTSTANDING` requests a service are passed on at a time; the others wait here: an ordinary
+ROS service keeps the last ten requests that it has not yet begun and silently loses more. What
+waits past its deadline is never begun, nor what its robot no longer wants.
 
 Owns: what becomes of the requests that this replica holds.
 Not here: which ids are known (`known_requests`), in what order they run and how many
@@ -46,21 +45,16 @@ class Responder:
         outstanding: Requests passed on to one service at once, where no limit is given.
         limits: How many may be at work, by service, where it is not to be learned.
         latest: Services of which the newest request goes first.
-        passing: Whether a service's answer holds for the moment only: it is not kept, and a copy
-            is run anew.
-        kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
-        kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
+        passing: Whether a service's answer holds for the moment only: a copy is run anew.
+        kept_bytes, kept_ids: As for `KnownRequests`.
         clock: Monotonic seconds.
 
     Attributes:
-        ran: Requests passed on.
-        ran_s: The time from then until their responses, together, in seconds.
+        ran, ran_s: Requests passed on, and the time until their responses together.
         joined: Copies of requests that were known.
-        saved: Requests that were dropped unbegun because their robot had its answer.
-        interrupted: Requests at work that were told to stop for the same reason.
-        wasted: Requests that were run for nobody: too late, or no longer wanted.
-        wasted_s: The time that they took together, in seconds.
-        refused: Refusals by reason.
+        saved, interrupted: Requests dropped unbegun, or told to stop, that nobody wanted any more.
+        wasted, wasted_s: Requests that were run for nobody: too late, or unwanted.
+        refused: Refusals by kind.
     """
 
     def __init__(
@@ -78,10 +72,8 @@ class Responder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._is_ready = is_ready
-        self._max_in_flight = max_in_flight
-        self._held_bytes_limit = held_bytes
-        self._outstanding = outstanding
-        self._limits = dict(limits or {})
+        self._max_in_flight, self._held_bytes_limit = max_in_flight, held_bytes
+        self._outstanding, self._limits = outstanding, dict(limits or {})
         self._latest = frozenset(latest)
         self._passing = passing
         self._clock = clock
@@ -90,13 +82,8 @@ class Responder:
         self._interruptions = Interruptions()
         self._known = KnownRequests(kept_bytes, kept_ids)
         self._queues: dict[str, ServiceQueue] = {}
-        self.ran = 0
-        self.ran_s = 0.0
-        self.joined = 0
-        self.saved = 0
-        self.interrupted = 0
-        self.wasted = 0
-        self.wasted_s = 0.0
+        self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
+        self.ran_s = self.wasted_s = 0.0
         self.refused: dict[Refusal, int] = {}
 
     @property
@@ -168,8 +155,7 @@ class Responder:
     def _accept(self, incoming: Incoming, now: float) -> Job | None:
         """Take a request; return it where it is to be passed on at once."""
         job = Job(now + incoming.remaining_s, incoming)
-        service = job.service
-        queue = self._queues[service]
+        queue = self._queues[job.service]
         self._known.add(job)
         if queue.open:
             queue.begin(job, now)
@@ -180,9 +166,8 @@ class Responder:
     def _queue(self, service: str) -> ServiceQueue:
         queue = self._queues.get(service)
         if queue is None:
-            queue = self._queues[service] = ServiceQueue(
-                self._outstanding, self._limits.get(service), latest=service in self._latest
-            )
+            limit, latest = self._limits.get(service), service in self._latest
+            queue = self._queues[service] = ServiceQueue(self._outstanding, limit, latest=latest)
         return queue
 
     def _reason_to_refuse(
@@ -204,7 +189,7 @@ class Responder:
         if self._known.held < self._max_in_flight:
             return None, None
         displaced = queue.evict(incoming.robot, deadline)
-        return (None, displaced) if displaced is not None else (Refusal.OVERLOADED, None)
+        return (Refusal.OVERLOADED if displaced is None else None), displaced
 
     def cancel(self, ids: Iterable[bytes]) -> None:
         """Drop requests that are no longer wanted; those at work are told to stop, if they can.

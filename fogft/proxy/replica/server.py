@@ -3,10 +3,9 @@
 It supervises the user's command, says "ready" for a service only while the command lives
 and discovery finds the service, and answers probes at once whatever the services do.
 
-When the command dies, the proxy leaves ROS and joins it anew: discovery would go on
-listing the dead service until its lease ends (20 s with Fast DDS), and requests sent to it
-would be lost. A new node knows only the living. When a service goes and the command lives (it may
-restart its own nodes), what was passed on to that service is refused, to be sent again.
+When the command dies, the proxy leaves ROS and joins it anew: discovery would go on listing the
+dead service until its lease ends (20 s with Fast DDS). When a service goes and the command lives,
+what was passed on to that service is refused, to be sent again.
 
 Owns: the replica's state as probes tell it. Not here: requests (`responder`), the command
 (`supervisor`), files and signals (`process`).
@@ -30,15 +29,15 @@ from fogft.model.spec import Part, ServiceSpec
 from fogft.model.state import StateSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
-from fogft.proxy.replica.goals_once import GoalsOnce
+from fogft.proxy.replica.goals_once import GoalsOnce, for_the_moment
 from fogft.proxy.replica.interruption import CANCEL_TYPE
 from fogft.proxy.replica.offering import Offering
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder, StateBytes
 from fogft.proxy.replica.responder import Responder
+from fogft.proxy.replica.service_queue import limits_of
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
 from fogft.ros.port import RosClient, RosNode, RosTopics
-from fogft.topics import goals
 
 log = logging.getLogger(__name__)
 
@@ -78,11 +77,8 @@ class ServerProxy:
         self._id = id
         self._offering = Offering(services, define, clock)
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
-        self._listener = listener
-        self._make_node = make_node
-        self._supervisor = supervisor
-        self._orphan_after_s = orphan_after_s
-        self._clock = clock
+        self._listener, self._make_node, self._supervisor = listener, make_node, supervisor
+        self._orphan_after_s, self._clock = orphan_after_s, clock
         self._topics = TopicsOnReplica(topics, clock)
         self._incarnation = secrets.token_hex(8)
         self._ready: frozenset[str] = frozenset()
@@ -96,14 +92,13 @@ class ServerProxy:
             if service.state is not None and make_state is not None:
                 state = make_state(service.state)
                 self._ordered[service.name] = OrderedResponder(service.name, state, clock)
-        self._draining = False
-        self._at_risk = False
+        self._draining = self._at_risk = False
         self.responder = Responder(
             lambda name: name in self._ready,
             max_in_flight=max_in_flight,
-            limits=_limits(services),
+            limits=limits_of(services),
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
-            passing=_for_the_moment(services),
+            passing=for_the_moment(services),
             clock=clock,
         )
         self._goals = GoalsOnce(
@@ -167,11 +162,8 @@ class ServerProxy:
             ordered.crashed()
 
     def _look_for_services(self) -> None:
-        ready = frozenset(
-            name
-            for name, client in self._clients.items()
-            if self._supervisor.alive and client.available()
-        )
+        there = {name for name, client in self._clients.items() if client.available()}
+        ready = frozenset(there if self._supervisor.alive else ())
         gone = self._ready - ready
         if ready != self._ready:
             log.info("services_ready replica=%s ready=%s", self._id, sorted(ready))
@@ -301,8 +293,7 @@ class ServerProxy:
         """Return the services that can answer: found, and in the present state."""
         if not self._ordered:
             return self._ready
-        behind = {name for name, ordered in self._ordered.items() if not ordered.ready}
-        return self._ready - behind
+        return self._ready - {name for name, one in self._ordered.items() if not one.ready}
 
     def _passing(self) -> frozenset[str]:
         """Return the topics that pass now, by their names on the wire."""
@@ -358,20 +349,3 @@ class ServerProxy:
         self._listener.close()
         self._leave_ros()
         self._topics.close()
-
-
-def _limits(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
-    """Return how many requests a service may have at once, where that is not to be learned."""
-    # A cancel service names no request, so it must be clear which one is meant.
-    limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
-    return {name: limit for name, limit in limits.items() if limit}
-
-
-def _for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool]:
-    """Return what says whether an answer holds for the moment only.
-
-    A replica that comes later is asked for a result as soon as it is given the goal: it may answer
-    that before it knows the goal.
-    """
-    results = {s.name for s in services if s.part is Part.RESULT}
-    return lambda service, answer: service in results and goals.is_unknown(answer)

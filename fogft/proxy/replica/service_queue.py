@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 
 from fogft.link.port import Incoming
+from fogft.model.spec import ServiceSpec
 from fogft.requests.admission import AdmissionQueue
 from fogft.requests.concurrency import ConcurrencyLimit
 
@@ -128,3 +129,10 @@ class ServiceQueue:
                 found.append(job)
                 self.free(job)
         return found
+
+
+def limits_of(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
+    """Return how many requests a service may have at once, where that is not to be learned."""
+    # A cancel service names no request, so it must be clear which one is meant.
+    limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
+    return {name: limit for name, limit in limits.items() if limit}

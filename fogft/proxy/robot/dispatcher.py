@@ -6,7 +6,7 @@ caller takes it back. What differs between services is put in:
 * *choose* (`requests.choose`): which replicas are asked first, which next, and when;
 * *decide* (`requests.decide`): what an answer means;
 * *deliver* (`delivery`): how the end reaches the caller;
-* *replicate* (`replication`): what else replicas must have, of actions and stateful services.
+* *replicate* (`replication`): what else replicas of actions and stateful services must have.
 
 `submit` is called by the thread that takes ROS requests and never blocks. Answers come from the
 links' threads, which may not send: that is left to the next `tick`, which `wake` brings about.
@@ -58,8 +58,7 @@ class Dispatcher:
         empty_response: The serialised default response, for ``on_timeout: empty``.
         wake: Has `tick` called soon. Any thread.
         clock: Monotonic seconds.
-        max_pending_bytes: Requests kept at once, in bytes; more are turned away and counted.
-        max_pending: The same, by number.
+        max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
 
     Attributes:
         outcomes: What became of its requests.
@@ -95,8 +94,6 @@ class Dispatcher:
         self._sender = Sender(self._ledger, replication)
         self._delivery = Delivery(self._ledger, respond, empty_response, self._sender.forget)
 
-    # -- requests -------------------------------------------------------------------------
-
     @property
     def spec(self) -> ServiceSpec:
         """The service and its policy."""
@@ -117,7 +114,8 @@ class Dispatcher:
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to whom the policy chooses."""
-        self.forward(os.urandom(REQUEST_ID_BYTES), payload, handle, self.spec.timeout_s)
+        timeout_s = self._ledger.spec.timeout_s
+        self.forward(os.urandom(REQUEST_ID_BYTES), payload, handle, timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Do the same for a request that has its id, and so much time left; whether it was taken.
@@ -138,9 +136,9 @@ class Dispatcher:
             if item.trace is not None:
                 item.trace.asked.update(dict.fromkeys(chosen, now))
             outcomes.count["sent"] += len(chosen)
-            if requests.fallback is not None and self.spec.fallback is not None:
-                requests.fallback.submitted(request, now)
-            soon = requests.look_at(able=bool(able))
+            soon = requests.choose.look_at
+            if requests.fallback is not None and self._ledger.spec.fallback is not None:
+                soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
         self._sender.first(request, payload, links, chosen, timeout_s)
         if self._replication is not None:
             self._sender.replicate()
@@ -183,18 +181,21 @@ class Dispatcher:
             self._refused(id, replica, answer, Refusal.MALFORMED)
             return
         now, outcomes = self._clock(), self.outcomes
+        attempt, replication = answer.request_id, self._replication
         with self._lock:
-            request = self._request_of(answer)
+            request = attempt if replication is None else replication.request_of(attempt)
             means, pending, losers, verdict = self._requests.answered(
-                answer.request_id, request, replica, (payload, reading), now
+                attempt, request, replica, payload, reading, now
             )
         if pending is not None and request is not None:
             self._delivery.give(pending, payload)  # first: what is counted can wait
-            self._sender.forget(request, losers)
+            if losers:
+                self._sender.forget(request, losers)
             with self._lock:
                 outcomes.served(id)
                 outcomes.won(id, now - pending.item.arrived, len(payload))
-                self._ledger.trace(request, pending, Outcome.ANSWERED, now, replica=id.short)
+                if outcomes.trace is not None:
+                    self._ledger.trace(request, pending, Outcome.ANSWERED, now, replica=id.short)
         elif means is Means.SUCCESS or means is Means.LATE:
             with self._lock:
                 outcomes.served(id)
@@ -208,21 +209,17 @@ class Dispatcher:
         elif isinstance(means, Refusal):
             self._failed(id, replica, request, means)
 
-    def _request_of(self, answer: Answer) -> bytes | None:
-        """Return the request that an attempt is about; None for none. Under the lock."""
-        id = answer.request_id
-        return id if self._replication is None else self._replication.request_of(id)
-
     def late(self, link: Link, request: bytes) -> None:
-        """Count an answer that came after its link was told to forget the request."""
+        """Count an answer to a request that its link was told to forget."""
         self.outcomes.late()
 
     def _refused(self, id: ReplicaId, replica: int, answer: Answer, refusal: Refusal) -> None:
         """A replica has refused an attempt, or its link has lost it."""
+        attempt, replication = answer.request_id, self._replication
         with self._lock:
-            request = self._request_of(answer)
+            request = attempt if replication is None else replication.request_of(attempt)
             pending = self._requests.get(request)
-            self._decide.refused(answer.request_id, replica, refusal, answer.detail, pending)
+            self._decide.refused(attempt, replica, refusal, answer.detail, pending)
         self._failed(id, replica, request, refusal)
 
     def _failed(self, id: ReplicaId, replica: int, request: bytes | None, refusal: Refusal) -> None:
@@ -330,8 +327,6 @@ class Dispatcher:
         with self._lock:
             if self._replication is not None:
                 self._replication.close()
-
-    # -- what people see ------------------------------------------------------------------
 
     def disagrees(self, replica: int) -> bool:
         """Whether a replica's answers count no more."""

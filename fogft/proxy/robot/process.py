@@ -35,6 +35,7 @@ from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.diagnostics_node import SeenFromRos
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
+from fogft.proxy.robot.manager_sign import ManagerSign
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning
@@ -51,38 +52,6 @@ _TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 0.5
 _REPORT_AFTER_CHANGE_S = 0.05
 _LOOK_EVERY_S = 0.05  # at files, and what else needs no haste
-
-
-class ManagerSign:
-    """How long ago the pool's manager last gave a sign of life, by our own clock.
-
-    The lease's `beat` counts up while the manager works; comparing counts instead of
-    times makes it immune to a clock that jumps.
-    """
-
-    def __init__(self, lease: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        self._watched = Watched(lease)
-        self._clock = clock
-        self._beat: Any = None
-        self._seen_at: float | None = None
-
-    def look(self) -> None:
-        """Read the lease if it has changed."""
-        if not self._watched.changed():
-            return
-        try:
-            lease = disk.read_json(self._watched.path)
-        except StateError:
-            return
-        beat = (lease.get("epoch"), lease.get("beat")) if isinstance(lease, dict) else None
-        if beat is not None and beat != self._beat:
-            if self._beat is not None:  # the first reading may be of a manager long dead
-                self._seen_at = self._clock()
-            self._beat = beat
-
-    def age_s(self) -> float | None:
-        """Seconds since the last sign; None if there was none yet."""
-        return None if self._seen_at is None else self._clock() - self._seen_at
 
 
 def run(config_path: Path, *, metrics: str | None = None) -> None:

@@ -16,7 +16,7 @@ from fogft.model import membership
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.proxy.config import read_client, read_server
 from fogft.proxy.robot import process
-from fogft.proxy.robot.process import ManagerSign
+from fogft.proxy.robot.manager_sign import ManagerSign
 from tests.proxy.fakes import UID, Clock
 
 CLIENT = f"""\
