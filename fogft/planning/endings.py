@@ -85,6 +85,8 @@ def choose_endings(
         chooser.end_some(expendable, len(machines.good) - wanted, Cause.NOT_WANTED)
     if machines.replaced:
         _end_replaced(chooser, wanted, machines, held, first)
+    elif first is not None:
+        chooser.make_room(first)
     if unwanted:
         chooser.end_some(unwanted, len(unwanted), Cause.REPLACED)
         spare -= len(unwanted)

@@ -21,6 +21,8 @@ from fogft.planning.observed.health import Assessment
 
 # A quarter of all losses come within minutes of the order.
 SETTLED_S = 60.0
+# Under a cap that has no room for both, a stand-in makes way for a spot machine after so long.
+STAYS_S = 600.0
 
 
 def stand_ins(machines: Classification) -> list[Assessment]:
@@ -49,9 +51,17 @@ def spare(wanted: int, here: Classification, standing_in: Sequence[Assessment], 
     return kept - max(0, wanted - settled)
 
 
+def has_stayed(replica: Assessment, now: float) -> bool:
+    """Whether a stand-in may make way for a spot machine that the cap has no room for besides."""
+    return _has_served(replica, STAYS_S, now)
+
+
 def _is_settled(replica: Assessment, now: float) -> bool:
-    """Whether a replica serves, and has been ready for long enough to be relied on."""
+    return _has_served(replica, SETTLED_S, now)
+
+
+def _has_served(replica: Assessment, for_s: float, now: float) -> bool:
     record = replica.record
     if not replica.serving or record is None or record.first_ready_at is None:
         return False
-    return now - record.first_ready_at >= SETTLED_S
+    return now - record.first_ready_at >= for_s

@@ -191,6 +191,7 @@ def plan_once(
     for need in needs:
         if not buyer.buy(need, room=room - kept_free):
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
+            first = first or _stand_in_to_go(need, buyer, wanted, room)
             waits = True
             break
     begun = [launch.slot for launch in buyer.launches if launch.generation == 1]
@@ -296,6 +297,28 @@ def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Asses
         return None
     buyer.notes.append(Reason(Cause.OLD_BEFORE_NEW, slot=need.slot))
     return old
+
+
+def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessment | None:
+    """Return the stand-in that makes room under the cap for a spot machine, if one may.
+
+    All others that are wanted serve, and it has stayed for `fallback.STAYS_S`: should no spot
+    machine be had, it is ordered again.
+    """
+    machines = buyer.machines
+    if room <= len(buyer.launches) or buyer.launches or machines.ending or buyer.fits_beside(need):
+        return None
+    working = (*machines.good, *machines.replaced)
+    serving = sum(s.serving for s in working)
+    if serving != len(working) or serving < max(2, wanted):
+        return None
+    for replica in buyer.standing_in:
+        here = group_of(buyer.groups, replica.slot) is need.group
+        stayed = here and fallback.has_stayed(replica, buyer.observed.now)
+        if stayed and buyer.fits_instead(need, replica):
+            buyer.notes.append(Reason(Cause.OLD_BEFORE_NEW, slot=need.slot))
+            return replica
+    return None
 
 
 def _within_cap(sized: Size, machines: Classification) -> tuple[Sequence[int], list[Reason]]:

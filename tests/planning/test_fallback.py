@@ -110,3 +110,19 @@ def test_where_spot_machines_were_lost_less_often_the_next_one_goes():
     assert [x.offer.placement.zone for x in seen.plan().launches] == ["b"]
     later = replace(seen, now=NOW + 30 * 86_400)
     assert [x.offer.placement.zone for x in later.plan().launches] == ["a"]
+
+
+@pytest.mark.parametrize(("stands_in_for_s", "goes"), [(300.0, False), (900.0, True)])
+def test_under_a_cap_without_room_for_both_a_stand_in_makes_way_for_spot(stands_in_for_s, goes):
+    """One spot machine at 0.1 serves and the stand-in at 0.3: a second one fits in its place."""
+    capped = replace(MIXED, max_usd_per_hour=0.45)
+    planned = world(spot(0), stand_in(age_s=stands_in_for_s), of=capped).plan()
+    assert not planned.launches
+    assert [id.slot for id in planned.draining] == [STAND_INS] * goes
+
+
+def test_a_stand_in_that_serves_alone_makes_way_for_nobody():
+    capped = replace(MIXED, max_usd_per_hour=0.35)
+    planned = world(stand_in(age_s=9000.0), of=capped).plan()
+    assert not planned.draining
+    assert not planned.terminations
