@@ -61,6 +61,11 @@ class Supervisor:
         self.last_exit = ""
 
     @property
+    def pid(self) -> int | None:
+        """The command's process; None where there is none."""
+        return self._child.pid if self._child is not None else None
+
+    @property
     def alive(self) -> bool:
         """Whether the command runs."""
         return self._child is not None
