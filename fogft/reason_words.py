@@ -11,38 +11,36 @@ def words(reason: Reason | None) -> str:
     """Return a reason in words, without a full stop; empty for none."""
     if reason is None:
         return ""
-    make = _WORDS.get(reason.cause)
-    if make is None:
-        return _with_words(reason)
-    return make if isinstance(make, str) else make(reason)
+    found = _WORDS.get(reason.cause, "{name}{after}")
+    if callable(found):
+        return found(reason)
+    main = reason.words or (words(reason.because[0]) if reason.because else "")
+    return found.format(
+        r=reason,
+        main=main,
+        after=f": {main}" if main else "",
+        in_brackets=f" ({main})" if main else "",
+        names=_names(reason),
+        minutes=(reason.seconds or 0.0) / 60,
+        name=_name(reason),
+    )
 
 
-def _with_words(reason: Reason) -> str:
-    name = reason.cause.value.replace("_", " ")
-    rest = reason.words or _main(reason)
-    return f"{name}: {rest}" if rest else name
+def _name(reason: Reason) -> str:
+    return reason.cause.value.replace("_", " ")
 
 
-def _main(reason: Reason) -> str:
-    return words(reason.because[0]) if reason.because else ""
-
-
-def _after(start: str, reason: Reason, sign: str = ": ") -> str:
-    """Return how it starts, then the main reason where there is one."""
-    main = _main(reason)
-    return f"{start}{sign}{main}" if main else start
+def _names(reason: Reason) -> str:
+    return ", ".join(map(_name, reason.because))
 
 
 def _launch(start: str, market: tuple[Reason, ...]) -> str:
     return "; ".join([start, *map(words, market)])
 
 
-def _usd(amount: float | None) -> str:
-    return f"${max(amount or 0.0, 0.0):.3f}/h"
-
-
-def _ms(seconds: float | None) -> str:
-    return "unknown" if seconds is None else f"{seconds * 1000:.0f} ms"
+def _replaces(reason: Reason) -> str:
+    why = "".join(f": {words(one)}" for one in reason.because[:1])
+    return _launch(f"replaces {reason.replica}{why}", reason.because[1:])
 
 
 def _all_backing_off(reason: Reason) -> str:
@@ -50,29 +48,10 @@ def _all_backing_off(reason: Reason) -> str:
     return f"every location rests after failures ({places})"
 
 
-def _name(reason: Reason) -> str:
-    return reason.cause.value.replace("_", " ")
-
-
-def _rests(reason: Reason) -> str:
-    causes = ", ".join(map(_name, reason.because))
+def _backing_off(reason: Reason) -> str:
     if reason.seconds is None:
-        return f"waiting after {reason.count} failed launches ({causes})"
-    return f"rests {reason.seconds:.0f} s more after {reason.count} x {causes}"
-
-
-def _target_unmet(reason: Reason) -> str:
-    return (
-        f"`availability: {reason.target:g}` cannot be met: {reason.count} replicas are expected "
-        f"to reach {reason.share:.6g}, and {_main(reason)}"
-    )
-
-
-def _update_stopped(reason: Reason) -> str:
-    return (
-        f"update stopped, {_main(reason)}: the pool returns to the last good file, "
-        f"{reason.count} of {reason.of} replicas run it"
-    )
+        return f"waiting after {reason.count} failed launches ({_names(reason)})"
+    return f"rests {reason.seconds:.0f} s more after {reason.count} x {_names(reason)}"
 
 
 def _more_errors(reason: Reason) -> str:
@@ -83,22 +62,11 @@ def _more_errors(reason: Reason) -> str:
     )
 
 
-def _launches_fail(reason: Reason) -> str:
-    causes = ", ".join(map(_name, reason.because))
-    return f"{reason.count} launches failed ({causes}), and none served"
-
-
-def _run_ends(reason: Reason) -> str:
-    detail = f" ({reason.words.splitlines()[0]})" if reason.words else ""
-    return f"`run` ended {reason.count} times{detail}"
-
-
 def _clock_set(reason: Reason) -> str:
     set_s = reason.seconds or 0.0
     where = "forward" if set_s > 0 else "back"
-    return " and ".join(
-        [f"the clock was set {where} by {abs(set_s):.0f} s", *map(words, reason.because)]
-    )
+    said = f"the clock was set {where} by {abs(set_s):.0f} s"
+    return " and ".join([said, *map(words, reason.because)])
 
 
 def _impossible_price(reason: Reason) -> str:
@@ -110,21 +78,17 @@ def _impossible_price(reason: Reason) -> str:
 
 
 def _over_budget(reason: Reason) -> str:
+    left = f"leaves ${reason.limit_usd_per_hour:.3f}/h"
     if reason.slot is not None:
-        return f"over the cap: it leaves {_usd(reason.limit_usd_per_hour)} for slot {reason.slot}"
-    return (
-        f"the cheapest offer is {_usd(reason.usd_per_hour)} and `max_usd_per_hour` "
-        f"leaves {_usd(reason.limit_usd_per_hour)}"
-    )
+        return f"over the cap: it {left} for slot {reason.slot}"
+    return f"the cheapest offer is ${reason.usd_per_hour:.3f}/h and `max_usd_per_hour` {left}"
 
 
 def _over_cap(reason: Reason) -> str:
     if reason.usd_per_hour is None:
         return "`max_usd_per_hour` allows no more"
-    return (
-        f"{_usd(reason.usd_per_hour)} is over the cap of ${reason.limit_usd_per_hour:g}/h: "
-        "the dearest go, one by one"
-    )
+    cap = f"${reason.limit_usd_per_hour:g}/h"
+    return f"${reason.usd_per_hour:.3f}/h is over the cap of {cap}: the dearest go, one by one"
 
 
 def _other_market(reason: Reason) -> str:
@@ -150,6 +114,10 @@ def _worse_score(reason: Reason) -> str:
     return f"{(' but ' if better else ', ').join(said)} (slot {reason.slot})"
 
 
+def _ms(seconds: float | None) -> str:
+    return "unknown" if seconds is None else f"{seconds * 1000:.0f} ms"
+
+
 def _max_hours(reason: Reason) -> str:
     if reason.seconds is None:
         return "`max_hours` is over"
@@ -158,32 +126,32 @@ def _max_hours(reason: Reason) -> str:
 
 
 _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
-    Cause.NOT_RUNNING: lambda r: f"not running after {r.seconds:.0f} s",
-    Cause.NOT_READY: lambda r: f"not ready after {r.seconds:.0f} s",
+    Cause.NOT_RUNNING: "not running after {r.seconds:.0f} s",
+    Cause.NOT_READY: "not ready after {r.seconds:.0f} s",
     Cause.NOTICE: "preemption notice",
     Cause.DRAINS_ITSELF: "it asked to be left alone",
-    Cause.SILENT: lambda r: f"silent for {r.seconds:.0f} s",
+    Cause.SILENT: "silent for {r.seconds:.0f} s",
     Cause.DISAGREES: "its answers differ from those of the others",
     Cause.AT_RISK: "the cloud recommends to move it (rebalance)",
-    Cause.SERVICE_AWAY: lambda r: f"its service has been away for {r.seconds:.0f} s",
+    Cause.SERVICE_AWAY: "its service has been away for {r.seconds:.0f} s",
     Cause.DRAINED: "drained by the user",
     Cause.EXCLUDED: lambda r: (
         f"excluded location {r.location}" if r.location else "excluded by `fogft exclude`"
     ),
     Cause.NO_GROUP: "its group is not in the pool file",
     Cause.OUTDATED: "outdated by another version",
-    Cause.SUPERSEDED: lambda r: f"superseded by {r.replica}",
-    Cause.BETTER_SPREAD: lambda r: f"moves to {r.location}: better spread",
-    Cause.BETTER_SCORE: lambda r: f"moves to {r.location}: {r.share:.0%} better",
-    Cause.SPOT_AGAIN: lambda r: f"moves to {r.location}: spot",
-    Cause.ON_DEMAND_AGAIN: lambda r: f"moves to {r.location}: on demand",
+    Cause.SUPERSEDED: "superseded by {r.replica}",
+    Cause.BETTER_SPREAD: "moves to {r.location}: better spread",
+    Cause.BETTER_SCORE: "moves to {r.location}: {r.share:.0%} better",
+    Cause.SPOT_AGAIN: "moves to {r.location}: spot",
+    Cause.ON_DEMAND_AGAIN: "moves to {r.location}: on demand",
     Cause.MAX_HOURS: _max_hours,
-    Cause.NOT_WANTED: lambda r: _after("not wanted", r),
-    Cause.REPLACED: lambda r: _after("replaced", r),
-    Cause.REPLACED_FIRST: lambda r: _after("replaced, old before new", r),
-    Cause.ENOUGH_SPOT: lambda r: _after("enough spot machines are ready", r),
-    Cause.BUDGET_FULL: lambda r: f"{_main(r)}, and the budget has no room",
-    Cause.REPLACES: lambda r: _launch(_after(f"replaces {r.replica}", r), r.because[1:]),
+    Cause.NOT_WANTED: "not wanted{after}",
+    Cause.REPLACED: "replaced{after}",
+    Cause.REPLACED_FIRST: "replaced, old before new{after}",
+    Cause.ENOUGH_SPOT: "enough spot machines are ready{after}",
+    Cause.BUDGET_FULL: "{main}, and the budget has no room",
+    Cause.REPLACES: _replaces,
     Cause.FOLLOWS: lambda r: _launch(f"follows {r.replica}", r.because),
     Cause.NEW_SLOT: lambda r: _launch("fills a new slot", r.because),
     Cause.STANDS_IN: "stands in until enough spot machines are ready",
@@ -192,67 +160,63 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.IMPOSSIBLE_PRICE: _impossible_price,
     Cause.LOCATION_FULL: "a location must not hold more of the replicas",
     Cause.ALL_EXCLUDED: "every offered location is excluded",
-    Cause.BACKING_OFF: _rests,
+    Cause.BACKING_OFF: _backing_off,
     Cause.ALL_BACKING_OFF: _all_backing_off,
     Cause.OVER_BUDGET: _over_budget,
     Cause.SURGE_FULL: lambda r: (
         f"waiting to {'replace' if r.replica else 'launch'} slot {r.slot}: "
         "`max_surge` allows no more machines now"
     ),
-    Cause.WAITS: lambda r: _after(f"slot {r.slot} waits", r),
-    Cause.NO_ROOM_TO_UPDATE: lambda r: (
-        f"slot {r.slot} is not updated: there is no room for both, and no other one that "
+    Cause.WAITS: "slot {r.slot} waits{after}",
+    Cause.NO_ROOM_TO_UPDATE: (
+        "slot {r.slot} is not updated: there is no room for both, and no other one that "
         "answers meanwhile; raise `max_usd_per_hour` or `max_surge`"
     ),
-    Cause.OLD_BEFORE_NEW: lambda r: f"slot {r.slot}: no room for both, so old before new",
+    Cause.OLD_BEFORE_NEW: "slot {r.slot}: no room for both, so old before new",
     Cause.OTHER_KIND: "nothing of its kind is launched",
     Cause.OTHER_MARKET: _other_market,
     Cause.WORSE_SCORE: _worse_score,
-    Cause.LOST_THERE: lambda r: (
-        f"avoided for {(r.seconds or 0.0) / 60:.0f} min more: a replica was lost there"
-    ),
-    Cause.CROWDED: lambda r: (
-        f"spread: `{r.location}` has {r.count} already when slot {r.slot} is placed"
-    ),
+    Cause.LOST_THERE: ("avoided for {minutes:.0f} min more: a replica was lost there"),
+    Cause.CROWDED: ("spread: `{r.location}` has {r.count} already when slot {r.slot} is placed"),
     Cause.SCHEDULED_AHEAD: "launching ahead of the schedule's next window",
-    Cause.TARGET_UNMET: _target_unmet,
-    Cause.MOST_REPLICAS: lambda r: f"{r.count} is the most",
+    Cause.TARGET_UNMET: (
+        "`availability: {r.target:g}` cannot be met: {r.count} replicas are expected "
+        "to reach {r.share:.6g}, and {main}"
+    ),
+    Cause.MOST_REPLICAS: "{r.count} is the most",
     Cause.OVER_CAP: _over_cap,
-    Cause.UPDATING: lambda r: (
-        f"update in progress: {r.count} of {r.of} replicas run the new version"
+    Cause.UPDATING: ("update in progress: {r.count} of {r.of} replicas run the new version"),
+    Cause.UPDATE_STOPPED: (
+        "update stopped, {main}: the pool returns to the last good file, "
+        "{r.count} of {r.of} replicas run it"
     ),
-    Cause.UPDATE_STOPPED: _update_stopped,
-    Cause.ROLLED_BACK: lambda r: (
-        f"update rolled back, {_main(r)}: the pool runs the last good file"
-    ),
-    Cause.REPLICA_FAILS: lambda r: _after(f"replica {r.replica}", r),
+    Cause.ROLLED_BACK: ("update rolled back, {main}: the pool runs the last good file"),
+    Cause.REPLICA_FAILS: "replica {r.replica}{after}",
     Cause.TYPES_DIFFER: lambda r: r.words or "its types are not the same on both sides",
-    Cause.RUN_ENDS: _run_ends,
+    Cause.RUN_ENDS: "`run` ended {r.count} times{in_brackets}",
     Cause.MORE_ERRORS: _more_errors,
-    Cause.LAUNCHES_FAIL: _launches_fail,
+    Cause.LAUNCHES_FAIL: "{r.count} launches failed ({names}), and none served",
     Cause.CLOUD_UNREACHABLE: "the cloud cannot be reached: nothing is changed",
-    Cause.NO_ANSWER: lambda r: f"the cloud did not answer: {r.words}",
-    Cause.NO_PRICES: lambda r: f"no prices can be had: {r.words}",
+    Cause.NO_ANSWER: "the cloud did not answer: {r.words}",
+    Cause.NO_PRICES: "no prices can be had: {r.words}",
     Cause.UPLINK_SUSPECTED: "all links are silent together: the robot's uplink is suspected",
     Cause.NOBODY_HEARD: "nothing is ended while no replica can be heard",
-    Cause.ENDS_SOON: lambda r: (
-        f"the pool ends by itself in {(r.seconds or 0.0) / 60:.0f} min (`max_hours`)"
-    ),
+    Cause.ENDS_SOON: ("the pool ends by itself in {minutes:.0f} min (`max_hours`)"),
     Cause.CLOCK_SET: _clock_set,
-    Cause.CLOCK_DOUBTED: lambda r: (
-        f"the clock was set by {r.seconds:+.0f} s: nothing is launched or ended for it; "
+    Cause.CLOCK_DOUBTED: (
+        "the clock was set by {r.seconds:+.0f} s: nothing is launched or ended for it; "
         "schedules follow once it has stood for a minute"
     ),
-    Cause.SLEPT: lambda r: f"this machine slept for {r.seconds:.0f} s",
+    Cause.SLEPT: "this machine slept for {r.seconds:.0f} s",
     Cause.NO_MANAGER: "no manager runs: the cloud was asked directly",
     Cause.NO_PROXY_REPORT: "the client proxy has not reported yet",
     Cause.STALE_PROXY_REPORT: "the client proxy has not reported lately",
-    Cause.PROXY_KEEPS_ENDING: lambda r: (
-        f"the client proxy has ended {r.count} times in a row; its log is `{r.name}`"
+    Cause.PROXY_KEEPS_ENDING: (
+        "the client proxy has ended {r.count} times in a row; its log is `{r.name}`"
     ),
-    Cause.NO_CERTIFICATE: lambda r: (
-        f"gateway `{r.name}` has no certificate: `fogft credentials issue gateway {r.name}`"
+    Cause.NO_CERTIFICATE: (
+        "gateway `{r.name}` has no certificate: `fogft credentials issue gateway {r.name}`"
     ),
-    Cause.NOT_OFFERED: lambda r: f"`{r.name}` is not offered here: {r.words}",
-    Cause.TROUBLE: lambda r: r.words,
+    Cause.NOT_OFFERED: "`{r.name}` is not offered here: {r.words}",
+    Cause.TROUBLE: "{r.words}",
 }
