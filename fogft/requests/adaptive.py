@@ -28,7 +28,6 @@ from typing import Any
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.requests.choose import NEVER, All, Choose, Failover
 from fogft.requests.latency import Latencies
-from fogft.requests.token_bucket import TokenBucket
 
 LATE_SHARE = 0.95
 BUDGET_CAPACITY = 10.0
@@ -40,6 +39,41 @@ _SAMPLES_GOOD = 20
 _PROBE_SOONER = 0.1
 _UNKNOWN_DELAY_S = 0.1
 _LOAD_GAIN = 0.05
+
+
+class TokenBucket:
+    """Tokens for extra copies: a share of what was asked for, and a little to begin with.
+
+    Tokens come with requests, not with time: a service that is asked once a minute and one that is
+    asked a thousand times a second both send the same share of extra copies.
+
+    Law: after n requests at most ``capacity + share * n`` copies were taken.
+
+    Args:
+        share: Tokens that each request brings, above 0 and at most 1.
+        capacity: The most that are kept, and how many there are at first.
+    """
+
+    def __init__(self, share: float, capacity: float) -> None:
+        self._share = share
+        self._capacity = capacity
+        self._tokens = capacity
+
+    @property
+    def tokens(self) -> float:
+        """What is there now."""
+        return self._tokens
+
+    def request(self) -> None:
+        """Count a request."""
+        self._tokens = min(self._capacity, self._tokens + self._share)
+
+    def take(self, *, leave: float = 0.0) -> bool:
+        """Take a token, if then at least `leave` are left."""
+        if self._tokens < 1.0 + leave:
+            return False
+        self._tokens -= 1.0
+        return True
 
 
 class _Replica:

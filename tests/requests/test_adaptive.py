@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.adaptive import BUDGET_CAPACITY, Adaptive
+from fogft.requests.adaptive import BUDGET_CAPACITY, Adaptive, TokenBucket
 from fogft.requests.latency import Latencies
-from fogft.requests.token_bucket import TokenBucket
 
 A = b"a" * 16
 

@@ -63,7 +63,7 @@ operations = st.lists(
         st.tuples(st.just("put"), robots, st.floats(0, 10)),
         st.tuples(st.just("take"), robots, st.just(0.0)),
         st.tuples(st.just("remove"), robots, st.floats(0, 1)),
-        st.tuples(st.just("give way"), robots, st.floats(0, 10)),
+        st.tuples(st.just("evict"), robots, st.floats(0, 10)),
     ),
     max_size=120,
 )
@@ -95,7 +95,7 @@ def test_each_comes_out_once_and_nobody_starves(operations):
             chosen = sorted(waiting)[int(value * (len(waiting) - 1))]
             assert queue.remove(chosen.to_bytes(2, "big")) == chosen
             del waiting[chosen]
-        elif operation == "give way":
+        elif operation == "evict":
             gone = queue.evict(robot, value)
             if gone is not None:
                 del waiting[gone]

@@ -94,6 +94,8 @@ class Delivery:
             return
         with self._ledger.lock:
             self._ledger.end(request, pending, outcome)
+            if self._ledger.requests.fallback is not None:  # it was meant for that one
+                self._ledger.requests.fallback.ended(request)
         if response is not None:
             self.give(pending, response)
 
