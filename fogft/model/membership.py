@@ -24,6 +24,7 @@ from fogft.model.replica import Machine, MachinePhase, Member, Membership, Repli
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import Topology
 
+_PARTS = ("pool", "pool_uid", "epoch", "version", "members", "revoked", "topology")
 VERSION = re.compile(r"[\w.-]{0,64}", re.ASCII)
 
 
@@ -151,9 +152,7 @@ def from_dict(raw: Any) -> Membership:
         content = {key: value for key, value in raw.items() if key != "checksum"}
         if raw["checksum"] != checksum(content):
             raise ValueError("its checksum is wrong")
-        parts = {key: content[key] for key in ("pool", "pool_uid", "epoch", "version", "members")}
-        parts["revoked"] = content.get("revoked", ())  # older versions knew none
-        parts["topology"] = content.get("topology")
+        parts = {key: content[key] for key in _PARTS}
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error
     return from_parts(**parts)
@@ -201,7 +200,7 @@ def _member(uid: str, entry: Mapping[str, Any]) -> Member:
     if not isinstance(entry["draining"], bool):
         raise TypeError("draining is not true or false")
     id = ReplicaId(uid, _count(entry["slot"]), _count(entry["generation"]))
-    version = _text(entry.get("version", ""))  # older managers wrote none
+    version = _text(entry["version"])
     if not VERSION.fullmatch(version):
         raise ValueError(f"`{version:.40}` is not a version")
     return Member(id, endpoint, entry["draining"], version=version)

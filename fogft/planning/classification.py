@@ -18,6 +18,7 @@ from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.sizing import Size
 
 _ORDER = {Cause.DRAINED: 0, Cause.EXCLUDED: 1, Cause.OUTDATED: 3}  # all others between
+_OUTDATED = Reason(Cause.OUTDATED)  # of many at once, at every tick
 _LOST = (Verdict.LEAVING, Verdict.UNRESPONSIVE)
 _DOUBTED = (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES)
 
@@ -151,7 +152,7 @@ def _unwanted(
     if slot // BLOCK not in blocks:
         return Reason(Cause.NO_GROUP)
     if machine.spec_hash != replica_hash(spec, slot):
-        return Reason(Cause.OUTDATED)
+        return _OUTDATED
     return None
 
 
