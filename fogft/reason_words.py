@@ -217,6 +217,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.NO_CERTIFICATE: (
         "gateway `{r.name}` has no certificate: `fogft credentials issue gateway {r.name}`"
     ),
+    Cause.NO_RENDEZVOUS: "no rendezvous can be reached: {r.words}",
     Cause.NOT_OFFERED: "`{r.name}` is not offered here: {r.words}",
     Cause.TROUBLE: "{r.words}",
 }

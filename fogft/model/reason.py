@@ -111,6 +111,7 @@ class Cause(str, Enum):
     STALE_PROXY_REPORT = "stale_proxy_report"
     PROXY_KEEPS_ENDING = "proxy_keeps_ending"
     NO_CERTIFICATE = "no_certificate"
+    NO_RENDEZVOUS = "no_rendezvous"
     NOT_OFFERED = "not_offered"
     TROUBLE = "trouble"  # an error, in its own words
 

@@ -14,7 +14,6 @@ Not here: what is missing (`planner`), the arithmetic (`availability`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from fogft.model.choices import MAX_REPLICAS
@@ -75,9 +74,8 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
     elif intent.is_scaled(spec):
         total = intent.wanted(spec)
     elif spec.availability and now.replicas == spec.replicas:
-        found = _for_target(spec, intent, observed, now.max_usd_per_hour, running)
-        total = found.count
-        notes += because(found.note)
+        total, unmet = _for_target(spec, intent, observed, now.max_usd_per_hour, running)
+        notes += because(unmet)
     counts = shares(groups, total)
     extra = critical_group(spec, total)
     if extra.replicas and total:
@@ -147,23 +145,20 @@ class Markets:
         return self._made[key]
 
 
-@dataclass(frozen=True)
-class _Found:
-    count: int
-    note: Reason | None = None
-
-
 def _for_target(
     spec: PoolSpec, intent: Intent, observed: Observed, cap: float | None, running: int
-) -> _Found:
-    """Return the fewest replicas that reach the target; the most within the cap if none do."""
+) -> tuple[int, Reason | None]:
+    """Return the fewest replicas that reach the target; the most within the cap if none do.
+
+    The reason says why the target cannot be reached; None where it can.
+    """
     asked, groups = spec.availability, groups_of(spec)
     if asked is None:
-        return _Found(spec.replicas)
+        return spec.replicas, None
     if not observed.offers:
         one = 1.0 - unavailability_of(asked.assumed, spot=True)
         needed = replicas_needed(one, asked.target, limit=10_000)
-        return _Found(min(MAX_REPLICAS, max(spec.replicas, running, needed)))
+        return min(MAX_REPLICAS, max(spec.replicas, running, needed)), None
     scale = Scale(spec.placement.weights, observed.rtt_s)
     markets = Markets(observed.offers, scale, intent.excluded)
     laid = [o for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
@@ -171,7 +166,7 @@ def _for_target(
     for count in range(max(1, spec.replicas), len(laid) + 1):
         best = expected([o.placement for o in laid[:count]], asked.assumed)
         if best.correlated >= asked.target - 1e-12:
-            return _Found(count)
+            return count, None
     # Not below what runs: near the cap, prices that waver would make the number waver.
     count = max(1, spec.replicas, len(laid), min(running, MAX_REPLICAS))
     most = Reason(Cause.MOST_REPLICAS, count=MAX_REPLICAS)
@@ -183,4 +178,4 @@ def _for_target(
         target=asked.target,
         because=(why,),
     )
-    return _Found(count, note)
+    return count, note

@@ -15,6 +15,7 @@ import datetime
 from fogft.errors import CredentialError
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths, holder_of
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Membership
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
@@ -125,12 +126,13 @@ class ManagerRecords:
         self._certified_at = now
 
     @property
-    def trouble(self) -> str:
-        """Return what is wrong, in a sentence; empty when at least one rendezvous is there."""
+    def trouble(self) -> Reason | None:
+        """Return what is wrong; None when at least one rendezvous is there."""
         if self._client is None or self._client.known.connected:
-            return ""
+            return None
         said = self._client.status()["rendezvous"]
-        return "no rendezvous can be reached: " + "; ".join(str(one["detail"]) for one in said)
+        details = "; ".join(str(one["detail"]) for one in said)
+        return Reason(Cause.NO_RENDEZVOUS, words=details)
 
     def close(self) -> None:
         """Leave. Repeatable."""

@@ -224,9 +224,8 @@ class Manager:
             *self._trouble,
             *self._discovery.notes,
             *because(self._proxy.trouble),
+            *because(self._records.trouble),
         ]
-        if self._records.trouble:
-            notes.append(Reason(Cause.TROUBLE, words=self._records.trouble))
         if (report is None or not fresh) and not tick.over:
             cause = Cause.STALE_PROXY_REPORT if report else Cause.NO_PROXY_REPORT
             notes.append(Reason(cause))
