@@ -305,6 +305,8 @@ def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessm
     All others that are wanted serve, and it has stayed for `fallback.STAYS_S`: should no spot
     machine be had, it is ordered again.
     """
+    if buyer.cap is None:
+        return None
     machines = buyer.machines
     if room <= len(buyer.launches) or buyer.launches or machines.ending or buyer.fits_beside(need):
         return None

@@ -126,3 +126,20 @@ def test_a_stand_in_that_serves_alone_makes_way_for_nobody():
     planned = world(stand_in(age_s=9000.0), of=capped).plan()
     assert not planned.draining
     assert not planned.terminations
+
+
+@pytest.mark.parametrize("cap", [None, 5.0, 0.45])
+def test_a_stand_in_stays_while_no_spot_machine_can_be_had(cap):
+    """Every location refused a second ago: to end the stand-in would win nothing."""
+    refused = [
+        event
+        for number, place in enumerate(PLACES, 1)
+        for event in (
+            Event(NOW - 2, EventKind.LAUNCH, 1, number, place.location),
+            Event(NOW - 1, EventKind.REFUSED, 1, number, reason=Reason(Cause.CAPACITY)),
+        )
+    ]
+    asked = world(spot(0), stand_in(age_s=9000.0), of=replace(MIXED, max_usd_per_hour=cap))
+    planned = replace(asked, events=(*asked.events, *refused)).plan()
+    assert not planned.draining
+    assert not planned.terminations
