@@ -75,10 +75,8 @@ class OrderedReplica(Generic[T]):
     """One stateful service on one replica.
 
     Args:
-        queue_limit: Requests that wait for their turn; more are refused.
-        queue_bytes: Their bytes.
-        kept: Answers kept for copies.
-        kept_bytes: Their bytes; the oldest go first.
+        queue_limit, queue_bytes: Requests that wait for their turn; more are refused.
+        kept, kept_bytes: Answers kept for copies; the oldest go first.
     """
 
     def __init__(
@@ -96,7 +94,6 @@ class OrderedReplica(Generic[T]):
         self.promised = 0
         self.robot = ""
         self.goal = 0  # with this number it has caught up with the time when it joined
-        self.applied = 0  # how many requests were applied here
         self._limits = (queue_limit, queue_bytes, kept, kept_bytes)
         self._serial = 0
         self._work: _Work[T] | None = None
@@ -244,8 +241,7 @@ class OrderedReplica(Generic[T]):
 
     def _go_on(self) -> list[Effect[T]]:
         """Begin the next thing, if nothing is being done."""
-        if self._work is not None:
-            # Within its own term a claim asks only where we stand: that may be told at once.
+        if self._work is not None:  # within its own term a claim asks only where we stand
             return self._tell() if self.joined else []
         out = self._tell()
         if self._restore is not None:
@@ -254,8 +250,7 @@ class OrderedReplica(Generic[T]):
             if self._is_behind(index):
                 out.append(self._has_joined(to))
             else:
-                # It may have joined by another restore since; what it was sent then is not for
-                # the state that comes now.
+                # It may have joined by another restore since: what it was sent then is void.
                 out += self._give_up(Refusal.NOT_JOINED)
                 self.joined = self.sound = False
                 self._forget_answers()
@@ -292,7 +287,6 @@ class OrderedReplica(Generic[T]):
         self._work = None
         out: list[Effect[T]]
         if work.op is Op.APPLY:
-            self.applied += 1
             self.position = Position(work.epoch, work.index)
             self._keep(work.index, answer)
             out = [self._answer(to, answer) for to in work.waiting]

@@ -124,10 +124,9 @@ class Responder:
     def request(self, incoming: Incoming) -> None:
         """Take a request from the wire. Never blocks."""
         now = self._clock()
-        id = incoming.request_id
         displaced = begun = None
         with self._lock:
-            known = self._known.get(id)
+            known = self._known.get(incoming.request_id)
             if known is not None:
                 self.joined += 1
                 if known.waiting is not None and not known.unwanted:
@@ -241,8 +240,7 @@ class Responder:
         """Give the service a request; return whether it was taken. If not, it has ended."""
         try:
             payload, job.payload = job.payload, b""
-            on_response = partial(self._finished, job)
-            job.ticket = self._clients[job.service].call(payload, on_response)
+            job.ticket = self._clients[job.service].call(payload, partial(self._finished, job))
         except RosError as error:
             log.warning("request_not_passed_on service=%s reason=%r", job.service, str(error))
             hopeless = isinstance(error, Unreadable)
@@ -315,14 +313,11 @@ class Responder:
         incoming.refuse(reason)
 
     def crashed(self, service: str | None = None) -> None:
-        """A service, or all with the user's command, has died: refuse what is held for it.
-
-        What it had not been given is not blamed: it was just not ready for that.
-        """
+        """A service, or all with the user's command, has died: refuse what is held for it."""
         with self._lock:
             dead = self._known.unanswered(service)
             blamed = [job for job in dead if job.passed_on]
-            spared = [job for job in dead if not job.passed_on]
+            spared = [job for job in dead if not job.passed_on]  # it was not ready for these
             lost = []
             for name, queue in self._queues.items():
                 if service in (None, name):

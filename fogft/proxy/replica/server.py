@@ -1,7 +1,7 @@
 """The server proxy: the replica's side. Takes requests off the wire to the local services.
 
-It supervises the user's command, says "ready" for a service only while the command lives
-and discovery finds the service, and answers probes at once whatever the services do.
+It says "ready" for a service only while the user's command lives and discovery finds the service,
+and answers probes at once whatever the services do.
 
 When the command dies, the proxy leaves ROS and joins it anew: discovery would go on listing the
 dead service until its lease ends (20 s with Fast DDS). When a service goes and the command lives,
@@ -151,8 +151,8 @@ class ServerProxy:
             return
         complete = len(self._ready) == len(self._offering.services)
         for service in self._offering.look(self._node, complete=complete):
-            log.info("service_found replica=%s service=%s type=%s", self._id, service.name,
-                     service.type)  # fmt: skip
+            name, type_name = service.name, service.type
+            log.info("service_found replica=%s service=%s type=%s", self._id, name, type_name)
             self._make_client(service)
             self._listener.add(self._keys((service,)))
 
@@ -247,9 +247,8 @@ class ServerProxy:
         self.responder.use(self._clients, cancels)
         self._goals.use(self._clients)
         for service in services:
-            if service.name not in self._clients:
-                continue
-            if service.name in self._ordered and service.state is not None:
+            made = service.name in self._clients and service.name in self._ordered
+            if made and service.state is not None:
                 ends = (service.state.snapshot, service.state.restore)
                 snapshot, restore = (node.client(end.name, end.type) for end in ends)
                 clients = Clients(self._clients[service.name], snapshot, restore)
@@ -263,8 +262,8 @@ class ServerProxy:
             self._clients[service.name] = self._node.client(service.name, service.type)
         except RosError as error:
             if self._not_usable.get(service.name) != error.message:
-                log.error("service_not_usable replica=%s service=%s reason=%r", self._id,
-                          service.name, error.message)  # fmt: skip
+                log.error("service_not_usable replica=%s service=%s reason=%r",
+                          self._id, service.name, error.message)  # fmt: skip
             self._not_usable[service.name] = error.message
         else:
             self._not_usable.pop(service.name, None)
@@ -301,8 +300,7 @@ class ServerProxy:
 
     def _probe(self, probe: Probe) -> ProbeAnswer:
         if probe.manager_age_s is not None:
-            seen = self._clock() - probe.manager_age_s
-            self._manager_seen = max(self._manager_seen, seen)
+            self._manager_seen = max(self._manager_seen, self._clock() - probe.manager_age_s)
         return ProbeAnswer(
             slot=self._id.slot,
             generation=self._id.generation,
