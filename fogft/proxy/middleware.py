@@ -15,8 +15,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fogft.errors import RosError
+from fogft.model.cdr import Shape
 from fogft.model.middleware import Speaks
-from fogft.model.type_definition import Definition
+from fogft.model.type_definition import RESPONSE, Definition
 from fogft.proxy import start
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
@@ -93,6 +94,16 @@ def join(
         return replace(found, service_hash=hash or found.service_hash)
 
     return Joined(node, define)
+
+
+def response_fault(type_name: str) -> Callable[[bytes], str]:
+    """Return what says why bytes are no response of a type; empty for nothing.
+
+    Where the type is not installed only the header can be judged.
+    """
+    from fogft.ros.types import definition
+
+    return Shape(RESPONSE, definition(type_name).fields).fault
 
 
 def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | None:

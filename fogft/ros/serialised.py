@@ -20,9 +20,9 @@ from typing import Any
 from fogft.errors import RosError, Unreadable
 from fogft.ros import rcl
 from fogft.ros.port import NotFoundYet
+from fogft.ros.types import shape
 
 LARGE_BYTES = 256 * 1024
-ENCAPSULATION_BYTES = 4  # the shortest CDR there is: its header
 
 
 class CMessage:
@@ -39,6 +39,7 @@ class CMessage:
         self._input_address = addressof(self._input)
         self._output = rcl.OutputBytes(None, 0, 0, allocator)
         self._output_address = addressof(self._output)
+        self._shape = shape(message_type)
         self.address: int = rcl.create_function(rcl.address(kind._CREATE_ROS_MESSAGE))()
         if not self.address:
             raise RosError(f"no memory for a {self._name}")
@@ -50,18 +51,17 @@ class CMessage:
             Unreadable: They are no such message; what the message holds now is undefined.
         """
         size = len(payload)
+        fault = self._shape.fault(payload)
+        if fault:  # what is refused is the same under every middleware
+            raise Unreadable(f"{size} bytes are not a serialised {self._name}: {fault}")
         source = self._input
         source.buffer = payload
         source.length = source.capacity = size
         functions = self._held if size < LARGE_BYTES else self._released
-        code = (
-            functions.rmw_deserialize(self._input_address, self._type_support, self.address)
-            if size >= ENCAPSULATION_BYTES
-            else -1
-        )
+        code = functions.rmw_deserialize(self._input_address, self._type_support, self.address)
         source.buffer = None
         if code != rcl.OK:
-            reason = rcl.error_text() if code != -1 else "too short"
+            reason = rcl.error_text()
             raise Unreadable(f"{size} bytes are not a serialised {self._name}: {reason}")
 
     def write(self, functions: rcl.Rcl) -> bytes:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.errors import RosError
+from fogft.model.cdr import Shape
 from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
 
 _NAME = re.compile(
@@ -254,6 +255,16 @@ def definition(type_name: str) -> Definition:
         fields,
         service_hash=hashes.get(type_name, ""),
     )
+
+
+def shape(message_type: Any) -> Shape:
+    """Return the shape of a message's bytes. A type whose fields cannot be read has none."""
+    fields: dict[str, Fields] = {}
+    try:
+        _add("", message_type, fields)
+    except Exception:  # generated code: anything may go wrong in it
+        fields.clear()
+    return Shape("", fields)
 
 
 def _add(name: str, message: Any, fields: dict[str, Fields]) -> None:

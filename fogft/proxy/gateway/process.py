@@ -29,6 +29,7 @@ from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.process import start_log, stop_on_signal
 from fogft.proxy.config import GatewayConfig, read_gateway
 from fogft.proxy.gateway.gateway import Forwarder, NoRos, numbers
+from fogft.proxy.middleware import response_fault
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
@@ -109,7 +110,13 @@ class _Gateway:
     def _make_dispatcher(
         self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
     ) -> Dispatcher:
-        dispatcher = Dispatcher(spec, self._forwarder.respond, ok_of=_ok_of(spec.type), wake=wake)
+        dispatcher = Dispatcher(
+            spec,
+            self._forwarder.respond,
+            fault_of=response_fault(spec.type),
+            ok_of=_ok_of(spec.type),
+            wake=wake,
+        )
         self._forwarder.use(spec.name, dispatcher)
         return dispatcher
 

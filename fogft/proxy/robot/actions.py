@@ -214,12 +214,16 @@ class Actions:
         self._actions: dict[str, Action] = {}
 
     def make(
-        self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
+        self,
+        spec: ServiceSpec,
+        respond: Callable[[Any, bytes], None],
+        wake: Callable[[], None],
+        fault_of: Callable[[bytes], str] = lambda payload: "",
     ) -> Dispatcher:
         """Make the dispatcher of an action's part."""
         name = spec.name.rpartition("/")[0]
         action = self._actions.setdefault(name, Action(self._clock, wake))
-        make = partial(Dispatcher, spec, respond, wake=wake, clock=self._clock)
+        make = partial(Dispatcher, spec, respond, wake=wake, clock=self._clock, fault_of=fault_of)
         if spec.part is Part.GOAL:
             goal = _GoalPart(action, spec.name)
             return make(decide=goal, replication=goal)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -44,6 +45,8 @@ from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
 
+MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
+
 
 class Dispatcher:
     """The requests of one service, from the caller's request to the caller's response.
@@ -53,6 +56,8 @@ class Dispatcher:
         respond: Sends a response to a caller. Any thread.
         decide: What answers mean; the first success unless given.
         replication: What else replicas must have.
+        fault_of: Returns what is wrong with the bytes of a response; empty for nothing. One that
+            is malformed is a failure of its replica, and another answer is awaited.
         ok_of: Returns, for a name of a boolean response field, whether a response is a success;
             asked where the spec names an `ok_field`.
         empty_response: The serialised default response, for ``on_timeout: empty``.
@@ -71,6 +76,7 @@ class Dispatcher:
         *,
         decide: Decide | None = None,
         replication: Replication | None = None,
+        fault_of: Callable[[bytes], str] = lambda payload: "",
         ok_of: Callable[[str], Accepts] | None = None,
         empty_response: bytes | None = None,
         wake: Callable[[], None] = lambda: None,
@@ -78,6 +84,8 @@ class Dispatcher:
         max_pending_bytes: int = 256 << 20,
         max_pending: int = 1 << 16,
     ) -> None:
+        self._fault_of = fault_of
+        self._malformed: Counter[int] = Counter()
         self._ok_of = ok_of
         self._wake = wake
         self._clock = clock
@@ -176,8 +184,12 @@ class Dispatcher:
             self._refused(id, replica, answer, answer.refusal or Refusal.LOST)
             return
         try:
-            reading = self._decide.read(payload)
-        except RosError:  # no response of this type
+            fault = self._fault_of(payload)
+            reading = None if fault else self._decide.read(payload)
+        except RosError as error:
+            fault = error.message
+        if fault:  # no response of this type
+            self._misread(replica, id, fault)
             self._refused(id, replica, answer, Refusal.MALFORMED)
             return
         now, outcomes = self._clock(), self.outcomes
@@ -208,6 +220,15 @@ class Dispatcher:
             self._after(request, verdict)
         elif isinstance(means, Refusal):
             self._failed(id, replica, request, means)
+
+    def _misread(self, replica: int, id: ReplicaId, fault: str) -> None:
+        """Hold it against a replica that it sent what is no response."""
+        with self._lock:
+            self._malformed[replica] += 1
+            count = self._malformed[replica]
+        if worth_logging(count):
+            log.error("response_malformed service=%s replica=%s count=%d reason=%r",
+                      self.spec.name, id.short, count, fault)  # fmt: skip
 
     def late(self, link: Link, request: bytes) -> None:
         """Count an answer to a request that its link was told to forget."""
@@ -329,8 +350,8 @@ class Dispatcher:
                 self._replication.close()
 
     def disagrees(self, replica: int) -> bool:
-        """Whether a replica's answers count no more."""
-        return replica in self._decide.flagged
+        """Whether a replica's answers have differed, or were malformed, repeatedly."""
+        return replica in self._decide.flagged or self._malformed[replica] >= MALFORMED_LIMIT
 
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, where that is traced."""

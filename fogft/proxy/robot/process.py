@@ -175,14 +175,17 @@ def make_dispatcher(
     Raises:
         RosError: The type is needed and cannot be loaded.
     """
+    fault_of = middleware.response_fault(spec.type)
     if spec.part is not Part.NONE:
-        return actions.make(spec, respond, wake)
+        return actions.make(spec, respond, wake, fault_of)
     from fogft.ros import types
     from fogft.ros.comparison import Comparison
 
     # The policy may become `empty` later.
     empty = middleware.empty_response(speaks, spec.type, needed=spec.needs_type)
-    make = functools.partial(Dispatcher, spec, respond, empty_response=empty, wake=wake)
+    make = functools.partial(
+        Dispatcher, spec, respond, empty_response=empty, wake=wake, fault_of=fault_of
+    )
     if spec.state is not None:
         mark = marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}"
         order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake)

@@ -9,9 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import RosError
+from fogft.model.cdr import Shape
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
-from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.dispatcher import MALFORMED_LIMIT, Dispatcher
+from fogft.proxy.robot.sending import key_of
 from tests.proxy.fakes import Clock, FakeLink
 
 
@@ -23,7 +25,7 @@ class Scene:
         self.responses: list[tuple[object, bytes]] = []
         options = {
             key: spec.pop(key)
-            for key in ("empty_response", "max_pending_bytes", "max_pending")
+            for key in ("empty_response", "fault_of", "max_pending_bytes", "max_pending")
             if key in spec
         }
         if (is_ok := spec.pop("is_ok", None)) is not None:
@@ -402,3 +404,34 @@ def test_a_service_may_become_one_that_answers_empty_at_the_deadline():
     scene.dispatcher.adopt(replace(scene.dispatcher.spec, on_timeout=OnTimeout.EMPTY))
     scene.pass_time(6.0)
     assert scene.responses == [("before", b"empty")]
+
+
+SET_BOOL = Shape("", {"": (("success", "boolean"), ("message", "string"))})
+RIGHT = b"\x00\x01\x00\x00\x01\x00\x00\x00\x01\x00\x00\x00\x00"
+
+
+@pytest.mark.parametrize("junk", [b"", bytes(4), bytes(11), b"\x2a" * 65_536, bytes(65_536)])
+def test_a_malformed_response_never_wins(junk: bytes) -> None:
+    """Whoever sends it first: the next response is the answer, and the replica has failed."""
+    scene = Scene(3, fault_of=SET_BOOL.fault)
+    scene.dispatcher.submit(b"q", "caller")
+    scene.answer(0, junk)
+    assert scene.responses == []
+    scene.answer(1, RIGHT)
+    assert scene.responses == [("caller", RIGHT)]
+    report = scene.dispatcher.report()
+    assert (report["answered"], report["refused"]) == (1, {"malformed": 1})
+
+
+def test_a_replica_whose_responses_are_malformed_is_to_be_replaced() -> None:
+    """After a few of them, and nobody else is."""
+    scene = Scene(2, fault_of=SET_BOOL.fault)
+    liar, honest = (key_of(link) for link in scene.links)
+    for count in range(1, MALFORMED_LIMIT + 1):
+        assert not scene.dispatcher.disagrees(liar)
+        scene.dispatcher.submit(b"q", count)
+        scene.answer(0, b"junk")
+        scene.answer(1, RIGHT)
+    assert scene.dispatcher.disagrees(liar)
+    assert not scene.dispatcher.disagrees(honest)
+    assert [handle for handle, _ in scene.responses] == list(range(1, MALFORMED_LIMIT + 1))
