@@ -24,7 +24,7 @@ from fogft.pool.credentials.authority import Role
 from tests.freezing import freeze
 
 POOL_UID = "0123456789abcdef"
-SERVICE, TYPE = "/echo", "std_srvs/srv/SetBool"
+SERVICE, TYPE = "/echo", "plain_msgs/srv/Echo"  # not installed: its bytes are anything
 LIMIT_S = 30.0  # generous: a test that passes never waits for it
 
 
