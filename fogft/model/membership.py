@@ -110,7 +110,7 @@ def successor(
     if current is None or current.pool_uid != pool_uid:
         return Membership(pool, pool_uid, epoch, 1, members, frozenset(revoked), topology)
     if epoch < current.epoch:
-        return None  # a manager out of office writes nothing
+        return None  # a manager that was replaced writes nothing
     all_revoked = current.revoked | frozenset(revoked)
     now = (current.members, current.revoked, current.topology)
     if epoch == current.epoch and (members, all_revoked, topology) == now:

@@ -68,7 +68,7 @@ class Buyer:
     standing_in: Sequence[Assessment] = ()
     launches: list[PlannedLaunch] = field(default_factory=list)
     notes: list[Reason] = field(default_factory=list)
-    sacrificed: list[tuple[Assessment, Reason]] = field(default_factory=list)
+    ended_for_room: list[tuple[Assessment, Reason]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._catalogue = catalogue(self.observed.offers)
@@ -257,7 +257,7 @@ class Buyer:
                 continue
             if self._choose(need, left + self._price(replica))[0].offer is not None:
                 full = Reason(Cause.BUDGET_FULL, because=because(replica.why))
-                self.sacrificed.append((replica, full))
+                self.ended_for_room.append((replica, full))
                 return
 
     def fits_beside(self, need: Need) -> bool:

@@ -225,7 +225,7 @@ def plan_once(
         for s in (*machines.failed, *machines.aborted)
     ]
     ends += [PlannedEnd(s.id, why) for s, why in endings.now]
-    ends += [PlannedEnd(s.id, why) for s, why in buyer.sacrificed if s.id not in endings.ids]
+    ends += [PlannedEnd(s.id, why) for s, why in buyer.ended_for_room if s.id not in endings.ids]
     notes = [*sized.notes, *excess, *buyer.notes, *endings.notes]
     if health.uplink_suspected:
         notes.insert(0, Reason(Cause.UPLINK_SUSPECTED))

@@ -104,7 +104,7 @@ def backing_off(history: History, now: float) -> Mapping[str, Backoff]:
 def recently_failed(history: History, now: float) -> Mapping[str, Backoff]:
     """Return the supplies that failed within FORGIVE_S and have not proved themselves since.
 
-    Only the last failure is told.
+    Only the last failure counts.
     """
     return history.of_supplies(_outlook, _summed_up, now).recently_failed
 

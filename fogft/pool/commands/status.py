@@ -37,7 +37,7 @@ class Seen:
 
     Attributes:
         age_s: Since it was observed; None when nothing was observed yet.
-        manager_alive: Whether a manager holds office now.
+        manager_alive: Whether a manager runs now.
     """
 
     status: PoolStatus

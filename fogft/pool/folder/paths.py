@@ -79,7 +79,7 @@ class PoolPaths:
 
     @property
     def lease(self) -> Path:
-        """``{epoch, pid, beat}``: the manager in office; `beat` grows while it works."""
+        """``{epoch, pid, beat}``: the active manager; `beat` grows while it works."""
         return self.folder / "lease.json"
 
     @property

@@ -38,7 +38,7 @@ class ManagerRecords:
     Args:
         paths: The pool's folder.
         pool_uid: Its uid.
-        epoch: Of the manager in office.
+        epoch: Of the active manager.
     """
 
     def __init__(self, paths: PoolPaths, pool_uid: str, epoch: int) -> None:

@@ -1,4 +1,4 @@
-"""How far regions are from the robot: told, measured, or guessed, in this order.
+"""How far regions are from the robot, by the first of these that is known.
 
     the pool file's `rtt_s`, links to replicas, connects to regional endpoints, great circles
 

@@ -46,7 +46,7 @@ def end(
 
     Raises:
         PoolNotFound: There is no such pool (any more).
-        CloudUnreachable: It cannot be told what is left; run it again.
+        CloudUnreachable: It is not known what is left; run it again.
         FogftError: Something did not end (the message says what); run it again.
     """
     paths, identity = store.paths, store.identity()

@@ -1,7 +1,7 @@
 """End every machine of a pool, and believe it only when the clouds themselves say so.
 
 Owns: ending them side by side until none is listed, the last look past every memory, and what
-to say when it cannot be told what still runs.
+to say when it is not known what still runs.
 Not here: ending one machine (`fogft.cloud`).
 """
 
@@ -64,7 +64,7 @@ def end_machines(
     """End all machines that carry a pool's uid; return when none is left.
 
     Raises:
-        CloudUnreachable: It cannot be told what is left; the message lists what may be.
+        CloudUnreachable: It is not known what is left; the message lists what may be.
         FogftError: Some did not end within `limit_s`; the message says which, and why.
     """
     deadline = time.monotonic() + limit_s
