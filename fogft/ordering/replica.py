@@ -88,12 +88,11 @@ class OrderedReplica(Generic[T]):
         kept_bytes: int = 16 << 20,
     ) -> None:
         self.position = START
-        self.sound = True
-        self.joined = False
+        self.sound, self.joined = True, False
         self.serving = False  # whether the service and its two state services are there
-        self.promised = 0
-        self.robot = ""
+        self.promised, self.robot = 0, ""  # the term, and whose
         self.goal = 0  # with this number it has caught up with the time when it joined
+        self.applied = 0  # how many requests were applied here
         self._limits = (queue_limit, queue_bytes, kept, kept_bytes)
         self._serial = 0
         self._work: _Work[T] | None = None
@@ -127,9 +126,8 @@ class OrderedReplica(Generic[T]):
         if self._queue:
             return next(reversed(self._queue)) + 1
         work = self._work
-        if work is not None and work.op is Op.APPLY:
-            return work.index + 1
-        return self.position.index + 1
+        at = work if work is not None and work.op is Op.APPLY else self.position
+        return at.index + 1
 
     # -- orders ---------------------------------------------------------------------------
 
@@ -287,6 +285,7 @@ class OrderedReplica(Generic[T]):
         self._work = None
         out: list[Effect[T]]
         if work.op is Op.APPLY:
+            self.applied += 1
             self.position = Position(work.epoch, work.index)
             self._keep(work.index, answer)
             out = [self._answer(to, answer) for to in work.waiting]
