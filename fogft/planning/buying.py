@@ -156,7 +156,7 @@ class Buyer:
         if not group.on_demand.fallback or len(self._listing(group, True).supplies) < 2:
             return frozenset()
         stay = (*self.machines.good, *self.machines.replaced)
-        here = [s.machine.placement for s in stay if group_of(self.groups, s.slot) is group]
+        here = [s.placement for s in stay if group_of(self.groups, s.slot) is group]
         here += [x.offer.placement for x in self.launches if group_of(self.groups, x.slot) is group]
         count = Counter(place.location for place in here if place.spot)
         most = max(1, math.ceil(group.replicas / 2))
@@ -209,7 +209,7 @@ class Buyer:
         if not group.on_demand.base and not group.on_demand.fallback:
             return None
         stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
-        placed = [(s.slot, s.machine.placement) for s in stay]
+        placed = [(s.slot, s.placement) for s in stay]
         placed += [(launch.slot, launch.offer.placement) for launch in self.launches]
         on_demand = sum(
             not place.spot
@@ -221,12 +221,12 @@ class Buyer:
     def places(self, without: Assessment | None) -> list[Placement]:
         """Return where our replicas are and will be."""
         stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
-        taken = [s.machine.placement for s in stay]
+        taken = [s.placement for s in stay]
         return taken + [launch.offer.placement for launch in self.launches]
 
     def _price(self, replica: Assessment) -> float:
         """Return what a machine costs: as ordered, or more where its spot price has risen."""
-        placement = replica.machine.placement
+        placement = replica.placement
         return max(replica.machine.usd_per_hour, self._catalogue.prices.get(placement, 0.0))
 
     def _choose(self, need: Need, budget: float | None) -> tuple[Choice, Reason]:

@@ -18,7 +18,7 @@ from fogft.model.replica import ReplicaId
 from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.observed.history import History
-from fogft.planning.placement import crowding, domains
+from fogft.planning.placement import crowding
 
 # After the mark, the client proxy needs a moment to read it and to report what is in flight.
 DRAIN_SETTLE_S = 2.0
@@ -126,10 +126,10 @@ def _end_replaced(
 def _by_expendability(replicas: Iterable[Assessment], *, dear_first: bool) -> list[Assessment]:
     """Sort: not serving, then longest draining, then most crowded domain, then highest slot."""
     replicas = list(replicas)
-    count = crowding(s.machine.placement for s in replicas)
+    count = crowding(s.placement for s in replicas)
 
     def rank(s: Assessment) -> tuple[bool, bool, float, float, int, int, int, int, int]:
-        cloud, region, zone = domains(s.machine.placement)
+        cloud, region, zone = s.placement.domains
         return (
             s.may_serve,
             s.serving,

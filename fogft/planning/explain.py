@@ -27,7 +27,7 @@ from fogft.planning.cost import Cost, cost
 from fogft.planning.listing import is_possible
 from fogft.planning.observed.backoff import AVOID_MEMORY_S, EVERYWHERE, avoided, backing_off
 from fogft.planning.observed.history import History
-from fogft.planning.placement import crowding, domains
+from fogft.planning.placement import crowding
 from fogft.planning.planner import plan
 from fogft.planning.sizing import size
 
@@ -243,7 +243,7 @@ class _Reasons:
         if ours[0] > theirs[0]:
             left_s = self._avoided[offer.placement.location] - self._now
             return 2, Reason(Cause.LOST_THERE, seconds=left_s)
-        for level, domain in enumerate(domains(offer.placement), 1):
+        for level, domain in enumerate(offer.placement.domains, 1):
             if ours[level] > theirs[level]:
                 count = pick.count[domain]
                 crowded = Reason(Cause.CROWDED, slot=slot, location=domain, count=count)
@@ -258,7 +258,7 @@ class _Reasons:
         place = offer.placement
         return (
             int(place.location in self._avoided),
-            *(pick.count.get(domain, 0) for domain in domains(place)),
+            *(pick.count.get(domain, 0) for domain in place.domains),
         )
 
     def _score(self, cause: Cause, offer: Offer) -> Reason:

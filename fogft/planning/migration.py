@@ -29,7 +29,7 @@ from fogft.planning.buying import Buyer
 from fogft.planning.classification import Classification
 from fogft.planning.listing import catalogue
 from fogft.planning.observed.health import Assessment, Health
-from fogft.planning.placement import Choice, Crowd, crowding, domains
+from fogft.planning.placement import Choice, Crowd, crowding
 
 
 def is_quiet(machines: Classification, health: Health) -> bool:
@@ -115,7 +115,7 @@ def _moves(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Iterato
 
 def _is_better(buyer: Buyer, replica: Assessment, choice: Choice, count: Crowd) -> Move | None:
     """Return the move to a place if that is so much better."""
-    rules, placement = buyer.spec.migration, replica.machine.placement
+    rules, placement = buyer.spec.migration, replica.placement
     offer, (avoided, *there) = choice.offer, choice.rank
     if rules is None or offer is None or avoided or offer.placement == placement:
         return None
@@ -123,7 +123,7 @@ def _is_better(buyer: Buyer, replica: Assessment, choice: Choice, count: Crowd) 
     if kind is not None and kind != placement.spot:
         cause = Cause.SPOT_AGAIN if kind else Cause.ON_DEMAND_AGAIN
         return Move(replica, Reason(cause, location=offer.placement.location), (-1.0,))
-    here = [count[domain] for domain in domains(placement)]
+    here = [count[domain] for domain in placement.domains]
     if there < here:
         why = Reason(Cause.BETTER_SPREAD, location=offer.placement.location)
         return Move(replica, why, (0.0, *there))

@@ -41,11 +41,6 @@ class Choice(NamedTuple):
     rank: Rank = (False, 0, 0, 0)
 
 
-def domains(placement: Placement) -> tuple[str, str, str]:
-    """Return the failure domains that a placement lies in, the widest first."""
-    return placement.domains
-
-
 class Crowd(dict[str, int]):
     """How many replicas each failure domain holds: none where it is not named."""
 

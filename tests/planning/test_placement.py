@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.planning.observed.backoff import EVERYWHERE, Backoff
-from fogft.planning.placement import choose, crowding, domains
+from fogft.planning.placement import choose, crowding
 
 placements = st.builds(
     Placement,
@@ -44,7 +44,7 @@ def test_price_decides_within_equal_domains(offers: list[Offer], taken: list[Pla
     count = crowding(taken)
 
     def crowd(offer: Offer) -> list[int]:
-        return [count[domain] for domain in domains(offer.placement)]
+        return [count[domain] for domain in offer.placement.domains]
 
     assert chosen.usd_per_hour == min(o.usd_per_hour for o in offers if crowd(o) == crowd(chosen))
 
