@@ -184,7 +184,7 @@ class Dispatcher:
             self._refused(id, replica, answer, answer.refusal or Refusal.LOST)
             return
         try:
-            fault = self._fault_of(payload)
+            fault = self._fault_of(payload) if self._is_response(answer.request_id) else ""
             reading = None if fault else self._decide.read(payload)
         except RosError as error:
             fault = error.message
@@ -220,6 +220,13 @@ class Dispatcher:
             self._after(request, verdict)
         elif isinstance(means, Refusal):
             self._failed(id, replica, request, means)
+
+    def _is_response(self, attempt: bytes) -> bool:
+        """Whether an attempt was a caller's request, and not what else replicas must have."""
+        if self._replication is None:
+            return True
+        with self._lock:
+            return self._replication.request_of(attempt) is not None
 
     def _misread(self, replica: int, id: ReplicaId, fault: str) -> None:
         """Hold it against a replica that it sent what is no response."""
