@@ -114,7 +114,7 @@ class World(GatewayPool):
 
     def _admit(self) -> None:
         for machine in self.machines:
-            self._members[machine.id.slot] = Member(machine.id, "")
+            self.members[machine.id.slot] = Member(machine.id, "")
         self.publish()
 
     # -- what can be done to it ---------------------------------------------------------------
