@@ -102,3 +102,22 @@ def test_a_failed_set_up_runs_no_command_and_leaves_nothing(tmp_path, python):
     done = setup(tmp_path, stub(tmp_path, "3.11", no_venv=1) if python == "stub" else python)
     assert "ran" not in done.stdout
     assert not (tmp_path / "venv").exists()
+
+
+def test_a_distribution_without_wheels_is_refused(tmp_path):
+    done = setup(tmp_path, "python3", FOGFT_ROS="humble")
+    assert done.returncode == 1
+    assert done.stderr == (
+        "error: there are no wheels of ROS 2 'humble'\n\n"
+        "hint: choose jazzy or kilted; another one is used where it is sourced\n"
+    )
+    assert not (tmp_path / "venv").exists()
+
+
+def test_the_wheels_of_two_distributions_never_share_an_environment(tmp_path):
+    """One of Fast DDS's versions would read the other's variables."""
+    (tmp_path / "venv").mkdir()
+    (tmp_path / "venv" / "pyvenv.cfg").write_text("include-system-site-packages = false\n")
+    (tmp_path / "venv" / ".fogft-ros").write_text("jazzy\n")
+    done = setup(tmp_path, stub(tmp_path, "3.11"), FOGFT_ROS="kilted")
+    assert f"making {tmp_path / 'venv'} with Python 3.11" in done.stderr
