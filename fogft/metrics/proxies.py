@@ -6,7 +6,7 @@ Owns: names and labels of the metrics. Not here: counting (`outcomes`, `responde
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from fogft.metrics.families import counter, gauge, histogram
@@ -49,7 +49,7 @@ _WORK_COUNTS = {
 
 def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a client proxy or a gateway from its report."""
-    services, links = report["services"], report["links"]
+    services, links = report["services"], _newest(report["links"])
     yield from _requests(services)
     for kind, table in ((gauge, _LINK_GAUGES), (counter, _LINK_COUNTS)):
         for key, (name, help) in table.items():
@@ -140,6 +140,16 @@ def _by_slot(by_replica: Mapping[str, int]) -> dict[str, int]:
     return found
 
 
+def _newest(links: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return one link of each slot.
+
+    A slot has several while its machine is replaced, or behind gateways. The newest generation's is
+    taken, and of those one that is up: two samples of one series are an error.
+    """
+    ranked = sorted(links, key=lambda link: (link["generation"], link["state"] == "up"))
+    return list({link["slot"]: link for link in ranked}.values())
+
+
 def _slot(link: Mapping[str, Any]) -> dict[str, str]:
     return {"slot": str(link["slot"])}
 
@@ -163,7 +173,7 @@ def of_server(report: Mapping[str, Any]) -> Iterator[Metric]:
     )
     yield gauge(
         "fogft_replica_draining",
-        "Whether the replica is about to end.",
+        "Whether this machine received a preemption notice.",
         [(report["draining"], {})],
     )
     yield counter(

@@ -122,6 +122,16 @@ def test_generations_of_a_slot_are_one_series() -> None:
     assert value(said, "fogft_first_responses_total", slot="1", service="/s") == 6
 
 
+def test_a_slot_has_one_series_while_its_machine_is_replaced() -> None:
+    """Prometheus refuses two samples of one series; the newer machine's link is told."""
+    old = {**LINK, "in_flight": 7}
+    new = {**LINK, "generation": 2, "state": "connecting", "in_flight": 0}
+    for links in ([old, new], [new, old]):
+        said = text(proxies.of_client({**CLIENT, "links": links}), POOL)
+        assert value(said, "fogft_link_requests_in_flight", slot="0") == 0
+        assert value(said, "fogft_link_up", slot="0") == 0
+
+
 def test_a_slots_machine_is_told_as_information() -> None:
     replica = STATUS.replicas[0]
     said = text(of_pool(STATUS), POOL)
