@@ -26,7 +26,7 @@ _BYTE_ORDERS = {b"\x00\x00": Struct(">I"), b"\x00\x01": Struct("<I")}
 # what it reserved for gaps between fields and did not need: less than the message is long.
 _MOST_PADDING = 7
 
-_NUMBERS = {
+NUMBER_BYTES = {
     **dict.fromkeys(("boolean", "octet", "byte", "char", "uint8", "int8"), 1),
     **dict.fromkeys(("uint16", "int16"), 2),
     **dict.fromkeys(("uint32", "int32", "float"), 4),
@@ -139,7 +139,7 @@ class Shape:
         return self._kinds[name]
 
     def _kind(self, kind: str, within: tuple[str, ...]) -> _Kind:
-        if kind in _NUMBERS:
+        if kind in NUMBER_BYTES:
             return _number(kind)
         if found := _STRING.fullmatch(kind):
             return _string(int(found["bound"] or 0))
@@ -151,7 +151,7 @@ class Shape:
 
 
 def _number(kind: str) -> _Kind:
-    size = _NUMBERS[kind]
+    size = NUMBER_BYTES[kind]
     is_boolean = kind == "boolean"
 
     def walk(data: _Bytes, at: int) -> int:

@@ -26,7 +26,7 @@ from fogft.model.keys import (
     within,
 )
 from fogft.model.names import endpoint
-from fogft.model.ros_names import service_name
+from fogft.model.ros_names import absolute_service_name
 from fogft.model.scoring import Weights
 
 MAX_REPLICAS = 16
@@ -390,7 +390,7 @@ class FallbackSpec:
     """
 
     service: str = key(
-        Text("a service name", "write the name of a service on the robot", service_name),
+        Text("a service name", "write the name of a service on the robot", absolute_service_name),
         "Service of the same type that runs on the robot.",
         name="name",
     )

@@ -81,11 +81,6 @@ def is_field_name(name: str) -> bool:
     return bool(_FIELD.fullmatch(name))
 
 
-def service_name(written: str) -> str:
-    """Return a service's or topic's absolute name. Raises ValueError with what is wrong."""
-    return absolute_service_name(written)
-
-
 def service_type(written: str) -> str:
     """Return a service type's name as it is. Raises ValueError."""
     return _form(written, is_service_type(written))

@@ -29,9 +29,9 @@ from fogft.model.keys import DAY_S, Flag, Listed, Map, Maps, Number, OneOf, Tabl
 from fogft.model.middleware import Middleware, Speaks
 from fogft.model.names import endpoint
 from fogft.model.ros_names import (
+    absolute_service_name,
     field_name,
     field_path,
-    service_name,
     service_type,
     suggested_service_type,
 )
@@ -93,7 +93,7 @@ class ServiceSpec:
     """
 
     name: str = key(
-        Text("a service name", "write a name such as `/detect`", service_name),
+        Text("a service name", "write a name such as `/detect`", absolute_service_name),
         "Name of the service, on the robot and on the replicas; `detect` is `/detect`.",
         on_replica=True,
     )
@@ -158,7 +158,7 @@ class ServiceSpec:
         on_replica=True,
     )
     cancel: str = key(
-        Text("a service name", _service_hint("cancel"), service_name),
+        Text("a service name", _service_hint("cancel"), absolute_service_name),
         "Service (`std_srvs/srv/Trigger`) that cancels the request at work, called when the robot "
         "has its answer from elsewhere.",
         default="",

@@ -5,7 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fogft.model.keys import Map, Text, key
-from fogft.model.ros_names import field_path, service_name, service_type, suggested_service_type
+from fogft.model.ros_names import (
+    absolute_service_name,
+    field_path,
+    service_type,
+    suggested_service_type,
+)
 
 SNAPSHOT_TYPE = "nav_msgs/srv/GetMap"
 RESTORE_TYPE = "nav_msgs/srv/SetMap"
@@ -19,7 +24,7 @@ class StateService:
     """A service that carries a state."""
 
     name: str = key(
-        Text("a service name", "write a name such as `/svc/get_state`", service_name),
+        Text("a service name", "write a name such as `/svc/get_state`", absolute_service_name),
         "Name of the service.",
         on_replica=True,
     )

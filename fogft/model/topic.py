@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fogft.model.keys import DAY_S, Flag, Number, OneOf, Text, Whole, key
-from fogft.model.ros_names import action_type, message_type, service_name
+from fogft.model.ros_names import absolute_service_name, action_type, message_type
 
 PREFIX = "topic "  # of a topic's name on the wire, where it stands beside services
 DEPTH_LIMIT = 1000
@@ -43,7 +43,7 @@ class TopicSpec:
     """One proxied topic."""
 
     name: str = key(
-        Text("the name of a topic", "write a name such as `/topic`", service_name),
+        Text("the name of a topic", "write a name such as `/topic`", absolute_service_name),
         "Name of the topic, on the robot and on the replicas.",
         on_replica=True,
     )
@@ -106,7 +106,7 @@ class ActionSpec:
     """One proxied action: three services and two topics."""
 
     name: str = key(
-        Text("the name of an action", "write a name such as `/action`", service_name),
+        Text("the name of an action", "write a name such as `/action`", absolute_service_name),
         "Name of the action, on the robot and on the replicas.",
     )
     type: str = key(

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.model.cdr import Shape
+from fogft.model.cdr import NUMBER_BYTES, Shape
 from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
 
 _NAME = re.compile(
@@ -29,12 +29,6 @@ _NAME = re.compile(
 _MESSAGE = re.compile(
     r"[a-z][a-z0-9_]*/(msg/[A-Z][A-Za-z0-9]*|action/[A-Z][A-Za-z0-9]*_FeedbackMessage)"
 )
-_PRIMITIVE_BYTES = {
-    **dict.fromkeys(("boolean", "octet", "char", "uint8", "int8"), 1),
-    **dict.fromkeys(("uint16", "int16"), 2),
-    **dict.fromkeys(("uint32", "int32", "float"), 4),
-    **dict.fromkeys(("uint64", "int64", "double"), 8),
-}
 _XCDR1_HEADERS = (b"\x00\x00", b"\x00\x01")  # big and little endian
 
 
@@ -225,7 +219,7 @@ def fixed_offset(fields: dict[str, str], field: str) -> int | None:
     """Return where a field lies in every serialised message; None if that varies."""
     offset = 0
     for name, kind in fields.items():
-        size = _PRIMITIVE_BYTES.get(kind)
+        size = NUMBER_BYTES.get(kind)
         if size is None:
             return None
         offset += -offset % size
