@@ -39,7 +39,15 @@ def places(leftovers, tmp_path, monkeypatch):
 
 
 def sleeper(**environ: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(["sleep", "60"], env={**os.environ, **environ})
+    """Start a process that has this environment, and wait until the kernel shows it.
+
+    `Popen` returns while the kernel is still laying out the new program: until it has
+    done so, ``/proc/PID/environ`` is empty.
+    """
+    process = subprocess.Popen(["sleep", "60"], env={**os.environ, **environ})
+    while not Path(f"/proc/{process.pid}/environ").read_bytes():
+        assert process.poll() is None
+    return process
 
 
 def test_a_process_with_the_pools_home_is_found_until_it_ends(leftovers, tmp_path):
