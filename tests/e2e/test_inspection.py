@@ -95,7 +95,7 @@ def test_two_robots_get_every_place_once_though_replicas_are_killed(pool, etcd, 
         """Run the example's client again and again; return all places that it was told."""
         told = []
         while not ended.is_set():
-            client = [sys.executable, str(program), "--count", str(COUNT)]
+            client = [sys.executable, str(program), "--count", str(4 * COUNT)]
             said = subprocess.run(client, env=environ, stdout=subprocess.PIPE, check=True).stdout
             told += [tuple(json.loads(line)) for line in said.splitlines()]
         return told

@@ -23,7 +23,7 @@ environment.prepare(os.environ)
 TIMEOUT_S = 40.0
 # How long a caller waits: longer than the proxy, but where the proxy itself was killed.
 GIVE_UP_S, GIVE_UP_KILLED_S = 50.0, 3.0
-PACE_S = 0.02  # between an answer and the next question: what is seen needs no full processors
+PACE_S = 0.05  # between an answer and the next question: what is seen needs no full processors
 NODE = ROOT / "tests/proxy/nodes/stateful_node.py"
 _END = "type: nav_msgs/srv/{}Map, field: map.data"
 
