@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Mapping
@@ -77,7 +78,10 @@ def ci(tree):
     """A tree in which all that `.ci/run` calls passes and says so, and nothing is installed."""
     for name in ("check", "quickstart", "soak", "test-sky", "reproduce", "fuzz"):
         program(tree / "scripts" / name, f'#!/bin/sh\necho "{name} $*"\n')
-    program(tree / "scripts/test", '#!/bin/sh\necho "test with $FOGFT_MUST_RUN"\n')
+    program(
+        tree / "scripts/test",
+        '#!/bin/sh\necho "test on ${FOGFT_ROS:-jazzy} with $FOGFT_MUST_RUN"\n',
+    )
     (tree / "stubs").mkdir()
     tools = dict.fromkeys(("apt-get", "g++", "cmake", "ninja", "npm"), "exit 0")
     for name, text in {**tools, "ldconfig": "echo libEGL.so.1"}.items():
@@ -106,11 +110,12 @@ def test_ci_takes_every_step_and_fails_if_one_failed_or_did_not_run(ci, step, st
 
 
 def test_ci_asks_for_what_the_tests_can_need(ci):
-    """Each name is one of `tests/needs.py`."""
+    """On both distributions; each name is one of `tests/needs.py`."""
     said = run(ci, ".ci/run").stdout
-    [asked] = [line for line in said.splitlines() if line.startswith("test with")]
-    names = set(filter(None, asked.removeprefix("test with ").split(",")))
-    assert {"namespaces", "rclpy"} <= names <= set(NEEDS)
+    asked = dict(re.findall("^test on (.+) with (.*)$", said, re.MULTILINE))
+    names = {ros: set(filter(None, text.split(","))) for ros, text in asked.items()}
+    assert {"namespaces", "rclpy"} <= names["jazzy"] <= set(NEEDS)
+    assert {"rclpy", "test_msgs"} <= names["kilted"] <= set(NEEDS)
 
 
 def pip(tree: Path, text: str) -> None:
