@@ -54,6 +54,7 @@ def _queue_port_is_free() -> bool:
 
 NEEDS = {
     "apriltags": Need(_installed("pupil_apriltags"), "scripts/setup demo"),
+    "arm64": Need(lambda: "FOGFT_ARM64" in os.environ, "scripts/test-arm64"),
     "build": Need(_can_build, "scripts/setup ros-test, apt install g++ cmake ninja-build"),
     "colcon": Need(_installed("colcon_core"), "scripts/setup ros-test"),
     "cores": Need(lambda: len(os.sched_getaffinity(0)) > 1, "a second processor"),

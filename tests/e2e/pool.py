@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -143,9 +143,18 @@ class Machine:
         role: Of the bundle that is issued for it.
         name: Of its holder.
         domain: Its ROS domain; None for the pool's.
+        python: The command that starts its Python.
     """
 
-    def __init__(self, pool: Pool, role: str, name: str, domain: int | None = None) -> None:
+    def __init__(
+        self,
+        pool: Pool,
+        role: str,
+        name: str,
+        domain: int | None = None,
+        python: Sequence[str] = (sys.executable,),
+    ) -> None:
+        self._fogft = [*python, "-m", "fogft"]
         self.environ = {**pool.environ, "FOGFT_HOME": str(pool.folder / name)}
         if domain is not None:
             self.environ["ROS_DOMAIN_ID"] = str(domain)
@@ -155,7 +164,7 @@ class Machine:
         given = ("--passphrase-file", str(secret))
         bundle = pool.fogft("credentials", "issue", role, name, *given).strip()
         joined = subprocess.run(
-            [sys.executable, "-m", "fogft", "join", bundle, *given],
+            [*self._fogft, "join", bundle, *given],
             env=self.environ, cwd=pool.folder, capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert joined.returncode == 0, joined.stderr
@@ -173,7 +182,7 @@ class Machine:
         """Start what the bundle was for."""
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "fogft", self.command, "--config", str(self.config)],
+                [*self._fogft, self.command, "--config", str(self.config)],
                 env=self.environ, cwd=self._folder, stdout=log, stderr=log,
             )  # fmt: skip
 

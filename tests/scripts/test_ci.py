@@ -76,7 +76,7 @@ def test_an_unknown_option_is_wrong_usage(tree):
 @pytest.fixture
 def ci(tree):
     """A tree in which all that `.ci/run` calls passes and says so, and nothing is installed."""
-    for name in ("check", "quickstart", "soak", "test-sky", "reproduce", "fuzz"):
+    for name in ("check", "quickstart", "soak", "test-sky", "test-arm64", "reproduce", "fuzz"):
         program(tree / "scripts" / name, f'#!/bin/sh\necho "{name} $*"\n')
     program(
         tree / "scripts/test",
@@ -129,6 +129,7 @@ def test_at_night_all_that_the_machine_can_do_is_run(ci):
     assert done.returncode == 0, done.stderr
     assert "reproduce --quick\n" in done.stdout
     assert "fuzz" in done.stdout
+    assert "test-arm64" in done.stdout
     modes = ("", "--adapter", "--alone", "--container", "--contract")
     assert all(f"test-sky {mode}\n" in done.stdout for mode in modes)
     assert "not run" not in done.stderr
