@@ -1,4 +1,4 @@
-"""SkyPilot in memory: it keeps `sdk.Sky`'s surface and does what a test tells it to.
+"""SkyPilot in memory: it keeps `installed.InstalledSky`'s surface and does what a test tells it to.
 
 Launches stay under way until `finish`, `fail` or `cancel`. A machine can exist without a
 record of SkyPilot's (`machines` of the fake provider), as after its database was lost.
@@ -19,7 +19,6 @@ from fogft.cloud.sky.sdk import (
     JobState,
     RefusedError,
     Request,
-    RequestState,
 )
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Offer, Placement, ReplicaId
@@ -77,7 +76,7 @@ class ScriptedProvider:
 
 
 class ScriptedSky:
-    """See the module. Implements `fogft.cloud.sky.sdk.Sky`."""
+    """See the module. Has the surface of `InstalledSky`."""
 
     def __init__(self, provider: ScriptedProvider | None = None, *, boots: bool = False) -> None:
         self.provider = provider or ScriptedProvider()
@@ -101,7 +100,7 @@ class ScriptedSky:
 
     def launch(self, task: Mapping[str, Any], name: str) -> str:
         self._meet("launch", name)
-        request = Request(f"r{next(self._counter)}", RequestState.ACTIVE)
+        request = Request(f"r{next(self._counter)}", active=True)
         self.launched.append(_Launch(request, name, task))
         self._meet("launch-heard", name)
         return request.id
@@ -114,7 +113,7 @@ class ScriptedSky:
         self._meet("request", id)
         for one in self.launched:
             if one.request.id == id:
-                if self.boots and one.request.state is RequestState.ACTIVE:
+                if self.boots and one.request.active:
                     if one.task["resources"]["infra"] in self.full:
                         self.fail(one.name, "ResourcesUnavailableError", "no spot capacity")
                     else:
@@ -132,8 +131,8 @@ class ScriptedSky:
     def cancel(self, id: str) -> None:
         self._meet("cancel", id)
         for one in self.launched:
-            if one.request.id == id and one.request.state is RequestState.ACTIVE:
-                one.request = replace(one.request, state=RequestState.CANCELLED)
+            if one.request.id == id and one.request.active:
+                one.request = replace(one.request, active=False)
                 one.error = RefusedError("RequestCancelled", ["cancelled"])
 
     def clusters(self, name: str | None, *, refresh: bool) -> Sequence[Cluster]:
@@ -209,12 +208,12 @@ class ScriptedSky:
         self.records[name] = replace(self.records[name], state=ClusterState.UP, progress="")
         self.jobs[name] = job
         one = self._of(name)
-        one.request = replace(one.request, state=RequestState.SUCCEEDED)
+        one.request = replace(one.request, active=False)
 
     def fail(self, name: str, kind: str, *texts: str) -> None:
         """Let a launch fail; a machine that booted runs on, as with SkyPilot."""
         one = self._of(name)
-        one.request = replace(one.request, state=RequestState.FAILED)
+        one.request = replace(one.request, active=False)
         one.error = RefusedError(kind, texts)
 
     def preempt(self, name: str) -> None:

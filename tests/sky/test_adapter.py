@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from fogft.cloud.sky import naming
-from fogft.cloud.sky.following import DEFAULT_LIMITS, JOB_PAUSE_S
+from fogft.cloud.sky.following import ASK_LIMIT_S, JOB_PAUSE_S, LAUNCH_LIMIT_S
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
+from fogft.cloud.sky.task import SETUP_LIMIT_S
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
@@ -178,7 +179,7 @@ def test_a_launch_that_hangs_is_aborted_and_taken_down(scene: Scene):
     scene.cloud.launch(scene.order())
     scene.sky.boot(NAME)
     scene.work()
-    scene.pass_s(DEFAULT_LIMITS.launch_s)
+    scene.pass_s(LAUNCH_LIMIT_S)
     scene.work()
     machine = scene.machine()
     assert machine.failure.cause is Cause.TIMEOUT
@@ -226,10 +227,10 @@ def test_a_setup_that_hangs_ends_at_its_own_limit(scene: Scene):
     scene.cloud.launch(scene.order())
     scene.sky.finish(NAME, JobState.SETTING_UP)
     scene.work()
-    scene.pass_s(DEFAULT_LIMITS.launch_s)
+    scene.pass_s(LAUNCH_LIMIT_S)
     scene.work()
     assert scene.machine().phase is MachinePhase.RUNNING
-    scene.pass_s(DEFAULT_LIMITS.setup_s)
+    scene.pass_s(SETUP_LIMIT_S)
     scene.work()
     assert scene.machine().failure.cause is Cause.TIMEOUT
     assert not scene.provider.found
@@ -362,7 +363,7 @@ def test_an_order_that_was_never_heard_fails_after_a_while(scene: Scene):
         scene.cloud.launch(scene.order())
     scene.work()
     assert scene.machine().phase is MachinePhase.PROVISIONING
-    scene.pass_s(DEFAULT_LIMITS.ask_s)
+    scene.pass_s(ASK_LIMIT_S)
     scene.work()
     assert scene.machine().failure == Reason(
         Cause.ERROR, words="SkyPilot never heard of this launch"
@@ -571,7 +572,7 @@ def test_a_process_killed_before_skypilot_heard_leaves_a_failed_launch_not_a_los
         scene.cloud.launch(scene.order())
     scene.cloud = scene.another_process()
     assert scene.machine().phase is MachinePhase.PROVISIONING
-    scene.pass_s(DEFAULT_LIMITS.ask_s)
+    scene.pass_s(ASK_LIMIT_S)
     scene.work()
     assert scene.machine().phase is MachinePhase.FAILED
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from fogft import template_files
 from fogft.cloud.sky import guard
-from fogft.cloud.sky.following import DEFAULT_LIMITS
+from fogft.cloud.sky.following import LAUNCH_LIMIT_S
+from fogft.cloud.sky.task import SETUP_LIMIT_S
 
 LIMIT_S = 60.0
 
@@ -90,4 +91,4 @@ def test_its_command_returns_at_once_and_is_plain_text_for_every_reader(tmp_path
 
 
 def test_its_limit_is_longer_than_a_launch_and_a_set_up_may_take():
-    assert DEFAULT_LIMITS.launch_s + DEFAULT_LIMITS.setup_s <= guard.ALONE_MINUTES * 60
+    assert LAUNCH_LIMIT_S + SETUP_LIMIT_S <= guard.ALONE_MINUTES * 60

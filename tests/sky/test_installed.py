@@ -20,22 +20,21 @@ import pytest
 
 from fogft.cloud.sky import answers, guard, task
 from fogft.cloud.sky.installed import InstalledSky
-from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
+from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.errors import CloudUnreachable
 from fogft.model.replica import Placement
 from tests.needs import needs
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, ScriptedSky
 
-SURFACE = [name for name in vars(Sky) if not name.startswith("_")]
+SURFACE = [name for name, member in vars(InstalledSky).items() if inspect.isfunction(member)]
 
 
-@pytest.mark.parametrize("name", SURFACE)
-@pytest.mark.parametrize("implementation", [InstalledSky, ScriptedSky])
-def test_both_implementations_have_the_surface(name: str, implementation: type):
+@pytest.mark.parametrize("name", [name for name in SURFACE if not name.startswith("_")])
+def test_the_scripted_sky_has_the_surface_of_the_installed_one(name: str):
     """Same names, same parameters, in the same order."""
-    expected = inspect.signature(getattr(Sky, name)).parameters.values()
-    found = inspect.signature(getattr(implementation, name)).parameters.values()
+    expected = inspect.signature(getattr(InstalledSky, name)).parameters.values()
+    found = inspect.signature(getattr(ScriptedSky, name)).parameters.values()
     assert [(p.name, p.kind, p.default) for p in found] == [
         (p.name, p.kind, p.default) for p in expected
     ]
@@ -130,7 +129,7 @@ def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any,
     sdk.launch.return_value = "r1"
     assert installed.launch({"run": "true"}, "c") == "r1"
     sdk.api_status.return_value = [payload(), payload(name="sky.status"), payload(cluster_name="d")]
-    assert [r.state for r in installed.launches("c")] == [RequestState.ACTIVE]
+    assert [r.active for r in installed.launches("c")] == [True]
     assert installed.request("r1") is not None
     assert installed.request("r2") is None
     sdk.get.return_value = (3, None)

@@ -19,18 +19,21 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fogft import child, disk, logfile
 from fogft.cloud.local import faults, guard, processes, task_commands
 from fogft.cloud.local.ending import sweep_shared_memory
 from fogft.cloud.local.folder import LINK, LOCK, NOTICE, MachineFolder, Record, State
-from fogft.cloud.local.relay import Relay
 from fogft.cloud.local.reservations import Reservation, reserve_domain, reserve_port
 from fogft.errors import FogftError, StateError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from fogft.process import ENDING_SIGNALS, start_log
 from fogft.reason_words import words
+
+if TYPE_CHECKING:
+    from fogft.cloud.local.relay import Relay
 
 log = logging.getLogger("fogft.machine")
 
@@ -174,6 +177,8 @@ class Machine:
         pid = self._start_server(workdir, domain, port)
         endpoint = f"127.0.0.1:{port.number}"
         if self._record.relay:
+            from fogft.cloud.local.relay import Relay  # late: it loads asyncio
+
             self._relay = Relay(("127.0.0.1", port.number))
             endpoint = self._relay.endpoint
         running = State(

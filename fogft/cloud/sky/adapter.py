@@ -18,13 +18,14 @@ from fogft.cloud.sky import listing, task, wheel
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.failures import classify
-from fogft.cloud.sky.following import DEFAULT_LIMITS, UNDER_WAY, Following, Limits
-from fogft.cloud.sky.journal import Entry, Journal, Stage
+from fogft.cloud.sky.following import Following
+from fogft.cloud.sky.installed import InstalledSky
+from fogft.cloud.sky.journal import ON_THE_MACHINE, UNDER_WAY, Entry, Journal, Stage
 from fogft.cloud.sky.naming import OWNER, cluster_name, label_value, replica_of
 from fogft.cloud.sky.presence import Presence
 from fogft.cloud.sky.prices import Prices
 from fogft.cloud.sky.provider import Provider
-from fogft.cloud.sky.sdk import RefusedError, Sky
+from fogft.cloud.sky.sdk import RefusedError
 from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
 from fogft.disk import write_whole
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
@@ -33,27 +34,23 @@ from fogft.model.replica import Machine, Offer, ReplicaId
 
 log = logging.getLogger(__name__)
 
-_ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
 _LOG_LINES = 1000
 
 
-def on_thread(run: Callable[[], None]) -> None:
-    """Run a function on a thread that does not keep the process alive."""
+def _on_thread(run: Callable[[], None]) -> None:
     threading.Thread(target=run, name="sky", daemon=True).start()
 
 
-def each_second(step: Callable[[], bool]) -> None:
-    """Call a function each second, on a thread of its own, until it returns False."""
-
+def _each_second(step: Callable[[], bool]) -> None:
     def run() -> None:
         while step():
             time.sleep(1.0)
 
-    threading.Thread(target=run, name="sky-follow", daemon=True).start()
+    _on_thread(run)
 
 
 class SkyCloud:
-    """Real clouds. Implements `fogft.cloud.port.Cloud` and `Refreshing`.
+    """Real clouds. Implements all of `fogft.cloud.port`.
 
     Args:
         folder: Where it remembers its launches, for all pools of this user.
@@ -65,26 +62,22 @@ class SkyCloud:
         submit: Runs a function on another thread.
         repeat: Calls a function every so often on another thread, until it returns False.
         sleep: Waits some seconds.
-        limits: When a launch hangs.
         make_wheel: Puts fogft's wheel into a folder below the one given, and returns that.
-        port: Where server proxies listen.
     """
 
     def __init__(
         self,
         folder: Path,
-        sky: Sky,
+        sky: InstalledSky,
         providers: Sequence[Provider] = (),
         *,
         owner: str,
         base: Path,
         clock: Callable[[], float] = time.time,
-        submit: Callable[[Callable[[], None]], object] = on_thread,
-        repeat: Callable[[Callable[[], bool]], object] = each_second,
+        submit: Callable[[Callable[[], None]], object] = _on_thread,
+        repeat: Callable[[Callable[[], bool]], object] = _each_second,
         sleep: Callable[[float], object] = time.sleep,
-        limits: Limits = DEFAULT_LIMITS,
         make_wheel: Callable[[Path], Path] = wheel.make,
-        port: int = task.LINK_PORT,
     ) -> None:
         self._folder = folder
         self._sky = sky
@@ -93,21 +86,13 @@ class SkyCloud:
         self._clock = clock
         self._repeat = repeat
         self._make_wheel = make_wheel
-        self._port = port
         by_name = {provider.cloud: provider for provider in providers}
         self.journal = Journal(folder / "launches")
         self._census = Census(by_name, clock, submit)
-        self._presence = Presence(
-            sky, self.journal, self._census, clock=clock, submit=submit, port=port
-        )
-        self._ending = Ending(sky, self.journal, by_name, sleep=sleep, clock=clock)
+        self._presence = Presence(sky, self.journal, self._census, clock, submit)
+        self._ending = Ending(sky, self.journal, by_name, sleep, clock)
         self._following = Following(
-            sky,
-            self.journal,
-            self._ending,
-            clock=clock,
-            on_move=self._presence.forget,
-            limits=limits,
+            sky, self.journal, self._ending, clock, on_move=self._presence.forget
         )
         self._prices = Prices(sky, by_name, clock, submit)
         self._lock = threading.Lock()
@@ -144,7 +129,6 @@ class SkyCloud:
             wheel=self._make_wheel(self._folder / "wheels"),
             owner=self._owner,
             base=self._base,
-            port=self._port,
         )
         begun = Entry(order.id, order.placement, order.usd_per_hour, order.spec_hash, self._clock())
         if not self.journal.open(begun, order.files):
@@ -178,7 +162,7 @@ class SkyCloud:
         entry = self.journal.get(id)
         name = cluster_name(id)
         told = ""
-        if entry is None or entry.stage in _ON_THE_MACHINE:
+        if entry is None or entry.stage in ON_THE_MACHINE:
             told = self._sky.job_log(name, entry.job if entry else None, _LOG_LINES)
         if not told and entry is not None:
             told = self._sky.provision_log(name, _LOG_LINES)
@@ -190,34 +174,19 @@ class SkyCloud:
     # -- beyond the port --------------------------------------------------------------------
 
     def refresh(self, id: ReplicaId) -> None:
-        """Ask the cloud about one machine, so that `machines` is true of it: a second or two.
-
-        For a replica that stopped to answer: SkyPilot's memory of it may be old. The provider
-        is asked where it can be, since SkyPilot's own refresh waits its turn behind others.
-
-        Raises:
-            CloudUnreachable: It cannot tell.
-        """
+        """See `Refreshing`. The provider is asked where it can be: SkyPilot's own refresh waits."""
         self._presence.refresh(id)
 
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
-        """Test credentials: cloud -> empty, or what is wrong and what to do about it.
-
-        Raises:
-            CloudUnreachable: SkyPilot does not answer.
-        """
+        """See `Accounts`."""
         return self._sky.check(clouds)
 
     def check_task(self, task: Mapping[str, Any]) -> None:
-        """Refuse what a pool decides itself, and what it cannot do.
-
-        Raises:
-            SpecError: Such a field is there; the message names its key.
-        """
+        """See `Accounts`."""
         refuse_what_cannot_be_honoured(task)
 
     def unverified(self, cloud: str) -> str:
-        """Return why what exists in a cloud is SkyPilot's word alone; empty when it is not."""
+        """See `Accounts`."""
         return self._census.unverified(cloud)
 
     def audit(self, pool_uid: str = "") -> Audit:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from fogft.cloud.sky.failures import plain
-from fogft.cloud.sky.sdk import Cluster, ClusterState, JobState, RefusedError, Request, RequestState
+from fogft.cloud.sky.sdk import Cluster, ClusterState, JobState, RefusedError, Request
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Placement
 
@@ -29,8 +29,6 @@ UNKNOWN = frozenset(
         *("HTTPError", "ChunkedEncodingError"),
     )
 )
-STATES = {"SUCCEEDED": RequestState.SUCCEEDED, "FAILED": RequestState.FAILED,
-           "CANCELLED": RequestState.CANCELLED}  # fmt: skip
 JOBS = {
     "INIT": JobState.PENDING, "PENDING": JobState.PENDING, "SETTING_UP": JobState.SETTING_UP,
     "RUNNING": JobState.RUNNING, "FAILED_SETUP": JobState.SETUP_FAILED,
@@ -108,8 +106,8 @@ def cluster_of(record: Any) -> Cluster:
 
 def request_of(payload: Any) -> Request:
     """Return a `RequestPayload` of SkyPilot's as our record."""
-    state = STATES.get(payload.status, RequestState.ACTIVE)
-    return Request(payload.request_id, state, plain(payload.status_msg or ""))
+    ended = payload.status in ("SUCCEEDED", "FAILED", "CANCELLED")
+    return Request(payload.request_id, active=not ended)
 
 
 def told_reasons(output: str) -> dict[str, str]:

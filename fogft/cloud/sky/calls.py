@@ -10,7 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import TypeVar
+from concurrent.futures import Future, wait
+from typing import Any, TypeVar
 
 from fogft.cloud.sky.answers import translated
 from fogft.errors import CloudUnreachable
@@ -23,7 +24,7 @@ class Calls:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._given_up: dict[str, threading.Thread] = {}
+        self._given_up: dict[str, Future[Any]] = {}
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
         """Run a call, for so long at most; turn its errors into ours.
@@ -37,36 +38,33 @@ class Calls:
             CloudUnreachable: No answer in time, or none that says anything.
             RefusedError: The answer is no.
         """
-        end = time.monotonic() + limit_s
+        ends_at = time.monotonic() + limit_s
         with self._lock:
-            before = self._given_up.get(subject)
-        if before is not None:
-            before.join(limit_s)
-        outcome: list[T] = []
-        errors: list[BaseException] = []
-
-        def run() -> None:
-            try:
-                outcome.append(call())
-            except BaseException as error:  # SystemExit too: SkyPilot's client uses it
-                errors.append(error)
-
-        thread = before
-        if before is None or not before.is_alive():
-            thread = threading.Thread(target=run, name="sky-call", daemon=True)
-            thread.start()
-            thread.join(max(0.0, end - time.monotonic()))
-        assert thread is not None
+            running = self._given_up.get(subject)
+        if running is not None:
+            wait([running], limit_s)
+        if running is None or running.done():
+            running = Future()
+            threading.Thread(target=_run, args=(call, running), daemon=True).start()
+            wait([running], max(0.0, ends_at - time.monotonic()))
+            if running.done():
+                with self._lock:
+                    self._given_up.pop(subject, None)
+                error = running.exception()
+                if error is not None:
+                    raise translated(error, subject) from error
+                answer: T = running.result()
+                return answer
         with self._lock:
-            if thread.is_alive():
-                self._given_up[subject] = thread
-            else:
-                self._given_up.pop(subject, None)
-        if outcome:
-            return outcome[0]
-        if errors:
-            raise translated(errors[0], subject) from errors[0]
+            self._given_up[subject] = running
         raise CloudUnreachable(
             f"SkyPilot did not answer within {limit_s:.0f} s about {subject}",
             "`sky api info` and `sky api logs` tell how its API server is doing",
         )
+
+
+def _run(call: Callable[[], T], outcome: Future[T]) -> None:
+    try:
+        outcome.set_result(call())
+    except BaseException as error:  # SystemExit too: SkyPilot's client uses it
+        outcome.set_exception(error)

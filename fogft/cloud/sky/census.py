@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 from fogft.cloud.sky.journal import Entry
 from fogft.cloud.sky.provider import Instance, NotAllowedError, Provider
@@ -21,26 +22,17 @@ EVERY_S = 60.0
 NOBODY = "0" * 16  # a pool that does not exist: may one ask at all?
 
 
+@dataclass
 class Census:
-    """The machines that providers list with our labels.
+    """The machines that providers list with our labels; `submit` runs a function elsewhere."""
 
-    Args:
-        providers: Clouds that can be asked directly, by name.
-        clock: Seconds since the epoch.
-        submit: Runs a function on another thread.
-    """
+    providers: Mapping[str, Provider]
+    clock: Callable[[], float]
+    submit: Callable[[Callable[[], None]], object]
 
-    def __init__(
-        self,
-        providers: Mapping[str, Provider],
-        clock: Callable[[], float],
-        submit: Callable[[Callable[[], None]], object],
-    ) -> None:
-        self._providers = providers
-        self._clock = clock
-        self._submit = submit
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
-        self._found: dict[str, tuple[Instance, ...]] = {}
+        self._found: dict[str, Sequence[Instance]] = {}
         self._begun_at: dict[str, float] = {}
         self._refused: dict[str, str] = {}
 
@@ -52,33 +44,31 @@ class Census:
         Raises:
             CloudUnreachable: The provider could be asked, and did not answer.
         """
-        provider = self._providers.get(entry.placement.cloud)
+        provider = self.providers.get(entry.placement.cloud)
         if provider is None:
             return None
         found = self._ask(provider, [entry.placement.region], entry.id.pool_uid)
-        return next((instance for instance in found if instance.id == entry.id), None)
+        return next((i for i in found if i.id == entry.id), None)
 
     def vouches(self, cloud: str) -> bool:
         """Whether a cloud's own list can be had, as far as is known."""
-        return cloud in self._providers and cloud not in self._refused
+        return cloud in self.providers and cloud not in self._refused
 
     def latest(self, pool_uid: str, regions: Mapping[str, Iterable[str]]) -> Sequence[Instance]:
         """Return what the last census of a pool found, and take another when it is old.
 
-        The first one looks everywhere, later ones where machines of the pool can be, if
-        that is known.
+        The first one looks everywhere, later ones where machines of the pool can be, if known.
         """
-        now = self._clock()
+        now = self.clock()
         with self._lock:
             begun_at = self._begun_at.get(pool_uid)
             due = begun_at is None or now - begun_at >= EVERY_S
             if due:
                 self._begun_at[pool_uid] = now
             found = self._found.get(pool_uid, ())
-        if due and self._providers:
-            everywhere = begun_at is None
-            where = {cloud: sorted(names) for cloud, names in regions.items()}
-            self._submit(lambda: self._take(pool_uid, None if everywhere else where))
+        if due and self.providers:
+            where = None if begun_at is None else regions
+            self.submit(lambda: self._take(pool_uid, where))
         return found
 
     def everywhere(self, pool_uid: str) -> tuple[Sequence[Instance], frozenset[str]]:
@@ -89,18 +79,18 @@ class Census:
         Raises:
             CloudUnreachable: A provider did not answer.
         """
-        found = [i for p in self._providers.values() for i in self._ask(p, None, pool_uid)]
-        return found, frozenset(cloud for cloud in self._providers if self.vouches(cloud))
+        found = [i for p in self.providers.values() for i in self._ask(p, None, pool_uid)]
+        return found, frozenset(cloud for cloud in self.providers if self.vouches(cloud))
 
     def forget(self, id: ReplicaId) -> None:
         """Take a replica that is known to be gone out of the last census."""
         with self._lock:
             kept = self._found.get(id.pool_uid, ())
-            self._found[id.pool_uid] = tuple(i for i in kept if i.id != id)
+            self._found[id.pool_uid] = [i for i in kept if i.id != id]
 
     def unverified(self, cloud: str) -> str:
         """Return why a cloud's own list cannot be had; empty when it can. Asks for it: seconds."""
-        provider = self._providers.get(cloud)
+        provider = self.providers.get(cloud)
         if provider is None:
             return (
                 f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word, and a "
@@ -114,17 +104,16 @@ class Census:
         reason = self._refused.get(cloud, "")
         return f"{reason}; what exists in `{cloud}` is SkyPilot's word" if reason else ""
 
-    def _take(self, pool_uid: str, regions: Mapping[str, Sequence[str]] | None) -> None:
+    def _take(self, pool_uid: str, regions: Mapping[str, Iterable[str]] | None) -> None:
         found: list[Instance] = []
-        for cloud, provider in self._providers.items():
+        for cloud, provider in self.providers.items():
             try:
-                where = None if regions is None else regions.get(cloud)
-                found += self._ask(provider, where, pool_uid)
+                found += self._ask(provider, (regions or {}).get(cloud), pool_uid)
             except CloudUnreachable as error:
                 log.warning("census_failed cloud=%s reason=%r", cloud, error.message)
                 return
         with self._lock:
-            self._found[pool_uid] = tuple(found)
+            self._found[pool_uid] = found
 
     def _ask(
         self, provider: Provider, regions: Iterable[str] | None, pool_uid: str

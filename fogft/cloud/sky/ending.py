@@ -11,12 +11,14 @@ Not here: which replicas shall end (`fogft.planning.planner`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
+from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import Journal
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.provider import Instance, NotAllowedError, Provider
-from fogft.cloud.sky.sdk import RefusedError, RequestState, Sky
+from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import ReplicaId
 
@@ -25,55 +27,37 @@ log = logging.getLogger(__name__)
 _TRIES = 5
 _PAUSE_S = 3.0
 _LIMIT_S = 300.0  # no further try after that
-_HEARD_WITHIN_S = 180.0  # as `following.Limits.ask_s`
+_HEARD_WITHIN_S = 180.0  # as `following.ASK_LIMIT_S`
 
 
+@dataclass
 class Ending:
-    """Ends replicas, and makes sure that they are gone.
+    """Ends replicas, and makes sure that they are gone."""
 
-    Args:
-        sky: SkyPilot.
-        journal: What was launched.
-        providers: Clouds that can be asked directly, by name.
-        sleep: Waits some seconds.
-        clock: Seconds since the epoch.
-    """
-
-    def __init__(
-        self,
-        sky: Sky,
-        journal: Journal,
-        providers: Mapping[str, Provider],
-        *,
-        sleep: Callable[[float], object],
-        clock: Callable[[], float],
-    ) -> None:
-        self._sky = sky
-        self._journal = journal
-        self._providers = providers
-        self._sleep = sleep
-        self._clock = clock
+    sky: InstalledSky
+    journal: Journal
+    providers: Mapping[str, Provider]
+    sleep: Callable[[float], object]
+    clock: Callable[[], float]
 
     def end(self, id: ReplicaId) -> None:
-        """End a replica's machine; return when nothing of it is left. Repeatable.
-
-        The journal's entry stays, for whoever wants to know why.
+        """End a replica's machine; return when nothing of it is left. The journal's entry stays.
 
         Raises:
             CloudUnreachable: Something may still run; the hint says how to look.
         """
         name = cluster_name(id)
         trouble: Exception | None = None
-        begun_at = self._clock()
+        begun_at = self.clock()
         quiet, enough = 0, self._looks_needed(id)
         for attempt in range(_TRIES + enough - 1):
-            if attempt and self._clock() - begun_at > _LIMIT_S:
+            if attempt and self.clock() - begun_at > _LIMIT_S:
                 break
             if attempt:
-                self._sleep(_PAUSE_S)
+                self.sleep(_PAUSE_S)
             try:
                 self._abort_launches(name)
-                self._sky.down(name)
+                self.sky.down(name)
                 left = self._left(id, name)
             except (CloudUnreachable, RefusedError) as error:
                 trouble = error
@@ -95,45 +79,43 @@ class Ending:
         Whoever ordered may have been killed before SkyPilot's answer came, and SkyPilot may
         hear of the order only after our first look.
         """
-        entry = self._journal.get(id)
+        entry = self.journal.get(id)
         on_its_way = entry is not None and not entry.request
-        young = entry is not None and self._clock() - entry.launched_at < _HEARD_WITHIN_S
+        young = entry is not None and self.clock() - entry.launched_at < _HEARD_WITHIN_S
         return 2 if on_its_way and young else 1
 
     def _abort_launches(self, name: str) -> None:
-        for request in self._sky.launches(name):
-            if request.state is RequestState.ACTIVE:
-                self._sky.cancel(request.id)
+        for request in self.sky.launches(name):
+            if request.active:
+                self.sky.cancel(request.id)
 
     def _left(self, id: ReplicaId, name: str) -> list[str]:
         """Return what still exists; ask the provider to end what SkyPilot did not."""
         instances = self._instances(id)
         # The provider knows best; SkyPilot's own look at the cloud waits behind its other requests.
-        clusters = self._sky.clusters(name, refresh=instances is None)
+        clusters = self.sky.clusters(name, refresh=instances is None)
         left = [f"cluster {c.name} ({c.state.value})" for c in clusters if c.name == name]
         for instance in instances or ():
             left.append(f"{instance.placement.cloud} instance {instance.key}")
             try:
-                self._providers[instance.placement.cloud].terminate([instance])
+                self.providers[instance.placement.cloud].terminate([instance])
             except NotAllowedError as error:
                 raise CloudUnreachable(f"{instance.key} may not be ended: {error}") from error
         return left
 
     def _instances(self, id: ReplicaId) -> list[Instance] | None:
         """Return a replica's machines by the provider; None where SkyPilot's word has to do."""
-        entry = self._journal.get(id)
-        asked = list(self._providers)
+        entry = self.journal.get(id)
+        asked = list(self.providers)
         if entry is not None:
             asked = [cloud for cloud in asked if cloud == entry.placement.cloud]
         out: list[Instance] = []
         sure = entry is not None and bool(asked)  # else it may be where nobody can be asked
         for cloud in asked:
-            provider = self._providers[cloud]
+            provider = self.providers[cloud]
             regions = None if entry is None else [entry.placement.region]
             try:
-                found: Sequence[Instance] = provider.instances(regions, id.pool_uid)
+                out += [i for i in provider.instances(regions, id.pool_uid) if i.id == id]
             except NotAllowedError:
                 sure = False
-            else:
-                out += [instance for instance in found if instance.id == id]
         return out if sure or out else None

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 
 from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.failures import classify, tail
-from fogft.cloud.sky.journal import Entry, Journal, Stage
+from fogft.cloud.sky.installed import InstalledSky
+from fogft.cloud.sky.journal import UNDER_WAY, Entry, Journal, Stage
 from fogft.cloud.sky.naming import cluster_name
-from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, RequestState, Sky
+from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.cloud.sky.task import SETUP_LIMIT_S
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.reason import Cause, Reason
@@ -34,55 +35,23 @@ on the machine over ssh, in one of its few workers, and holds up whoever wants s
 same machine: it takes some ten seconds of processor time. So nobody asks before `setup` can have
 ended, and the pause grows with the time that an answer takes."""
 
-UNDER_WAY = frozenset({Stage.ASKING, Stage.LAUNCHING, Stage.SETTING_UP})
+ASK_LIMIT_S = 180.0
+"""Until SkyPilot has accepted the order; then it is known that it never will."""
+LAUNCH_LIMIT_S = 900.0
+"""From the order to the running machine; `SETUP_LIMIT_S` is from the order to the running job."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    """How long each stage of a launch may take, in seconds.
-
-    Attributes:
-        ask_s: Until SkyPilot has accepted the order; then it is known that it never will.
-        launch_s: From the order to the running machine.
-        setup_s: From the order to the running job.
-    """
-
-    ask_s: float = 180.0
-    launch_s: float = 900.0
-    setup_s: float = SETUP_LIMIT_S
-
-
-DEFAULT_LIMITS = Limits()
-
-
+@dataclass
 class Following:
-    """Takes the next step of each launch.
+    """Takes the next step of each launch; `on_move` is called when one has moved on."""
 
-    Args:
-        sky: SkyPilot.
-        journal: Where each launch stands.
-        ending: Takes down what failed.
-        clock: Seconds since the epoch.
-        on_move: Called when a launch has moved on.
-        limits: When a launch hangs.
-    """
+    sky: InstalledSky
+    journal: Journal
+    ending: Ending
+    clock: Callable[[], float]
+    on_move: Callable[[], None]
 
-    def __init__(
-        self,
-        sky: Sky,
-        journal: Journal,
-        ending: Ending,
-        *,
-        clock: Callable[[], float],
-        on_move: Callable[[], None] = lambda: None,
-        limits: Limits = DEFAULT_LIMITS,
-    ) -> None:
-        self._sky = sky
-        self._journal = journal
-        self._ending = ending
-        self._clock = clock
-        self._on_move = on_move
-        self._limits = limits
+    def __post_init__(self) -> None:
         self._job_not_before: dict[ReplicaId, float] = {}
 
     def step(self, id: ReplicaId) -> bool:
@@ -91,38 +60,38 @@ class Following:
         Raises:
             CloudUnreachable: Nothing was learned; try again later.
         """
-        entry = self._journal.get(id)
+        entry = self.journal.get(id)
         if entry is None or entry.stage not in UNDER_WAY:
             return False
-        if self._age(entry) > self._limits.setup_s:
+        if self._age(entry) > SETUP_LIMIT_S:
             doing = "setting up" if entry.stage is Stage.SETTING_UP else "launching"
-            self._fail(entry, self._hung(entry, self._limits.setup_s, doing))
+            self._fail(entry, self._hung(entry, SETUP_LIMIT_S, doing))
         elif entry.stage is Stage.ASKING:
             self._asking(entry)
         elif entry.stage is Stage.LAUNCHING:
             self._launching(entry)
         else:
             self._setting_up(entry)
-        entry = self._journal.get(id)
+        entry = self.journal.get(id)
         return entry is not None and entry.stage in UNDER_WAY
 
     def _asking(self, entry: Entry) -> None:
-        requests = self._sky.launches(cluster_name(entry.id))
+        requests = self.sky.launches(cluster_name(entry.id))
         if requests:
             self._move(entry, stage=Stage.LAUNCHING, request=requests[-1].id)
-        elif self._age(entry) > self._limits.ask_s:
+        elif self._age(entry) > ASK_LIMIT_S:
             self._fail(entry, Reason(Cause.ERROR, words="SkyPilot never heard of this launch"))
 
     def _launching(self, entry: Entry) -> None:
-        request = self._sky.request(entry.request)
+        request = self.sky.request(entry.request)
         if request is None:
             self._lost(entry)
-        elif request.state is RequestState.ACTIVE:
-            if self._age(entry) > self._limits.launch_s:
-                self._fail(entry, self._hung(entry, self._limits.launch_s, "launching"))
+        elif request.active:
+            if self._age(entry) > LAUNCH_LIMIT_S:
+                self._fail(entry, self._hung(entry, LAUNCH_LIMIT_S, "launching"))
         else:
             try:
-                job = self._sky.launched_job(entry.request)
+                job = self.sky.launched_job(entry.request)
             except RefusedError as error:
                 self._fail(entry, self._refused(entry, error))
             else:
@@ -130,23 +99,23 @@ class Following:
 
     def _lost(self, entry: Entry) -> None:
         """SkyPilot lost the request (its database, or a server that was put in place of it)."""
-        clusters = self._sky.clusters(cluster_name(entry.id), refresh=True)
+        clusters = self.sky.clusters(cluster_name(entry.id), refresh=True)
         if any(c.state is ClusterState.UP for c in clusters):
             self._move(entry, stage=Stage.SETTING_UP)
         else:
             self._fail(entry, Reason(Cause.ERROR, words="SkyPilot lost this launch"))
 
     def _setting_up(self, entry: Entry) -> None:
-        asked_at = self._clock()
+        asked_at = self.clock()
         if asked_at < self._job_not_before.setdefault(entry.id, asked_at + JOB_PAUSE_S):
             return
         try:
-            job = self._sky.job(cluster_name(entry.id), entry.job)
+            job = self.sky.job(cluster_name(entry.id), entry.job)
         except RefusedError as error:  # the cluster is gone, or not up: its absence will tell
             log.info("job_unknown replica=%s reason=%r", entry.id.short, str(error))
             return
         finally:
-            now = self._clock()
+            now = self.clock()
             pause_s = max(JOB_PAUSE_S, 3 * (now - asked_at))
             self._job_not_before[entry.id] = now + pause_s
         if job is JobState.RUNNING:
@@ -164,9 +133,9 @@ class Following:
     def _fail(self, entry: Entry, failure: Reason) -> None:
         """Write the failure first: whatever happens while it is taken down, it stays known."""
         log.warning("launch_failed replica=%s reason=%r", entry.id.short, in_words(failure))
-        self._journal.update(entry.id, stage=Stage.FAILED, failure=failure)
+        self.journal.update(entry.id, stage=Stage.FAILED, failure=failure)
         try:
-            self._ending.end(entry.id)
+            self.ending.end(entry.id)
         except CloudError as error:  # it stays listed as failed until `terminate` has managed
             log.warning("end_failed replica=%s reason=%r", entry.id.short, str(error))
 
@@ -186,21 +155,21 @@ class Following:
         return Reason(Cause.TIMEOUT, words=words + (log_tail or self._provision_tail(entry)))
 
     def _job_tail(self, entry: Entry) -> str:
-        told = tail(self._sky.job_log(cluster_name(entry.id), entry.job, 30))
+        told = tail(self.sky.job_log(cluster_name(entry.id), entry.job, 30))
         return f"\n{told}" if told else ""
 
     def _provision_tail(self, entry: Entry) -> str:
         try:
-            told = tail(self._sky.provision_log(cluster_name(entry.id), 30))
+            told = tail(self.sky.provision_log(cluster_name(entry.id), 30))
         except CloudUnreachable:
             return ""
         return f"\n{told}" if told else ""
 
     def _move(self, entry: Entry, **changes: object) -> None:
-        moved = self._journal.update(entry.id, **changes)
+        moved = self.journal.update(entry.id, **changes)
         if moved is not None and moved.stage is not entry.stage:
             log.info("launch_moved replica=%s stage=%s", entry.id.short, moved.stage.value)
-            self._on_move()
+            self.on_move()
 
     def _age(self, entry: Entry) -> float:
-        return self._clock() - entry.launched_at
+        return self.clock() - entry.launched_at

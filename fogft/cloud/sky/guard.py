@@ -17,7 +17,7 @@ from fogft.cloud.sky.task import SETUP_LIMIT_S
 
 SETTING = ("aws", "post_provision_runcmd")
 ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60
-"""A launch takes 15 minutes at most (`following.Limits`), a set-up as long as its own limit."""
+"""A launch takes 15 minutes at most (`following.LAUNCH_LIMIT_S`), a set-up its own limit."""
 
 
 def command() -> str:

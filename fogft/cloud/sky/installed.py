@@ -1,4 +1,4 @@
-"""The installed SkyPilot behind `sdk.Sky`. The only module that imports `sky`, and only when used.
+"""The installed SkyPilot. The only module that imports `sky`, and only when used.
 
 Importing it takes 2 to 4 s, and the first call may start its API server (11 s, 0.6 GB); a
 server elsewhere is used by `SKYPILOT_API_SERVER_ENDPOINT` or ``sky api login``, as always.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import importlib
 import io
 import json
@@ -15,7 +16,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from fogft.cloud.sky import guard
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
@@ -24,7 +25,7 @@ from fogft.cloud.sky.sdk import Cluster, JobState, Request
 from fogft.errors import CloudError
 from fogft.model.replica import Offer, Placement
 
-T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 ASK_LIMIT_S = 30.0
 REFRESH_LIMIT_S = 60.0
@@ -36,69 +37,77 @@ DOWN_LIMIT_S = 300.0
 _ZONE_ID = re.compile(r"[a-z]{2,5}\d-[a-z]{2,4}\d")  # `use1-az1`: a zone whose name is not known
 
 
+def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
+    """Give a call a limit; `subject` says what it is about, with its arguments filled in."""
+
+    def decorate(call: F) -> F:
+        @functools.wraps(call)
+        def limited(self: InstalledSky, *args: Any) -> Any:
+            return self._calls.within(limit_s, subject.format(*args), lambda: call(self, *args))
+
+        return cast(F, limited)
+
+    return decorate
+
+
 class InstalledSky:
-    """The installed SkyPilot; see `fogft.cloud.sky.sdk.Sky`."""
+    """SkyPilot's public SDK, as far as fogft uses it. From any thread.
+
+    Every call has a limit, and ends in a value or in one of these errors, whatever SkyPilot, its
+    API server and the network do: `CloudUnreachable`, where nothing is known and nothing may be
+    concluded; `RefusedError`, where SkyPilot did the work and the answer is no.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.modules: tuple[Any, Any] | None = None
         self._calls = Calls()
 
+    @_limited(LAUNCH_LIMIT_S, "the launch of `{1}`")
     def launch(self, task: Mapping[str, Any], name: str) -> str:
-        """See `Sky`."""
+        """Order a cluster; return the request's id, long before the cluster runs."""
+        sky, sdk = self._sky()
+        with as_answer():
+            made = sky.Task.from_yaml_config(dict(task))
+        self._set_guard()
+        return str(sdk.launch(made, cluster_name=name))
 
-        def run() -> str:
-            sky, sdk = self._sky()
-            with as_answer():
-                made = sky.Task.from_yaml_config(dict(task))
-            self._set_guard()
-            return str(sdk.launch(made, cluster_name=name))
-
-        return self._within(LAUNCH_LIMIT_S, f"the launch of `{name}`", run)
-
+    @_limited(ASK_LIMIT_S, "the requests of `{0}`")
     def launches(self, name: str) -> Sequence[Request]:
-        """See `Sky`."""
-
-        def run() -> Sequence[Request]:
-            _, sdk = self._sky()
-            found = _asked(sdk, all_status=True, cluster_name=name)
-            found = [r for r in found if r.name == "sky.launch" and r.cluster_name == name]
-            return [request_of(r) for r in sorted(found, key=lambda r: r.created_at)]
-
-        return self._within(ASK_LIMIT_S, f"the requests of `{name}`", run)
-
-    def request(self, id: str) -> Request | None:
-        """See `Sky`."""
-
-        def run() -> Request | None:
-            _, sdk = self._sky()
-            found = _asked(sdk, request_ids=[id])
-            return next((request_of(r) for r in found if r.request_id == id), None)
-
-        return self._within(ASK_LIMIT_S, f"request {id}", run)
-
-    def launched_job(self, id: str) -> int | None:
-        """See `Sky`."""
-
-        def run() -> int | None:
-            _, sdk = self._sky()
-            with as_answer():
-                job, _ = sdk.get(id)
-            return None if job is None else int(job)
-
-        return self._within(ASK_LIMIT_S, f"the outcome of request {id}", run)
-
-    def cancel(self, id: str) -> None:
-        """See `Sky`."""
+        """List the launch requests of a cluster that the API server knows, oldest first."""
         _, sdk = self._sky()
-        self._within(
-            ASK_LIMIT_S,
-            f"the abort of request {id}",
-            lambda: sdk.get(sdk.api_cancel([id], silent=True)),
-        )
+        found = _asked(sdk, all_status=True, cluster_name=name)
+        found = [r for r in found if r.name == "sky.launch" and r.cluster_name == name]
+        return [request_of(r) for r in sorted(found, key=lambda r: r.created_at)]
+
+    @_limited(ASK_LIMIT_S, "request {0}")
+    def request(self, id: str) -> Request | None:
+        """Return how a request is doing; None when the API server does not know it."""
+        _, sdk = self._sky()
+        found = _asked(sdk, request_ids=[id])
+        return next((request_of(r) for r in found if r.request_id == id), None)
+
+    @_limited(ASK_LIMIT_S, "the outcome of request {0}")
+    def launched_job(self, id: str) -> int | None:
+        """Return the job's number of a launch request; refused if that failed or was cancelled."""
+        _, sdk = self._sky()
+        with as_answer():
+            job, _ = sdk.get(id)
+        return None if job is None else int(job)
+
+    @_limited(ASK_LIMIT_S, "the abort of request {0}")
+    def cancel(self, id: str) -> None:
+        """Abort a request; return when that is done. One that has ended is no error."""
+        _, sdk = self._sky()
+        sdk.get(sdk.api_cancel([id], silent=True))
 
     def clusters(self, name: str | None, *, refresh: bool) -> Sequence[Cluster]:
-        """See `Sky`."""
+        """List one cluster, or all of them.
+
+        Args:
+            name: The only one of interest; None for all.
+            refresh: Ask the clouds themselves (seconds), instead of SkyPilot's memory.
+        """
 
         def run() -> Sequence[Cluster]:
             sky, sdk = self._sky()
@@ -111,96 +120,78 @@ class InstalledSky:
 
         limit_s = REFRESH_LIMIT_S if refresh else ASK_LIMIT_S
         subject = f"cluster `{name}`" if name else "the list of clusters"
-        return self._within(limit_s, subject, run)
+        return self._calls.within(limit_s, subject, run)
 
+    @_limited(JOB_LIMIT_S, "the job of `{0}`")
     def job(self, name: str, number: int | None) -> JobState:
-        """See `Sky`."""
-
-        def run() -> JobState:
-            _, sdk = self._sky()
-            states = sdk.get(sdk.job_status(name, None if number is None else [number]))
-            state = next(iter(states.values()), None)
-            if state is None:
-                return JobState.MISSING
-            return JOBS.get(state.value, JobState.ENDED)
-
-        return self._within(JOB_LIMIT_S, f"the job of `{name}`", run)
+        """Return the state of a cluster's job, its last one if `number` is None."""
+        _, sdk = self._sky()
+        states = sdk.get(sdk.job_status(name, None if number is None else [number]))
+        state = next(iter(states.values()), None)
+        return JobState.MISSING if state is None else JOBS.get(state.value, JobState.ENDED)
 
     def job_log(self, name: str, number: int | None, lines: int) -> str:
-        """See `Sky`."""
+        """Return the end of a job's log; empty when there is none."""
         _, sdk = self._sky()
         return self._log(
             lambda out: sdk.tail_logs(name, number, follow=False, tail=lines, output_stream=out)
         )
 
     def provision_log(self, name: str, lines: int) -> str:
-        """See `Sky`."""
+        """Return the end of the log of a cluster's launch; empty when there is none."""
         _, sdk = self._sky()
         return self._log(
             lambda out: sdk.tail_provision_logs(name, follow=False, tail=lines, output_stream=out)
         )
 
+    @_limited(DOWN_LIMIT_S, "the end of `{0}`")
     def down(self, name: str) -> None:
-        """See `Sky`."""
+        """End a cluster; return when SkyPilot says that it is gone. Missing is no error."""
+        _, sdk = self._sky()
+        try:
+            sdk.get(sdk.down(name))
+        except Exception as error:
+            if type(error).__name__ != "ClusterDoesNotExist":
+                raise
 
-        def run() -> None:
-            _, sdk = self._sky()
-            try:
-                sdk.get(sdk.down(name))
-            except Exception as error:
-                if type(error).__name__ != "ClusterDoesNotExist":
-                    raise
-
-        self._within(DOWN_LIMIT_S, f"the end of `{name}`", run)
-
+    @_limited(REFRESH_LIMIT_S, "the catalogue of prices")
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """See `Sky`."""
+        """List what the catalogue sells for a `resources` section, cheapest first."""
+        sky, sdk = self._sky()
+        found: dict[Placement, float] = {}
+        with as_answer():
+            asked = sky.Resources.from_yaml_config(copy.deepcopy(dict(resources)))
+        for one in asked:
+            clouds = [one.cloud]
+            if one.cloud is None:
+                enabled = sdk.get(sdk.enabled_clouds())
+                clouds = [sky.CLOUD_REGISTRY.from_str(name) for name in enabled]
+            for cloud in clouds:
+                for place, price in _sold_by(cloud, one.copy(cloud=cloud)):
+                    found[place] = min(found.get(place, price), price)
+        fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in found}}
+        offers = [Offer(p, price, "catalogue", fetched[p.cloud]) for p, price in found.items()]
+        return sorted(offers, key=lambda o: (o.usd_per_hour, o.placement))
 
-        def run() -> Sequence[Offer]:
-            sky, sdk = self._sky()
-            found: dict[Placement, float] = {}
-            with as_answer():
-                asked = sky.Resources.from_yaml_config(copy.deepcopy(dict(resources)))
-            for one in asked:
-                clouds = [one.cloud]
-                if one.cloud is None:
-                    enabled = sdk.get(sdk.enabled_clouds())
-                    clouds = [sky.CLOUD_REGISTRY.from_str(name) for name in enabled]
-                for cloud in clouds:
-                    for offer in _offers_of(cloud, one.copy(cloud=cloud)):
-                        price = found.get(offer.placement, offer.usd_per_hour)
-                        found[offer.placement] = min(price, offer.usd_per_hour)
-            fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in found}}
-            offers = [
-                Offer(placement, price, "catalogue", fetched[placement.cloud])
-                for placement, price in found.items()
-            ]
-            return sorted(offers, key=lambda o: (o.usd_per_hour, o.placement))
-
-        return self._within(REFRESH_LIMIT_S, "the catalogue of prices", run)
-
+    @_limited(CHECK_LIMIT_S, "the check of credentials")
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
-        """See `Sky`."""
-
-        def run() -> Mapping[str, str]:
-            _, sdk = self._sky()
-            told = io.StringIO()
-            request = sdk.check(tuple(clouds) or None, verbose=False)
-            enabled = sdk.stream_and_get(request, output_stream=told)
-            usable = {
-                cloud.lower()
-                for workspace in enabled.values()
-                for cloud, capabilities in workspace.items()
-                if "compute" in capabilities
-            }
-            reasons = told_reasons(told.getvalue())
-            asked = {cloud.lower() for cloud in clouds} or usable | set(reasons)
-            return {
-                cloud: "" if cloud in usable else reasons.get(cloud, "SkyPilot may not use it")
-                for cloud in sorted(asked)
-            }
-
-        return self._within(CHECK_LIMIT_S, "the check of credentials", run)
+        """Test the credentials of clouds, all if none is named: cloud -> "" or what is wrong."""
+        _, sdk = self._sky()
+        told = io.StringIO()
+        request = sdk.check(tuple(clouds) or None, verbose=False)
+        enabled = sdk.stream_and_get(request, output_stream=told)
+        usable = {
+            cloud.lower()
+            for workspace in enabled.values()
+            for cloud, capabilities in workspace.items()
+            if "compute" in capabilities
+        }
+        reasons = told_reasons(told.getvalue())
+        asked = {cloud.lower() for cloud in clouds} or usable | set(reasons)
+        return {
+            cloud: "" if cloud in usable else reasons.get(cloud, "SkyPilot may not use it")
+            for cloud in sorted(asked)
+        }
 
     def _set_guard(self) -> None:
         """Have SkyPilot give every VM of ours the guard, after the user's own commands.
@@ -218,11 +209,8 @@ class InstalledSky:
     def _log(self, read: Callable[[io.StringIO], object]) -> str:
         out = io.StringIO()
         with contextlib.suppress(CloudError):  # a log that is missing must not hide the failure
-            self._within(JOB_LIMIT_S, f"log {id(out)}", lambda: read(out))
+            self._calls.within(JOB_LIMIT_S, f"log {id(out)}", lambda: read(out))
         return out.getvalue()
-
-    def _within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
-        return self._calls.within(limit_s, subject, call)
 
     def _sky(self) -> tuple[Any, Any]:
         with self._lock:
@@ -249,7 +237,7 @@ def _asked(sdk: Any, **filters: Any) -> list[Any]:
     return list(sdk.api_status(**filters))
 
 
-def _offers_of(cloud: Any, resources: Any) -> Iterator[Offer]:
+def _sold_by(cloud: Any, resources: Any) -> Iterator[tuple[Placement, float]]:
     for launchable in cloud.get_feasible_launchable_resources(
         resources, num_nodes=1
     ).resources_list:
@@ -261,18 +249,14 @@ def _offers_of(cloud: Any, resources: Any) -> Iterator[Offer]:
             zones = [zone.name for zone in region.zones or ()]
             for zone in zones or [None]:
                 named = None if zone is None or _ZONE_ID.fullmatch(zone) else zone
-                price = launchable.copy(region=region.name, zone=zone).get_cost(3600)
-                placement = Placement(
+                place = Placement(
                     str(cloud).lower(), region.name, named or "", instance, launchable.use_spot
                 )
-                yield Offer(placement, float(price))
+                yield place, float(launchable.copy(region=region.name, zone=zone).get_cost(3600))
 
 
 def _fetched_at(cloud: str) -> float:
-    """Return when SkyPilot last fetched a cloud's catalogue: seconds since the epoch, 0 unknown.
-
-    The file itself is some hours older than that.
-    """
+    """Return when SkyPilot last fetched a cloud's catalogue: seconds since the epoch, 0 unknown."""
     try:
         common = importlib.import_module("sky.catalog.common")
         return Path(common.get_catalog_path(f"{cloud}/vms.csv")).stat().st_mtime

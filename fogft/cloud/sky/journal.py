@@ -38,6 +38,8 @@ class Stage(str, Enum):
 
 
 _ORDER = list(Stage)
+UNDER_WAY = frozenset({Stage.ASKING, Stage.LAUNCHING, Stage.SETTING_UP})
+ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
 
 
 @dataclass(frozen=True)

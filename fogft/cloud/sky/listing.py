@@ -10,15 +10,14 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.journal import Entry, Stage
 from fogft.cloud.sky.provider import Instance
 from fogft.cloud.sky.sdk import Cluster, ClusterState
+from fogft.cloud.sky.task import LINK_PORT
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 
 NOWHERE = Placement("", "", "", "")
 
 
-def of_entry(
-    entry: Entry, cluster: Cluster | None, instance: Instance | None, port: int
-) -> Machine:
+def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -> Machine:
     """Return a machine that the journal knows; the others may say nothing of it."""
     phase = MachinePhase.PROVISIONING
     failure: Reason | None = None
@@ -45,7 +44,7 @@ def of_entry(
         placement=placement,
         phase=phase,
         launched_at=entry.launched_at,
-        endpoint=f"{ip}:{port}" if ip and phase is not MachinePhase.FAILED else None,
+        endpoint=f"{ip}:{LINK_PORT}" if ip and phase is not MachinePhase.FAILED else None,
         usd_per_hour=entry.usd_per_hour,
         spec_hash=entry.spec_hash,
         failure=failure,
@@ -53,7 +52,7 @@ def of_entry(
     )
 
 
-def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool, port: int) -> Machine:
+def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
     """Return a machine that SkyPilot lists and the journal has lost."""
     phase, failure = MachinePhase.FAILED, None
     if cluster.state is ClusterState.UP:
@@ -69,7 +68,7 @@ def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool, port: int) -
         placement=cluster.placement or NOWHERE,
         phase=phase,
         launched_at=cluster.launched_at,
-        endpoint=f"{cluster.head_ip}:{port}" if running else None,
+        endpoint=f"{cluster.head_ip}:{LINK_PORT}" if running else None,
         usd_per_hour=naming.usd_per_hour(cluster.labels),
         spec_hash=cluster.labels.get(naming.SPEC, ""),
         failure=failure,

@@ -8,14 +8,17 @@ Not here: what one machine looks like (`listing`).
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 from fogft.cloud.sky import listing
 from fogft.cloud.sky.census import Census
-from fogft.cloud.sky.journal import Entry, Journal, Stage
+from fogft.cloud.sky.installed import InstalledSky
+from fogft.cloud.sky.journal import ON_THE_MACHINE, Entry, Journal
 from fogft.cloud.sky.naming import cluster_name, replica_of
-from fogft.cloud.sky.sdk import Cluster, RequestState, Sky
+from fogft.cloud.sky.sdk import Cluster
 from fogft.errors import CloudError
 from fogft.model.replica import Machine, ReplicaId
 
@@ -24,39 +27,21 @@ log = logging.getLogger(__name__)
 CLUSTERS_FRESH_S = 5.0
 CLUSTERS_USABLE_S = 15.0  # so long nobody waits for a newer list, which is under way
 PROVIDER_SURE_AFTER_S = 60.0  # a provider's list may miss a machine in its first seconds
-_ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
 
 
+@dataclass
 class Presence:
-    """Lists the machines of a pool.
+    """Lists the machines of a pool; `submit` runs a function elsewhere."""
 
-    Args:
-        sky: SkyPilot.
-        journal: What was launched.
-        census: What the providers list.
-        clock: Seconds since the epoch.
-        submit: Runs a function on another thread.
-        port: Where server proxies listen.
-    """
+    sky: InstalledSky
+    journal: Journal
+    census: Census
+    clock: Callable[[], float]
+    submit: Callable[[Callable[[], None]], object]
 
-    def __init__(
-        self,
-        sky: Sky,
-        journal: Journal,
-        census: Census,
-        *,
-        clock: Callable[[], float],
-        submit: Callable[[Callable[[], None]], object],
-        port: int,
-    ) -> None:
-        self._sky = sky
-        self._journal = journal
-        self._census = census
-        self._clock = clock
-        self._submit = submit
-        self._port = port
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
-        self._listed: tuple[float, Sequence[Cluster]] | None = None
+        self._listed: tuple[float, Sequence[Cluster]] = (-math.inf, ())
         self._listing = False
         self._gone: set[ReplicaId] = set()
 
@@ -74,7 +59,7 @@ class Presence:
         """
         known = {entry.id: entry for entry in entries}
         clusters = self._clusters(pool_uid)
-        if any(e.stage in _ON_THE_MACHINE and e.id not in clusters for e in known.values()):
+        if any(e.stage in ON_THE_MACHINE and e.id not in clusters for e in known.values()):
             clusters = self._clusters(pool_uid, fresh=True)
         found: dict[ReplicaId, Machine] = {}
         for id, entry in known.items():
@@ -82,31 +67,31 @@ class Presence:
             if machine is not None:
                 found[id] = machine
         for id, cluster in clusters.items():
-            if id not in found and id not in self._gone and self._journal.get(id) is None:
+            if id not in found and id not in self._gone and self.journal.get(id) is None:
                 found[id] = self._of_cluster(id, cluster)
-        for instance in self._census.latest(pool_uid, regions):
-            if instance.id not in found and self._journal.get(instance.id) is None:
+        for instance in self.census.latest(pool_uid, regions):
+            if instance.id not in found and self.journal.get(instance.id) is None:
                 found[instance.id] = listing.of_instance(instance)
         return [found[id] for id in sorted(found)]
 
     def refresh(self, id: ReplicaId) -> None:
         """Ask the cloud about one machine. See `SkyCloud.refresh`."""
-        entry = self._journal.get(id)
-        if entry is not None and self._census.vouches(entry.placement.cloud):
-            gone = self._census.alive(entry) is None
-            sure = self._clock() - entry.launched_at > PROVIDER_SURE_AFTER_S or not gone
-            if sure and self._census.vouches(entry.placement.cloud):
-                if gone and entry.stage in _ON_THE_MACHINE:
+        entry = self.journal.get(id)
+        if entry is not None and self.census.vouches(entry.placement.cloud):
+            gone = self.census.alive(entry) is None
+            sure = self.clock() - entry.launched_at > PROVIDER_SURE_AFTER_S or not gone
+            if sure and self.census.vouches(entry.placement.cloud):
+                if gone and entry.stage in ON_THE_MACHINE:
                     self._is_gone(entry)
-                    self._submit(lambda: self._drop_record(id))
+                    self.submit(lambda: self._drop_record(id))
                 return
-        self._sky.clusters(cluster_name(id), refresh=True)
+        self.sky.clusters(cluster_name(id), refresh=True)
         self.forget()
 
     def everywhere(self) -> Sequence[Cluster]:
         """Return SkyPilot's list as it is now, of all pools and of everybody's clusters."""
-        begun_at = self._clock()
-        clusters = self._sky.clusters(None, refresh=False)
+        begun_at = self.clock()
+        clusters = self.sky.clusters(None, refresh=False)
         with self._lock:
             self._listed = (begun_at, clusters)
         return clusters
@@ -114,33 +99,31 @@ class Presence:
     def forget(self) -> None:
         """Read SkyPilot's list anew the next time."""
         with self._lock:
-            self._listed = None
+            self._listed = (-math.inf, ())
 
     def _of_entry(self, entry: Entry, cluster: Cluster | None) -> Machine | None:
         instance = None
-        if cluster is None and entry.stage in _ON_THE_MACHINE:
-            instance = self._census.alive(entry)
+        if cluster is None and entry.stage in ON_THE_MACHINE:
+            instance = self.census.alive(entry)
             if instance is None:
                 self._is_gone(entry)
                 return None
-        return listing.of_entry(entry, cluster, instance, self._port)
+        return listing.of_entry(entry, cluster, instance)
 
     def _of_cluster(self, id: ReplicaId, cluster: Cluster) -> Machine:
-        launching = any(
-            request.state is RequestState.ACTIVE for request in self._sky.launches(cluster.name)
-        )
-        return listing.of_cluster(id, cluster, launching=launching, port=self._port)
+        launching = any(request.active for request in self.sky.launches(cluster.name))
+        return listing.of_cluster(id, cluster, launching=launching)
 
     def _is_gone(self, entry: Entry) -> None:
         log.info("machine_gone replica=%s", entry.id.short)
         self._gone.add(entry.id)
-        self._journal.close(entry.id)
-        self._census.forget(entry.id)
+        self.journal.close(entry.id)
+        self.census.forget(entry.id)
 
     def _drop_record(self, id: ReplicaId) -> None:
         """Let SkyPilot find out that a machine is gone; it drops its record then."""
         try:
-            self._sky.clusters(cluster_name(id), refresh=True)
+            self.sky.clusters(cluster_name(id), refresh=True)
         except CloudError as error:
             log.warning("record_not_dropped replica=%s reason=%r", id.short, error.message)
 
@@ -163,17 +146,15 @@ class Presence:
                 with self._lock:
                     self._listing = False
 
-        self._submit(read)
+        self.submit(read)
 
     def _clusters(self, pool_uid: str, *, fresh: bool = False) -> dict[ReplicaId, Cluster]:
         with self._lock:
-            kept = self._listed
-        age_s = float("inf") if kept is None else self._clock() - kept[0]
-        if fresh or kept is None or age_s >= CLUSTERS_USABLE_S:
+            at, clusters = self._listed
+        age_s = self.clock() - at
+        if fresh or age_s >= CLUSTERS_USABLE_S:
             clusters = self.everywhere()
-        else:
-            clusters = kept[1]
-            if age_s >= CLUSTERS_FRESH_S:
-                self._list_later()
+        elif age_s >= CLUSTERS_FRESH_S:
+            self._list_later()
         named = ((replica_of(cluster.name), cluster) for cluster in clusters)
         return {id: cluster for id, cluster in named if id and id.pool_uid == pool_uid}

@@ -5,13 +5,14 @@ offer says where its price comes from and how old it is. Prices are kept for a w
 planner asks every half minute, and the answer must not cost a second each time.
 
 Owns: which price an offer carries, and how long it is kept.
-Not here: the catalogue (`sdk`) and the provider's interface (`provider`).
+Not here: the catalogue (`installed`) and the provider's interface (`provider`).
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,8 +20,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fogft.cloud.sky.failures import classify
+from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.provider import NotAllowedError, Provider
-from fogft.cloud.sky.sdk import RefusedError, Sky
+from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudUnreachable, SpecError
 from fogft.model.replica import Offer
 
@@ -30,35 +32,18 @@ FRESH_S = 300.0
 USABLE_S = 3600.0
 
 
-@dataclass(frozen=True)
-class _Kept:
-    at: float
-    offers: tuple[Offer, ...]
-
-
+@dataclass
 class Prices:
-    """Offers with prices, cached for a while.
+    """Offers with prices, cached for a while; `submit` runs a function elsewhere."""
 
-    Args:
-        sky: SkyPilot's catalogue.
-        providers: Clouds that can be asked for live prices, by name.
-        clock: Seconds since the epoch.
-        submit: Runs a function on another thread.
-    """
+    sky: InstalledSky
+    providers: Mapping[str, Provider]
+    clock: Callable[[], float]
+    submit: Callable[[Callable[[], None]], object]
 
-    def __init__(
-        self,
-        sky: Sky,
-        providers: Mapping[str, Provider],
-        clock: Callable[[], float],
-        submit: Callable[[Callable[[], None]], object],
-    ) -> None:
-        self._sky = sky
-        self._providers = providers
-        self._clock = clock
-        self._submit = submit
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
-        self._kept: dict[str, _Kept] = {}
+        self._kept: dict[str, tuple[float, tuple[Offer, ...]]] = {}
         self._renewing: set[str] = set()
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
@@ -68,21 +53,21 @@ class Prices:
         """
         key = json.dumps(resources, sort_keys=True, default=str)
         with self._lock:
-            kept = self._kept.get(key)
-        age_s = float("inf") if kept is None else self._clock() - kept.at
-        if kept is None or age_s > USABLE_S:
+            at, offers = self._kept.get(key, (-math.inf, ()))
+        age_s = self.clock() - at
+        if age_s > USABLE_S:
             return self._renewed(key, resources)
         if age_s > FRESH_S:
             self._renew_later(key, resources)
-        return kept.offers
+        return offers
 
     @property
     def regions(self) -> Mapping[str, set[str]]:
         """Cloud -> regions that were offered: where machines of ours can be."""
         with self._lock:
             out: dict[str, set[str]] = {}
-            for kept in self._kept.values():
-                for offer in kept.offers:
+            for _, offers in self._kept.values():
+                for offer in offers:
                     out.setdefault(offer.placement.cloud, set()).add(offer.placement.region)
             return out
 
@@ -101,11 +86,11 @@ class Prices:
                 with self._lock:
                     self._renewing.discard(key)
 
-        self._submit(renew)
+        self.submit(renew)
 
     def _renewed(self, key: str, resources: Mapping[str, Any]) -> tuple[Offer, ...]:
         try:
-            listed = self._sky.offers(resources)
+            listed = self.sky.offers(resources)
         except RefusedError as error:
             words = classify(error.kind, error.texts).words
             raise SpecError(f"resources: SkyPilot refuses this section: {words}") from error
@@ -117,39 +102,40 @@ class Prices:
             )
         offers = tuple(sorted(self._priced(listed), key=lambda o: (o.usd_per_hour, o.placement)))
         with self._lock:
-            self._kept[key] = _Kept(self._clock(), offers)
+            self._kept[key] = self.clock(), offers
         return offers
 
     def _priced(self, listed: Sequence[Offer]) -> Sequence[Offer]:
         wanted: dict[tuple[str, str], set[str]] = {}
         for offer in listed:
             place = offer.placement
-            if place.spot and place.cloud in self._providers:
+            if place.spot and place.cloud in self.providers:
                 wanted.setdefault((place.cloud, place.region), set()).add(place.instance)
         if not wanted:
             return listed
         with ThreadPoolExecutor(min(8, len(wanted)), "prices") as pool:
             answers = dict(zip(wanted, pool.map(self._live, wanted.items()), strict=True))
-        now = self._clock()
+        now = self.clock()
 
         def priced(offer: Offer) -> Offer:
             place = offer.placement
             live = answers.get((place.cloud, place.region), {}) if place.spot else {}
-            price = live.get((place.zone, place.instance))
-            if price is None and not place.zone:  # the cloud chooses: count with the dearest zone
-                price = max(
-                    (p for (_, kind), p in live.items() if kind == place.instance), default=None
-                )
-            if price is None:
+            # Without a zone the cloud chooses one: count with the dearest.
+            prices = [
+                price
+                for (zone, kind), price in live.items()
+                if kind == place.instance and place.zone in ("", zone)
+            ]
+            if not prices:
                 return offer
-            return replace(offer, usd_per_hour=price, source="live", as_of=now)
+            return replace(offer, usd_per_hour=max(prices), source="live", as_of=now)
 
         return [priced(offer) for offer in listed]
 
     def _live(self, wanted: tuple[tuple[str, str], set[str]]) -> Mapping[tuple[str, str], float]:
         (cloud, region), instances = wanted
         try:
-            return self._providers[cloud].spot_prices(region, instances)
+            return self.providers[cloud].spot_prices(region, instances)
         except (NotAllowedError, CloudUnreachable) as error:
             log.info("live_prices_missing region=%s/%s reason=%r", cloud, region, str(error))
             return {}

@@ -1,25 +1,13 @@
-"""What fogft needs of SkyPilot, as a surface that a test can stand in for.
-
-Plain values in and out: no object of SkyPilot's crosses this line. Every call has a limit
-and ends in a value or in one of these errors, whatever SkyPilot, its API server and the
-network do:
-
-* `CloudUnreachable`: nothing is known, and nothing may be concluded;
-* `RefusedError`: SkyPilot did the work and the answer is no, with its words.
-
-Implementations: `fogft.cloud.sky.installed.InstalledSky`; `tests/sky/scripted_sky.py`, whose
-calls are held to the installed SkyPilot's signatures by `tests/sky/test_installed.py`.
-"""
+"""The plain values that SkyPilot's answers become: no object of its own gets past `installed`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Protocol
 
 from fogft.errors import CloudError
-from fogft.model.replica import Offer, Placement
+from fogft.model.replica import Placement
 
 
 class RefusedError(CloudError):
@@ -36,22 +24,12 @@ class RefusedError(CloudError):
         self.texts = tuple(texts)
 
 
-class RequestState(Enum):
-    """How a request to the API server is doing."""
-
-    ACTIVE = "active"
-    SUCCEEDED = "succeeded"
-    FAILED = "failed"
-    CANCELLED = "cancelled"
-
-
 @dataclass(frozen=True)
 class Request:
-    """A launch request that the API server knows of."""
+    """A launch request that the API server knows of, and whether it is still under way."""
 
     id: str
-    state: RequestState
-    message: str = ""
+    active: bool
 
 
 class ClusterState(Enum):
@@ -91,65 +69,3 @@ class JobState(Enum):
     SETUP_FAILED = "setup failed"
     ENDED = "ended"
     MISSING = "missing"
-
-
-class Sky(Protocol):
-    """SkyPilot's public SDK, as far as fogft uses it. Calls come from any thread."""
-
-    def launch(self, task: Mapping[str, Any], name: str) -> str:
-        """Order a cluster; return the request's id, long before the cluster runs.
-
-        Raises:
-            CloudUnreachable: Unknown whether the order was heard.
-            RefusedError: The task is not valid; nothing was ordered.
-        """
-
-    def launches(self, name: str) -> Sequence[Request]:
-        """List the launch requests of a cluster that the API server knows, oldest first."""
-
-    def request(self, id: str) -> Request | None:
-        """Return how a request is doing; None when the API server does not know it."""
-
-    def launched_job(self, id: str) -> int | None:
-        """Return the job's number of a launch request that succeeded.
-
-        Raises:
-            RefusedError: The request failed, or was cancelled; carries why.
-        """
-
-    def cancel(self, id: str) -> None:
-        """Abort a request; return when that is done. One that has ended is no error."""
-
-    def clusters(self, name: str | None, *, refresh: bool) -> Sequence[Cluster]:
-        """List one cluster, or all of them.
-
-        Args:
-            name: The only one of interest; None for all.
-            refresh: Ask the clouds themselves (seconds), instead of SkyPilot's memory.
-        """
-
-    def job(self, name: str, number: int | None) -> JobState:
-        """Return the state of a cluster's job, its last one if `number` is None."""
-
-    def job_log(self, name: str, number: int | None, lines: int) -> str:
-        """Return the end of a job's log; empty when there is none."""
-
-    def provision_log(self, name: str, lines: int) -> str:
-        """Return the end of the log of a cluster's launch; empty when there is none."""
-
-    def down(self, name: str) -> None:
-        """End a cluster; return when SkyPilot says that it is gone. Missing is no error.
-
-        Raises:
-            RefusedError: It failed; the cluster may still run.
-        """
-
-    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """List what the catalogue sells for a `resources` section, cheapest first.
-
-        Raises:
-            RefusedError: The section is not valid.
-        """
-
-    def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
-        """Test the credentials of clouds, all if none is named: cloud -> "" or what is wrong."""

@@ -76,7 +76,6 @@ def build(
     wheel: Path,
     owner: str,
     base: Path,
-    port: int = LINK_PORT,
 ) -> dict[str, Any]:
     """Return the task of one replica, for exactly one location.
 
@@ -87,7 +86,6 @@ def build(
         wheel: Folder with fogft's wheel.
         owner: Whose machine it is, for its labels.
         base: Folder that relative paths of the pool file start from.
-        port: Where the server proxy shall listen.
 
     Raises:
         SpecError: A field of the pool file cannot be honoured.
@@ -97,8 +95,8 @@ def build(
     marks = {
         "@FILES@": str(files),
         "@WHEEL@": str(wheel),
-        "@PORT@": str(port),
-        "@LISTEN@": f"{'127.0.0.1' if order.dials_out else '0.0.0.0'}:{port}",
+        "@PORT@": str(LINK_PORT),
+        "@LISTEN@": f"{'127.0.0.1' if order.dials_out else '0.0.0.0'}:{LINK_PORT}",
         "@SETUP_LIMIT_S@": str(SETUP_LIMIT_S),
         "@SETUP@": setup,  # the user's text last, as it is
     }
