@@ -6,68 +6,40 @@ Not here: what may stand in it (`fogft.poolfile.reader`).
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from fogft.errors import SpecError
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import yaml_tree
-from fogft.poolfile.pool import FieldCheck, StateCheck, ToleranceCheck, TypeCheck, pool_spec
+from fogft.poolfile.pool import UNCHECKED, Checks, pool_spec
 
 MAX_BYTES = 1 << 20
 
 
-def read(
-    path: Path | str,
-    *,
-    check_types: TypeCheck | None = None,
-    check_fields: FieldCheck | None = None,
-    check_states: StateCheck | None = None,
-    check_tolerances: ToleranceCheck | None = None,
-) -> PoolSpec:
+def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
     """Return what a pool file asks for.
 
     Args:
         path: The file. Its `workdir`, relative to the file's own folder, must exist.
-        check_types: Returns why a service type cannot be loaded on this machine, or None
-            if it can. Without it the types are not looked up.
-        check_fields: Returns why a service type's response has no such boolean field, for
-            `ok_field`.
-        check_states: Returns why a service's state cannot travel as `state` says, or None.
-        check_tolerances: Returns why a type's responses cannot be compared so, or None.
+        checks: What is asked of this machine.
 
     Raises:
         SpecError: The file cannot be read, or its first mistake: ``file:line: key: what``.
     """
-    return parse(
-        read_text(path),
-        file=str(path),
-        check_types=check_types,
-        check_fields=check_fields,
-        check_states=check_states,
-        check_tolerances=check_tolerances,
-        folder=Path(path).parent,
-    )
+    return parse(read_text(path), str(path), checks, Path(path).parent)
 
 
 def parse(
-    source: str,
-    *,
-    file: str,
-    check_types: TypeCheck | None = None,
-    check_fields: FieldCheck | None = None,
-    check_states: StateCheck | None = None,
-    check_tolerances: ToleranceCheck | None = None,
-    folder: Path | None = None,
+    source: str, file: str, checks: Checks = UNCHECKED, folder: Path | None = None
 ) -> PoolSpec:
     """Return what the text of a pool file asks for.
 
     Args:
         source: The text.
         file: Its name, for messages; its stem names the pool where the text does not.
-        check_types: As for `read`.
-        check_fields: As for `read`.
-        check_states: As for `read`.
-        check_tolerances: As for `read`.
+        checks: What is asked of this machine.
         folder: Where `workdir` is looked for; None to leave it unjudged.
 
     Raises:
@@ -75,15 +47,9 @@ def parse(
     """
     if len(source) > MAX_BYTES:
         raise _too_large(file)
-    return pool_spec(
-        yaml_tree.tree(source, file),
-        file,
-        check_types=check_types,
-        check_fields=check_fields,
-        check_states=check_states,
-        check_tolerances=check_tolerances,
-        check_workdir=None if folder is None else lambda workdir: _no_folder(folder, workdir),
-    )
+    if folder is not None:
+        checks = replace(checks, workdir=partial(_no_folder, folder))
+    return pool_spec(yaml_tree.tree(source, file), file, checks)
 
 
 def read_text(path: Path | str) -> str:

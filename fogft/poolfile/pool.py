@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
@@ -28,37 +28,43 @@ from fogft.poolfile.reader import Reader
 from fogft.poolfile.task import check_task
 from fogft.poolfile.tree import Node, Section, plain, shown
 
-# What only this machine can tell. Each returns what is wrong, None if nothing is; what to
-# do about it may follow after "; ".
-TypeCheck = Callable[[str], str | None]  # of a service or message type
-FieldCheck = Callable[[str, str], str | None]  # of a service type and a boolean response field
-StateCheck = Callable[[StateSpec], str | None]  # of a service's `state`
-ToleranceCheck = Callable[[str, Mapping[str, float]], str | None]  # of a type, by field
-FolderCheck = Callable[[str], str | None]  # of `workdir`
+
+def _nothing(*_: object) -> None:
+    return None
 
 
-def pool_spec(
-    root: Node,
-    file: str,
-    *,
-    check_types: TypeCheck | None = None,
-    check_fields: FieldCheck | None = None,
-    check_states: StateCheck | None = None,
-    check_tolerances: ToleranceCheck | None = None,
-    check_workdir: FolderCheck | None = None,
-) -> PoolSpec:
+@dataclass(frozen=True)
+class Checks:
+    """What only this machine can tell, asked when all else is right.
+
+    Each returns what is wrong, None if nothing is; what to do may follow after ``; ``.
+
+    Attributes:
+        types: Of a service or message type: why it cannot be loaded here.
+        fields: Of a service type: why its response has no such boolean field, for `ok_field`.
+        states: Why a service's state cannot travel as its `state` says.
+        tolerances: Of a service type, by field: why responses cannot be compared so.
+        workdir: Why it cannot be used here.
+    """
+
+    types: Callable[[str], str | None] = _nothing
+    fields: Callable[[str, str], str | None] = _nothing
+    states: Callable[[StateSpec], str | None] = _nothing
+    tolerances: Callable[[str, Mapping[str, float]], str | None] = _nothing
+    workdir: Callable[[str], str | None] = _nothing
+
+
+UNCHECKED = Checks()
+
+
+def pool_spec(root: Node, file: str, checks: Checks = UNCHECKED) -> PoolSpec:
     """Return what a pool file asks for.
 
     Args:
         root: The file's tree.
         file: Its name as the user wrote it: begins every message, and its stem is the
             pool's name where the file gives none.
-        check_types: Says why a type of a service or message cannot be loaded here. Asked last,
-            once for each, when all else is right.
-        check_fields: Says why a type's response has no boolean field of that name.
-        check_states: Says why a service's state cannot travel by the services that `state` names.
-        check_tolerances: Says why a type's responses cannot be compared with such tolerances.
-        check_workdir: Says why a `workdir` cannot be used here.
+        checks: What is asked of this machine.
 
     Raises:
         SpecError: The first mistake found; ``file:line: key: what is wrong``.
@@ -73,26 +79,24 @@ def pool_spec(
 
     spec: PoolSpec = Reader({**rules.RULES, PoolSpec: whole}).map(PoolSpec, ours)
     workdir = spec.task.get("workdir")
-    if isinstance(workdir, str) and check_workdir is not None:
-        _judge(top, "workdir", check_workdir(workdir))
+    if isinstance(workdir, str):
+        _judge(top, "workdir", checks.workdir(workdir))
     sections = ours.sections("services", "") if "services" in ours.children else ()
     for section, service in zip(sections, spec.services, strict=False):
         _check_quorum(section, service, spec)
     for section, service in zip(sections, spec.services, strict=False):
-        passes_through = spec.rmw.robot is Speaks.ZENOH and not service.needs_type
-        if check_types is not None and not passes_through:
-            _judge(section, "type", check_types(service.type))
-        if service.ok_field and check_fields is not None:
-            _judge(section, "ok_field", check_fields(service.type, service.ok_field))
-        if service.tolerance and check_tolerances is not None:
-            reason = check_tolerances(service.type, dict(service.tolerance))
+        if spec.rmw.robot is not Speaks.ZENOH or service.needs_type:
+            _judge(section, "type", checks.types(service.type))
+        if service.ok_field:
+            _judge(section, "ok_field", checks.fields(service.type, service.ok_field))
+        if service.tolerance:
+            reason = checks.tolerances(service.type, dict(service.tolerance))
             _judge(section, "tolerance", reason)
-        if service.state is not None and check_states is not None:
-            _judge(section, "state", check_states(service.state))
+        if service.state is not None:
+            _judge(section, "state", checks.states(service.state))
     for key, end in (("topics", ""), ("actions", "_SendGoal")):
-        if key in ours.children and check_types is not None:
-            for section in ours.sections(key, ""):
-                _judge(section, "type", check_types(section.text("type", "") + end))
+        for section in ours.sections(key, "") if key in ours.children else ():
+            _judge(section, "type", checks.types(section.text("type", "") + end))
     return spec
 
 

@@ -16,6 +16,7 @@ from fogft.errors import SpecError
 from fogft.model.keys import keys_of
 from fogft.model.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
 from fogft.poolfile import file, yaml_tree
+from fogft.poolfile.pool import Checks
 from fogft.poolfile.tree import plain
 from tests.needs import needs
 from tests.nightly import by_day
@@ -53,9 +54,9 @@ def pool(ours="", *, top="", services="[{name: /a, type: a/srv/A}]"):
     return "\n".join([*lines, *textwrap.indent(ours, "  ").splitlines()]) + "\n"
 
 
-def fault(source, **kwargs):
+def fault(source, folder=None, **checks):
     with pytest.raises(SpecError) as caught:
-        file.parse(source, file="pool.yaml", **kwargs)
+        file.parse(source, file="pool.yaml", checks=Checks(**checks), folder=folder)
     return caught.value.message, caught.value.hint
 
 
@@ -565,7 +566,7 @@ def test_a_type_that_cannot_be_loaded():
         return "`b/srv/B` has no module\n`b`; install it" if type_name == "b/srv/B" else None
 
     source = pool(services="\n    - {name: a, type: a/srv/A}\n    - name: b\n      type: b/srv/B")
-    assert fault(source, check_types=check) == (
+    assert fault(source, types=check) == (
         "pool.yaml:6: fogft.services[1].type: `b/srv/B` has no module\\n`b`",
         "install it",
     )
@@ -580,7 +581,7 @@ def test_a_field_that_the_response_lacks():
         services="\n    - {name: a, type: a/srv/A}\n"
         "    - name: b\n      type: b/srv/B\n      ok_field: done"
     )
-    assert fault(source, check_fields=check) == (
+    assert fault(source, fields=check) == (
         "pool.yaml:7: fogft.services[1].ok_field: "
         "the response of `b/srv/B` has no boolean field `done`",
         "its boolean fields: ok",

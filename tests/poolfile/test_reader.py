@@ -16,7 +16,7 @@ from fogft.model.middleware import Middleware, Speaks
 from fogft.model.names import POOL_NAME_PATTERN
 from fogft.model.spec import HealthSpec, HedgingMode, OnTimeout, PoolSpec, ServiceSpec
 from fogft.poolfile.plain import to_plain
-from fogft.poolfile.pool import pool_spec
+from fogft.poolfile.pool import Checks, pool_spec
 from fogft.poolfile.task import TASK_KEYS
 from fogft.poolfile.tree import Node, plain, shown
 
@@ -32,8 +32,8 @@ def tree(value, line=1):
     return Node(value, line, line)
 
 
-def read(document, **kwargs):
-    return pool_spec(tree(document), "pool.yaml", **kwargs)
+def read(document, **checks):
+    return pool_spec(tree(document), "pool.yaml", Checks(**checks))
 
 
 def read_or_error(document):
@@ -164,11 +164,11 @@ def test_types_are_checked_once_each_and_last():
         asked.append(type_name)
 
     services = [{"name": "a", "type": "a/srv/A"}, {"name": "b", "type": "b/srv/B"}]
-    read(document(services=services), check_types=check)
+    read(document(services=services), types=check)
     assert asked == ["a/srv/A", "b/srv/B"]
     asked.clear()
     with pytest.raises(SpecError, match="stands here twice"):
-        read(document(services=[*services, services[0]]), check_types=check)
+        read(document(services=[*services, services[0]]), types=check)
     assert asked == []
 
 
@@ -252,7 +252,7 @@ def test_rmw_is_one_of_the_ways_there_are(rmw):
 
 def test_a_robot_over_zenoh_needs_no_type_but_where_a_policy_looks_into_responses():
     """What passes through untouched need not be known; what is made or read must be."""
-    refuse = {"check_types": lambda name: f"there is no `{name}`"}
+    refuse = {"types": lambda name: f"there is no `{name}`"}
     assert read(document(rmw="zenoh"), **refuse).rmw.robot is Speaks.ZENOH
     for rmw in ("rclpy", {"replica": "zenoh"}):
         with pytest.raises(SpecError, match="there is no"):

@@ -10,6 +10,7 @@ from fogft.model.spec import ServiceSpec
 from fogft.model.state import StateService, StateSpec
 from fogft.poolfile import file as pool_file
 from fogft.poolfile.plain import from_plain, to_plain
+from fogft.poolfile.pool import Checks
 
 FILE = """
 name: p
@@ -27,7 +28,9 @@ LONG = (
 
 
 def parse(state: str, more: str = "", **checks):
-    return pool_file.parse(f"{FILE}      state: {state}\n{more}", file="p.yaml", **checks)
+    return pool_file.parse(
+        f"{FILE}      state: {state}\n{more}", file="p.yaml", checks=Checks(**checks)
+    )
 
 
 def test_names_alone_stand_for_the_types_of_the_helpers():
@@ -102,7 +105,7 @@ def test_what_does_not_go_with_state_is_refused(line):
 
 def test_types_are_judged_where_they_can_be():
     with pytest.raises(SpecError, match=r"p.yaml:8: fogft.services\[0\].state: no such field"):
-        parse(SHORT, check_states=lambda state: "no such field; name another")
+        parse(SHORT, states=lambda state: "no such field; name another")
 
 
 VOTING = FILE + "      quorum: 2\n"

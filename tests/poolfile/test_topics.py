@@ -9,6 +9,7 @@ from fogft.model.spec import Part, ServiceSpec
 from fogft.model.topic import Origin, Select, TopicSpec
 from fogft.poolfile import file
 from fogft.poolfile.plain import from_plain, to_plain
+from fogft.poolfile.pool import Checks
 
 FILE = """\
 name: p
@@ -19,7 +20,7 @@ fogft:
 
 
 def parse(key: str, value: str, **more):
-    return file.parse(FILE % (key, value), file="p.yaml", **more)
+    return file.parse(FILE % (key, value), file="p.yaml", checks=Checks(**more))
 
 
 def test_a_topic_has_its_direction_and_its_quality():
@@ -58,11 +59,11 @@ def test_a_topic_more_replaces_the_replicas():
 
 def test_types_are_looked_up_by_name():
     asked = []
-    parse("topics", "[{name: a, type: p/msg/T, from: robot}]", check_types=asked.append)
-    parse("actions", "[{name: a, type: p/action/T}]", check_types=asked.append)
+    parse("topics", "[{name: a, type: p/msg/T, from: robot}]", types=asked.append)
+    parse("actions", "[{name: a, type: p/action/T}]", types=asked.append)
     assert asked == ["p/msg/T", "p/action/T_SendGoal"]
     with pytest.raises(SpecError, match="type: there is none") as found:
-        parse("actions", "[{name: a, type: p/action/T}]", check_types=lambda _: "there is none; x")
+        parse("actions", "[{name: a, type: p/action/T}]", types=lambda _: "there is none; x")
     assert found.value.hint == "x"
 
 

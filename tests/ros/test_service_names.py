@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from fogft.errors import SpecError
 from fogft.model import ros_names
 from fogft.poolfile import file
+from fogft.poolfile.pool import Checks
 from fogft.ros import types
 from tests.needs import need
 
@@ -50,12 +51,7 @@ def test_the_longest_name_that_we_accept_is_accepted_by_ros():
 def fault(service):
     source = f"run: x\nfogft:\n  services: [{{name: a, {service}}}]\n"
     with pytest.raises(SpecError) as caught:
-        file.parse(
-            source,
-            file="p.yaml",
-            check_types=types.check_service_type,
-            check_fields=types.check_ok_field,
-        )
+        file.parse(source, "p.yaml", Checks(types.check_service_type, types.check_ok_field))
     return caught.value.message, caught.value.hint
 
 

@@ -27,6 +27,7 @@ from fogft.pool.manager import offers
 from fogft.poolfile.changes import changes, replaces_replicas
 from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import clouds_named, located
+from fogft.poolfile.pool import Checks
 from fogft.reason_words import words
 
 
@@ -104,15 +105,8 @@ def order(
     from fogft.ros.types import check_ok_field, check_type
 
     source = read_text(file)
-    spec = parse(
-        source,
-        file=str(file),
-        check_types=check_type,
-        check_fields=check_ok_field,
-        check_states=check_state,
-        check_tolerances=check_tolerances,
-        folder=file.parent,
-    )
+    checks = Checks(check_type, check_ok_field, check_state, check_tolerances)
+    spec = parse(source, str(file), checks, file.parent)
     cloud_name = cloud or cloud_named_by(spec, source, file)
     concrete = make_cloud(cloud_name, file.resolve().parent)
     before, rolled_back = _before(make_store(spec.name), source)
