@@ -23,9 +23,10 @@ from fogft.model.keys import (
     Text,
     Whole,
     key,
+    only,
     within,
 )
-from fogft.model.names import endpoint
+from fogft.model.names import is_endpoint
 from fogft.model.ros_names import absolute_service_name
 from fogft.model.scoring import Weights
 
@@ -113,7 +114,7 @@ class AvailabilitySpec:
 
 def _metrics(default_port: int) -> Text:
     hint = f"write an address that only your Prometheus reaches, such as `127.0.0.1:{default_port}`"
-    return Text("`host:port`", hint, endpoint)
+    return Text("`host:port`", hint, only(is_endpoint))
 
 
 @dataclass(frozen=True)
@@ -160,12 +161,6 @@ class OnDemandSpec:
     )
 
 
-def _group_name(written: str) -> str:
-    if not re.fullmatch(r"[a-z][a-z0-9-]{0,19}", written) or written == "critical":
-        raise ValueError
-    return written
-
-
 @dataclass(frozen=True)
 class GroupSpec:
     """Replicas of one pool that have machines of their own kind."""
@@ -174,7 +169,7 @@ class GroupSpec:
         Text(
             "a group's name",
             "use lower-case letters, digits and dashes, at most 20, and not `critical`",
-            _group_name,
+            only(re.compile(r"(?!critical$)[a-z][a-z0-9-]{0,19}").fullmatch),
         ),
         "Name of the group: lower-case letters, digits and dashes, at most 20.",
     )
@@ -187,7 +182,6 @@ class GroupSpec:
         Free("write resources as at the top level"),
         "Merged over the file's own `resources`, key by key.",
         default_factory=dict,
-        usual="none",
     )
     on_demand: OnDemandSpec = key(
         Map(OnDemandSpec), "As the pool's, for this group.", default_factory=OnDemandSpec
@@ -324,12 +318,6 @@ def _robot_at(written: Any) -> tuple[float, float]:
     return float(written[0]), float(written[1])
 
 
-def _location(written: str) -> str:
-    if not _LOCATION.fullmatch(written):
-        raise ValueError
-    return written
-
-
 @dataclass(frozen=True)
 class PlacementSpec:
     """How locations are weighed, and what is known of distances.
@@ -353,7 +341,11 @@ class PlacementSpec:
     rtt_s: Mapping[str, float] = key(
         Table(
             Number(60, "seconds"),
-            Text("a `cloud/region`", "write a place such as `aws/us-west-2`", _location),
+            Text(
+                "a `cloud/region`",
+                "write a place such as `aws/us-west-2`",
+                only(_LOCATION.fullmatch),
+            ),
         ),
         "Round trips that you know better than fogft, by `cloud/region`, such as "
         "`{aws/us-west-2: 0.021}`.",

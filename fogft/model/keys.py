@@ -73,6 +73,17 @@ class Text:
     suggest: Callable[[str], str] = lambda text: ""
 
 
+def only(is_right: Callable[[str], object]) -> Callable[[str], str]:
+    """Return a check for `Text` that takes a text as it is, where it is right."""
+
+    def check(written: str) -> str:
+        if not is_right(written):
+            raise ValueError
+        return written
+
+    return check
+
+
 @dataclass(frozen=True)
 class Listed:
     """A list of different texts."""

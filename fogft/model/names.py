@@ -112,10 +112,3 @@ def is_endpoint(text: str) -> bool:
     if not host or not (in_brackets or ":" not in host) or not host.isascii():
         return False
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
-
-
-def endpoint(written: str) -> str:
-    """Return ``host:port`` as it is. Raises ValueError where it is none."""
-    if not is_endpoint(written):
-        raise ValueError
-    return written

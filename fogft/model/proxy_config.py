@@ -11,39 +11,42 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fogft.model.credentials import CredentialPaths
-from fogft.model.keys import PATH, Flag, Free, Listed, Map, Maps, Number, OneOf, Text, Whole, key
+from fogft.model.keys import (
+    PATH,
+    Flag,
+    Free,
+    Listed,
+    Map,
+    Maps,
+    Number,
+    OneOf,
+    Text,
+    Whole,
+    key,
+    only,
+)
 from fogft.model.middleware import Speaks
-from fogft.model.names import NOTICE_SOURCES, POOL_UID_PATTERN, ROBOT_BYTES_LIMIT, endpoint
+from fogft.model.names import NOTICE_SOURCES, POOL_UID_PATTERN, ROBOT_BYTES_LIMIT, is_endpoint
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.topic import TopicSpec
-from fogft.model.uplinks import interface
+from fogft.model.uplinks import is_interface
 
 _LAST_GENERATION = 1 << 31
 
 
-def _uid(written: str) -> str:
-    if not POOL_UID_PATTERN.fullmatch(written):
-        raise ValueError
-    return written
+def _is_robot(written: str) -> bool:
+    return written.isprintable() and 0 < len(written.encode()) <= ROBOT_BYTES_LIMIT
 
 
-def _robot(written: str) -> str:
-    if not written.isprintable() or not 0 < len(written.encode()) <= ROBOT_BYTES_LIMIT:
-        raise ValueError
-    return written
-
-
-def _notice(written: str) -> str:
-    kind, colon, path = written.partition(":")
-    if not (colon and kind == "file" and path) and written not in ("none", *NOTICE_SOURCES):
-        raise ValueError
-    return written
+def _is_notice_source(written: str) -> bool:
+    kind, _, path = written.partition(":")
+    return (kind == "file" and path != "") or written in ("none", *NOTICE_SOURCES)
 
 
 _POOL = Text("a pool's name", "write the pool's name")
-_UID = Text("a pool's uid", "quote its 16 hexadecimal digits", _uid)
-_ENDPOINT = Text("`host:port`", "write an address and a port", endpoint)
+_UID = Text("a pool's uid", "quote its 16 hexadecimal digits", only(POOL_UID_PATTERN.fullmatch))
+_ENDPOINT = Text("`host:port`", "write an address and a port", only(is_endpoint))
 _ENDPOINTS = Listed(_ENDPOINT, 64, least=0)
 _MAPS = "write a list of maps"
 
@@ -55,7 +58,7 @@ class ClientProxyConfig:
     pool: str = key(_POOL, "Name of the pool.")
     pool_uid: str = key(_UID, "The pool's identity.")
     robot: str = key(
-        Text("a name", f"write 1 to {ROBOT_BYTES_LIMIT} printable bytes", _robot),
+        Text("a name", f"write 1 to {ROBOT_BYTES_LIMIT} printable bytes", only(_is_robot)),
         "Name of this robot, or gateway.",
     )
     membership: Path = key(PATH, "Which replicas there are; written by the manager.")
@@ -91,7 +94,11 @@ class ClientProxyConfig:
         _ENDPOINT, "Where to listen for them, if not on that port of all addresses.", default=""
     )
     uplinks: tuple[str, ...] = key(
-        Listed(Text("a network interface's name", "write what `ip link` lists", interface), 64, 0),
+        Listed(
+            Text("a network interface's name", "write what `ip link` lists", only(is_interface)),
+            64,
+            0,
+        ),
         "Network interfaces to use at once, the preferred one first.",
         default=(),
     )
@@ -133,7 +140,7 @@ class ServerProxyConfig:
         Text(
             "a source of notices",
             f"write one of file:PATH, none, {', '.join(NOTICE_SOURCES)}",
-            _notice,
+            only(_is_notice_source),
         ),
         "Where preemption notices come from.",
         default="auto",

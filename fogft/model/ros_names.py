@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import re
 
+from fogft.model.keys import only
+
 MAX_SERVICE_NAME = 240  # DDS allows 255; ROS adds a prefix and a suffix
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _FIELD = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")
@@ -40,11 +42,20 @@ def absolute_service_name(name: str) -> str:
 
 def is_service_type(name: str) -> bool:
     """Whether this has the form ``package/srv/Name``."""
-    return is_type(name, "srv")
+    return _is_type(name, "srv")
 
 
-def is_type(name: str, kind: str) -> bool:
-    """Whether this has the form ``package/KIND/Name``, with ``srv``, ``msg`` or ``action``."""
+def is_message_type(name: str) -> bool:
+    """Whether this has the form ``package/msg/Name``."""
+    return _is_type(name, "msg")
+
+
+def is_action_type(name: str) -> bool:
+    """Whether this has the form ``package/action/Name``."""
+    return _is_type(name, "action")
+
+
+def _is_type(name: str, kind: str) -> bool:
     parts = name.split("/")
     return (
         len(parts) == 3
@@ -81,32 +92,9 @@ def is_field_name(name: str) -> bool:
     return bool(_FIELD.fullmatch(name))
 
 
-def service_type(written: str) -> str:
-    """Return a service type's name as it is. Raises ValueError."""
-    return _form(written, is_service_type(written))
+def is_field_path(name: str) -> bool:
+    """Whether this has the form of a path to a field, such as ``plan.cost``."""
+    return all(map(is_field_name, name.split(".")))
 
 
-def message_type(written: str) -> str:
-    """Return a message type's name as it is. Raises ValueError."""
-    return _form(written, is_type(written, "msg"))
-
-
-def action_type(written: str) -> str:
-    """Return an action type's name as it is. Raises ValueError."""
-    return _form(written, is_type(written, "action"))
-
-
-def field_name(written: str) -> str:
-    """Return a field's name as it is. Raises ValueError."""
-    return _form(written, is_field_name(written))
-
-
-def field_path(written: str) -> str:
-    """Return a field's path, such as ``plan.cost``, as it is. Raises ValueError."""
-    return _form(written, all(map(is_field_name, written.split("."))))
-
-
-def _form(written: str, is_right: bool) -> str:
-    if not is_right:
-        raise ValueError
-    return written
+service_type, message_type = only(is_service_type), only(is_message_type)

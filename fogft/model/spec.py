@@ -25,20 +25,33 @@ from fogft.model.choices import (
     ScheduleSpec,
     TrafficSpec,
 )
-from fogft.model.keys import DAY_S, Flag, Listed, Map, Maps, Number, OneOf, Table, Text, Whole, key
+from fogft.model.keys import (
+    DAY_S,
+    Flag,
+    Listed,
+    Map,
+    Maps,
+    Number,
+    OneOf,
+    Table,
+    Text,
+    Whole,
+    key,
+    only,
+)
 from fogft.model.middleware import Middleware, Speaks
-from fogft.model.names import endpoint
+from fogft.model.names import is_endpoint
 from fogft.model.ros_names import (
     absolute_service_name,
-    field_name,
-    field_path,
+    is_field_name,
+    is_field_path,
     service_type,
     suggested_service_type,
 )
 from fogft.model.state import StateSpec
 from fogft.model.topic import ActionSpec, TopicSpec
 from fogft.model.topology import Topology
-from fogft.model.uplinks import UplinkPolicy, interface
+from fogft.model.uplinks import UplinkPolicy, is_interface
 
 CONCURRENCY_LIMIT = 512  # a replica holds no more requests
 MAX_HOURS = 8000  # the certificates last 365 days
@@ -77,10 +90,6 @@ class Part(str, Enum):
     GOAL = "goal"
     RESULT = "result"
     CANCEL = "cancel"
-
-
-def _service_hint(key: str) -> str:
-    return f"write a service's name, such as `{key}: /detect_{key}`"
 
 
 @dataclass(frozen=True)
@@ -123,10 +132,9 @@ class ServiceSpec:
         parameter=True,
     )
     ok_field: str = key(
-        Text("the name of a field", "name a boolean field, such as `success`", field_name),
+        Text("the name of a field", "name a boolean field, such as `success`", only(is_field_name)),
         "Boolean field of the response. While it is false, another replica's response is awaited.",
         default="",
-        usual="none",
         parameter=True,
     )
     hedging: HedgingMode = key(
@@ -158,11 +166,14 @@ class ServiceSpec:
         on_replica=True,
     )
     cancel: str = key(
-        Text("a service name", _service_hint("cancel"), absolute_service_name),
+        Text(
+            "a service name",
+            "write a service's name, such as `cancel: /detect_cancel`",
+            absolute_service_name,
+        ),
         "Service (`std_srvs/srv/Trigger`) that cancels the request at work, called when the robot "
         "has its answer from elsewhere.",
         default="",
-        usual="none",
         on_replica=True,
     )
     quorum: int = key(
@@ -175,20 +186,18 @@ class ServiceSpec:
     tolerance: tuple[tuple[str, float], ...] = key(
         Table(
             Number(1e12, "the field's own"),
-            Text("the path of a field", "write a path such as `plan.cost`", field_path),
+            Text("the path of a field", "write a path such as `plan.cost`", only(is_field_path)),
             as_pairs=True,
         ),
         "With `quorum`: how far apart two values of a float field may be, such as "
         "`{plan.poses.pose.position.x: 0.01}`. All else must be equal.",
         default=(),
-        usual="none",
     )
     state: StateSpec | None = key(
         Map(StateSpec, "write `state: {snapshot: /svc/get_state, restore: /svc/set_state}`"),
         "The service keeps state: all replicas apply all requests in one order, and a new replica "
         "is given the state of another.",
         default=None,
-        usual="none",
         on_replica=True,
     )
     fallback: FallbackSpec | None = key(
@@ -196,7 +205,6 @@ class ServiceSpec:
         "With `on_timeout: fallback`: the service on the robot that answers instead.",
         name="fallback_service",
         default=None,
-        usual="none",
     )
     freshness: Freshness = key(
         OneOf(Freshness),
@@ -280,7 +288,7 @@ class HealthSpec:
 
 
 def _endpoint(hint: str) -> Text:
-    return Text("`host:port`", hint, endpoint)
+    return Text("`host:port`", hint, only(is_endpoint))
 
 
 @dataclass(frozen=True)
@@ -340,7 +348,6 @@ class PoolSpec:
         "How often a replica must answer; the number of replicas follows, and `replicas` is the "
         "least. `0.9995` is short for `{target: 0.9995}`.",
         default=None,
-        usual="none",
     )
     placement: PlacementSpec = key(
         Map(PlacementSpec),
@@ -358,13 +365,11 @@ class PoolSpec:
         "Replicas with machines of different kinds, at most eight groups, in place of `replicas` "
         "and `on_demand`. Add new ones at the end: a group is known by its place in the list.",
         default=(),
-        usual="none",
     )
     schedule: ScheduleSpec | None = key(
         Map(ScheduleSpec, "write `time_zone` and `windows`"),
         "Replicas and cap by the time of the week.",
         default=None,
-        usual="none",
     )
     migration: MigrationSpec | None = key(
         Map(MigrationSpec, "write `migration: false`, or remove it", off=True),
@@ -378,7 +383,6 @@ class PoolSpec:
         "Where `fogft rendezvous` runs, for pools with several robots, gateways, or replicas whose "
         "address the cloud does not know.",
         default=(),
-        usual="none",
     )
     dial_in: str = key(
         _endpoint(
@@ -386,7 +390,6 @@ class PoolSpec:
         ),
         "Robot's own address, for replicas that cannot be reached: they dial the robot.",
         default="",
-        usual="none",
     )
     topology: Topology = key(
         Map(Topology),
@@ -398,7 +401,7 @@ class PoolSpec:
             Text(
                 "a network interface's name",
                 "write what `ip link` lists, such as `uplinks: [wlan0, wwan0]`",
-                interface,
+                only(is_interface),
             ),
             4,
         ),
@@ -420,7 +423,6 @@ class PoolSpec:
         ),
         "Topics that pass between the robot and the replicas. Not with `topology`.",
         default=(),
-        usual="none",
     )
     rmw: Middleware = key(
         Map(Middleware, short=("robot", "replica")),
@@ -436,7 +438,6 @@ class PoolSpec:
         ),
         "Actions that every replica runs. Not with `topology`.",
         default=(),
-        usual="none",
     )
     orphan_after_s: float = key(
         Number(30 * DAY_S, "seconds"),

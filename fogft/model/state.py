@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fogft.model.keys import Map, Text, key
+from fogft.model.keys import Map, Text, key, only
 from fogft.model.ros_names import (
     absolute_service_name,
-    field_path,
+    is_field_path,
     service_type,
     suggested_service_type,
 )
@@ -36,7 +36,7 @@ class StateService:
         on_replica=True,
     )
     field: str = key(
-        Text("the path of a field", f"write a path such as `field: {FIELD}`", field_path),
+        Text("the path of a field", f"write a path such as `field: {FIELD}`", only(is_field_path)),
         "The text or byte field that holds the state: of the response for a snapshot, of the "
         "request for a restore.",
         default="",

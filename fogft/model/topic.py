@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from fogft.model.keys import DAY_S, Flag, Number, OneOf, Text, Whole, key
-from fogft.model.ros_names import absolute_service_name, action_type, message_type
+from fogft.model.keys import DAY_S, Flag, Number, OneOf, Text, Whole, key, only
+from fogft.model.ros_names import absolute_service_name, is_action_type, message_type
 
 PREFIX = "topic "  # of a topic's name on the wire, where it stands beside services
 DEPTH_LIMIT = 1000
@@ -113,7 +113,7 @@ class ActionSpec:
         Text(
             "an action type",
             "write `package/action/Name`, such as `type: nav2_msgs/action/Spin`",
-            action_type,
+            only(is_action_type),
         ),
         "Its type; it must be installed on the robot.",
     )

@@ -16,21 +16,13 @@ from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.credentials import NAME_PATTERN, Holder, Role
-from fogft.model.keys import Listed, Maps, Text, key
-from fogft.model.names import endpoint as is_reached_at
+from fogft.model.keys import Listed, Maps, Text, key, only
 from fogft.model.names import is_endpoint
 
 GATEWAYS_LIMIT = 64
 ROBOTS_LIMIT = 512
 
-
-def _is_name(written: str) -> str:
-    if not NAME_PATTERN.fullmatch(written):
-        raise ValueError
-    return written
-
-
-_NAME = Text("a name", "use letters, digits and dashes, 28 at most", _is_name)
+_NAME = Text("a name", "use letters, digits and dashes, 28 at most", only(NAME_PATTERN.fullmatch))
 _NAMES = Listed(_NAME, GATEWAYS_LIMIT, least=0)
 
 
@@ -47,7 +39,7 @@ class Gateway:
         Text(
             "`host:port`",
             "write where robots reach it, such as `endpoint: edge.example.org:7470`",
-            is_reached_at,
+            only(is_endpoint),
         ),
         "Address where robots and other gateways reach it.",
     )
@@ -87,6 +79,7 @@ class Topology:
         ),
         "The gateways of the pool.",
         default=(),
+        usual="required",
     )
     routes: tuple[RobotRoute, ...] = key(
         Maps(
@@ -97,7 +90,6 @@ class Topology:
         "Robots that do not use `default_gateways`.",
         name="robots",
         default=(),
-        usual="none",
     )
     through: tuple[str, ...] = key(
         _NAMES,

@@ -25,13 +25,6 @@ def is_interface(name: str) -> bool:
     return bool(_INTERFACE.fullmatch(name)) and name not in (".", "..")
 
 
-def interface(written: str) -> str:
-    """Return a network interface's name as it is. Raises ValueError where it is none."""
-    if not is_interface(written):
-        raise ValueError
-    return written
-
-
 def choose(
     policy: UplinkPolicy, usable: Sequence[int], current: int | None
 ) -> tuple[Sequence[int], int | None]:

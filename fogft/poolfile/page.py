@@ -53,6 +53,8 @@ def _default(entry: Entry) -> str:
         return entry.key.usual
     if entry.required:
         return "required"
+    if entry.default in (None, "", (), {}):
+        return "none"
     value = getattr(entry.default, "value", entry.default)
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
