@@ -14,7 +14,7 @@ from typing import Any
 from fogft.errors import FrameError
 from fogft.link.frame import VERSION, check_version
 from fogft.link.port import GatewayView, Probe, ProbeAnswer
-from fogft.model import type_definition
+from fogft.model.plain import from_plain, to_plain
 from fogft.model.replica import LinkState
 from fogft.model.type_definition import Definition
 
@@ -58,7 +58,7 @@ def encode_probe_answer(answer: ProbeAnswer) -> bytes:
     """
     written = _plain_answer(answer)
     if answer.types:
-        types = {name: type_definition.to_plain(of) for name, of in answer.types.items()}
+        types = {name: to_plain(of) for name, of in answer.types.items()}
         frame = _to_json({**written, "types": types})
         if len(frame) <= PROBE_ANSWER_LIMIT:
             return frame
@@ -229,7 +229,7 @@ def _types(raw: dict[str, Any]) -> dict[str, Definition]:
     if not isinstance(found, dict):
         raise FrameError("`types` is not a map of definitions")
     try:
-        return {_check_text(k, "types"): type_definition.from_plain(v) for k, v in found.items()}
+        return {_check_text(k, "types"): from_plain(Definition, v) for k, v in found.items()}
     except FrameError:
         raise
     except ValueError as error:

@@ -3,19 +3,19 @@
 Each command is one operation that returns a new intent, so that it works whether or not
 a manager lives: the command line writes the result, the manager reads it.
 
-Owns: the operations and their JSON form.
+Owns: the operations.
 Not here: how the pool gets there (`planner`).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
-from fogft.errors import FogftError, StateError
+from fogft.errors import FogftError
 from fogft.model.choices import MAX_REPLICAS
+from fogft.model.plain import Count, Moment
 from fogft.model.spec import PoolSpec
 
 LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
@@ -36,12 +36,12 @@ class Intent:
             long as they count from the pool's creation.
     """
 
-    target: int | None = None
-    scaled_from: int | None = None
+    target: Count | None = None
+    scaled_from: Count | None = None
     drained: Mapping[int, int] = field(default_factory=dict)
     excluded: frozenset[str] = frozenset()
     stopping: bool = False
-    began_at: float = 0.0
+    began_at: Moment = 0.0
 
     def wanted(self, spec: PoolSpec) -> int:
         """Return how many replicas the user or the file names; see `sizing` for what follows."""
@@ -147,56 +147,3 @@ def checked_location(text: str) -> str:
             f"`{text}` is not a location", "write `cloud`, `cloud/region` or `cloud/region/zone`"
         )
     return place
-
-
-def to_json(intent: Intent) -> dict[str, Any]:
-    """Return the intent as a JSON object."""
-    return {
-        "target": intent.target,
-        "scaled_from": intent.scaled_from,
-        "drained": {str(slot): generation for slot, generation in intent.drained.items()},
-        "excluded": sorted(intent.excluded),
-        "stopping": intent.stopping,
-        "began_at": intent.began_at,
-    }
-
-
-def from_json(value: Any) -> Intent:
-    """Read an intent back.
-
-    Raises:
-        StateError: It is not one; nothing was changed.
-    """
-    try:
-        return Intent(
-            target=_number(value["target"]),
-            scaled_from=_number(value["scaled_from"]),
-            drained={int(k): int(v) for k, v in dict(value["drained"]).items()},
-            excluded=frozenset(_texts(value["excluded"])),
-            stopping=bool(value["stopping"]),
-            began_at=_moment(value.get("began_at", 0.0)),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise StateError(f"not an intent: {error!r}") from error
-
-
-def _number(value: Any) -> int | None:
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"not a count: {value!r}")
-    return value
-
-
-def _moment(value: Any) -> float:
-    moment = float(value)
-    if not 0 <= moment < float("inf"):  # false for NaN too
-        raise ValueError(f"not a time: {value!r}")
-    return moment
-
-
-def _texts(values: Iterable[Any]) -> list[str]:
-    texts = list(values)
-    if not all(isinstance(text, str) for text in texts):
-        raise ValueError("not texts")
-    return texts

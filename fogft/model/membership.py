@@ -12,20 +12,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Collection, Iterable, Mapping
 from enum import Enum
 from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.credentials import holder_of
-from fogft.model.names import POOL_UID_PATTERN, is_endpoint
+from fogft.model.plain import stored, to_plain
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.model.spec import PoolSpec
-from fogft.model.topology import Topology
-
-_PARTS = ("pool", "pool_uid", "epoch", "version", "members", "revoked", "topology")
-VERSION = re.compile(r"[\w.-]{0,64}", re.ASCII)
+from fogft.model.topology import Topology, trouble
 
 
 class Found(Enum):
@@ -121,24 +117,7 @@ def successor(
 
 def to_dict(membership: Membership) -> dict[str, Any]:
     """Return the JSON form, with its checksum."""
-    content = {
-        "pool": membership.pool,
-        "pool_uid": membership.pool_uid,
-        "epoch": membership.epoch,
-        "version": membership.version,
-        "members": [
-            {
-                "slot": m.id.slot,
-                "generation": m.id.generation,
-                "endpoint": m.endpoint,
-                "draining": m.draining,
-                "version": m.version,
-            }
-            for m in membership.members
-        ],
-        "revoked": sorted(membership.revoked),
-        "topology": membership.topology.to_plain(),
-    }
+    content = to_plain(membership)
     return {**content, "checksum": checksum(content)}
 
 
@@ -152,77 +131,30 @@ def from_dict(raw: Any) -> Membership:
         content = {key: value for key, value in raw.items() if key != "checksum"}
         if raw["checksum"] != checksum(content):
             raise ValueError("its checksum is wrong")
-        parts = {key: content[key] for key in _PARTS}
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise StateError(f"not a membership: {error}") from error
-    return from_parts(**parts)
+    return from_content(content)
 
 
-def from_parts(
-    *,
-    pool: Any,
-    pool_uid: Any,
-    epoch: Any,
-    version: Any,
-    members: Any,
-    revoked: Any = (),
-    topology: Any = None,
-) -> Membership:
-    """Return a membership from plain data.
+def from_content(content: Any) -> Membership:
+    """Return a membership from its JSON form without the checksum.
 
     Raises:
         StateError: It is none.
     """
-    try:
-        if not POOL_UID_PATTERN.fullmatch(pool_uid):
-            raise ValueError("its pool_uid is not one")
-        membership = Membership(
-            pool=_text(pool),
-            pool_uid=pool_uid,
-            epoch=_count(epoch),
-            version=_count(version),
-            members=tuple(_member(pool_uid, entry) for entry in members),
-            revoked=frozenset(_revoked(pool_uid, name) for name in revoked),
-            topology=Topology() if topology is None else Topology.from_plain(topology),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise StateError(f"not a membership: {error}") from error
+    membership = stored(Membership, content, "not a membership")
     ids = [m.id for m in membership.members]
     if len(set(ids)) != len(ids):
         raise StateError("not a membership: a replica is listed twice")
+    try:
+        uids = {id.pool_uid for id in ids} | {holder_of(n).pool_uid for n in membership.revoked}
+    except ValueError as error:
+        raise StateError(f"not a membership: {error}") from error
+    if not uids <= {membership.pool_uid}:
+        raise StateError("not a membership: it names what is another pool's")
+    if wrong := trouble(membership.topology):
+        raise StateError(f"not a membership: {wrong}")
     return membership
-
-
-def _member(uid: str, entry: Mapping[str, Any]) -> Member:
-    endpoint = _text(entry["endpoint"])
-    if endpoint and not is_endpoint(endpoint):
-        raise ValueError(f"`{endpoint:.80}` is not host:port")
-    if not isinstance(entry["draining"], bool):
-        raise TypeError("draining is not true or false")
-    id = ReplicaId(uid, _count(entry["slot"]), _count(entry["generation"]))
-    version = _text(entry["version"])
-    if not VERSION.fullmatch(version):
-        raise ValueError(f"`{version:.40}` is not a version")
-    return Member(id, endpoint, entry["draining"], version=version)
-
-
-def _revoked(uid: str, entry: Any) -> str:
-    holder = holder_of(_text(entry))
-    if holder.pool_uid != uid:
-        raise ValueError("it revokes what is another pool's")
-    return holder.common_name
-
-
-def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"not a count: {value!r:.40}")
-    return value
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"not a text: {value!r:.40}")
-    return value
 
 
 def checksum(content: Mapping[str, Any]) -> str:

@@ -11,6 +11,9 @@ from __future__ import annotations
 
 import hashlib
 import re
+from typing import Annotated
+
+from fogft.model.keys import only
 
 REQUEST_ID_BYTES = 16
 GATEWAY_SLOTS = 1 << 32  # from here on, slots are gateways
@@ -27,6 +30,7 @@ NO_VM_CLOUDS = ("k8s", "kubernetes", "slurm", "ssh")
 NOTICE_SOURCES = ("auto", "aws", "azure", "gcp")
 ROBOT_BYTES_LIMIT = 64  # of a robot's name
 POOL_UID_PATTERN = re.compile(r"[0-9a-f]{16}")
+PoolUid = Annotated[str, only(POOL_UID_PATTERN.fullmatch)]
 POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
@@ -112,3 +116,6 @@ def is_endpoint(text: str) -> bool:
     if not host or not (in_brackets or ":" not in host) or not host.isascii():
         return False
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
+
+
+Endpoint = Annotated[str, only(lambda text: not text or is_endpoint(text))]  # empty for none

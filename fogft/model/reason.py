@@ -5,10 +5,9 @@ Decisions compare causes. Words are made of a reason where people read it, by `r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import ClassVar
 
 
 class Cause(str, Enum):
@@ -133,6 +132,8 @@ class Reason:
         because: What led to it, the main reason first.
     """
 
+    omits_defaults: ClassVar = True  # written as plain data, it is the cause and what belongs to it
+
     cause: Cause
     slot: int | None = None
     replica: str = ""
@@ -147,23 +148,6 @@ class Reason:
     limit_usd_per_hour: float | None = None
     words: str = ""
     because: tuple[Reason, ...] = ()
-
-    def to_plain(self) -> dict[str, Any]:
-        """Return its JSON form: the cause and the data that it has."""
-        return asdict(self, dict_factory=plain)
-
-    @classmethod
-    def from_plain(cls, raw: Mapping[str, Any]) -> Reason:
-        """Read the JSON form.
-
-        Raises:
-            ValueError: It is none.
-        """
-        try:
-            because = tuple(cls.from_plain(one) for one in raw.get("because", ()))
-            return cls(**{**raw, "cause": Cause(raw["cause"]), "because": because})
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"not a reason: {error!r}") from error
 
     @property
     def place_at_fault(self) -> bool:
@@ -180,13 +164,6 @@ _MOVES = frozenset(
     {Cause.BETTER_SPREAD, Cause.BETTER_SCORE, Cause.SPOT_AGAIN, Cause.ON_DEMAND_AGAIN}
 )
 _NOT_THE_PLACE = _MOVES | {Cause.OUTDATED}
-
-
-def plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Make a plain map of a dataclass for `asdict`, of a reason without the data it has not."""
-    if items[0][0] != "cause":
-        return dict(items)
-    return {name: value for name, value in items if value not in (None, "", ())}
 
 
 def because(reason: Reason | None) -> tuple[Reason, ...]:

@@ -8,14 +8,20 @@ Not here: decisions (`planner`, `placement`) and the pool file (`spec`).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
+from typing import Annotated
 
-from fogft.model.names import gateway_certificate_name
+from fogft.model.keys import only
+from fogft.model.names import Endpoint, PoolUid, gateway_certificate_name
+from fogft.model.plain import Count
 from fogft.model.reason import Reason
 from fogft.model.topology import Topology
+
+_VERSION = re.compile(r"[\w.-]{0,64}", re.ASCII)
 
 
 @dataclass(frozen=True, order=True)
@@ -28,9 +34,9 @@ class ReplicaId:
         generation: Counts the launches of a slot from 1. A higher one fences off the lower.
     """
 
-    pool_uid: str
-    slot: int
-    generation: int
+    pool_uid: PoolUid
+    slot: Count
+    generation: Count
 
     @property
     def short(self) -> str:
@@ -256,10 +262,10 @@ class Member:
     """
 
     id: ReplicaId
-    endpoint: str
+    endpoint: Endpoint
     draining: bool = False
     gateway: str = ""
-    version: str = ""
+    version: Annotated[str, only(_VERSION.fullmatch)] = ""
 
     @property
     def certificate_name(self) -> str:
@@ -282,9 +288,9 @@ class Membership:
     """
 
     pool: str
-    pool_uid: str
-    epoch: int
-    version: int
+    pool_uid: PoolUid
+    epoch: Count
+    version: Count
     members: tuple[Member, ...] = field(default_factory=tuple)
     revoked: frozenset[str] = frozenset()
     topology: Topology = field(default_factory=Topology)

@@ -4,7 +4,7 @@ Whoever goes through gateways holds links to them and to no replica; all others 
 to the replicas. A gateway may go through others, so they form trees; a loop is refused
 wherever a topology is read.
 
-Owns: the topology, its plain form, and whom a holder talks to.
+Owns: the topology, and whom a holder talks to.
 Not here: the pool file's section (`fogft.poolfile.topology`), links (`fogft.proxy`).
 """
 
@@ -12,12 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
-from fogft.errors import StateError
 from fogft.model.credentials import NAME_PATTERN, Holder, Role
 from fogft.model.keys import Listed, Maps, Text, key, only
 from fogft.model.names import is_endpoint
+from fogft.model.plain import Count
 
 GATEWAYS_LIMIT = 64
 ROBOTS_LIMIT = 512
@@ -50,7 +49,7 @@ class Gateway:
         default=(),
         usual="the replicas",
     )
-    generations: tuple[int, ...] = ()
+    generations: tuple[Count, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -129,53 +128,6 @@ class Topology:
             listed = self.of_robot(holder.name)
         return tuple(g for g in self.gateways if g.name in listed and g.generations)
 
-    def to_plain(self) -> dict[str, Any]:
-        """Return it as plain JSON data."""
-        return {
-            "gateways": [
-                {
-                    "name": g.name,
-                    "endpoint": g.endpoint,
-                    "through": list(g.through),
-                    "generations": list(g.generations),
-                }
-                for g in self.gateways
-            ],
-            "robots": {name: list(through) for name, through in self.robots.items()},
-            "through": list(self.through),
-        }
-
-    @classmethod
-    def from_plain(cls, raw: Any) -> Topology:
-        """Read a topology back.
-
-        Raises:
-            StateError: It is none, or its gateways form a loop.
-        """
-
-        try:
-            gateways = tuple(
-                Gateway(
-                    _name(one["name"]),
-                    one["endpoint"],
-                    _names(one["through"]),
-                    tuple(_generation(g) for g in one["generations"]),
-                )
-                for one in _list(raw["gateways"], GATEWAYS_LIMIT)
-            )
-            if not all(isinstance(g.endpoint, str) and is_endpoint(g.endpoint) for g in gateways):
-                raise ValueError("an endpoint that is not host:port")
-            if len(raw["robots"]) > ROBOTS_LIMIT:
-                raise ValueError("too many robots")
-            routes = tuple(RobotRoute(_name(n), _names(g)) for n, g in raw["robots"].items())
-            topology = cls(gateways, routes, _names(raw["through"]))
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            raise StateError(f"not a topology: {error}") from error
-        wrong = trouble(topology)
-        if wrong:
-            raise StateError(f"not a topology: {wrong}")
-        return topology
-
 
 def certified(topology: Topology, generations: Mapping[str, Iterable[int]]) -> Topology:
     """Return a topology with the generations of each gateway's certificates that are good."""
@@ -222,25 +174,3 @@ def find_loop(through: Mapping[str, Iterable[str]]) -> list[str]:
             else:
                 stack.append((following, iter(through.get(following, ()))))
     return []
-
-
-def _list(raw: Any, limit: int) -> list[Any]:
-    if not isinstance(raw, list) or len(raw) > limit:
-        raise TypeError(f"not a list of at most {limit}")
-    return raw
-
-
-def _names(raw: Any) -> tuple[str, ...]:
-    return tuple(_name(one) for one in _list(raw, GATEWAYS_LIMIT))
-
-
-def _name(raw: Any) -> str:
-    if not isinstance(raw, str) or not NAME_PATTERN.fullmatch(raw):
-        raise ValueError(f"not a name: {raw!r:.40}")
-    return raw
-
-
-def _generation(raw: Any) -> int:
-    if isinstance(raw, bool) or not isinstance(raw, int) or raw < 1:
-        raise ValueError(f"not a generation: {raw!r:.40}")
-    return raw

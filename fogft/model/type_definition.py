@@ -7,7 +7,7 @@ right and are not. So the definitions are compared before the first request.
 A distribution that has type hashes (Iron and later) tells sameness by them. Where either side
 has none (Humble), or to say what differs, fields are compared one by one.
 
-Owns: definitions as values, their plain form for the wire, the comparison.
+Owns: definitions as values, the comparison.
 Not here: reading a type's definition (`fogft.ros.types`), who compares
 (`fogft.proxy.robot.client`).
 """
@@ -17,7 +17,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 REQUEST, RESPONSE = "request", "response"
 _NESTED = re.compile(r"(?:sequence<)?([A-Za-z]\w*/[A-Za-z]\w*)")
@@ -48,40 +47,6 @@ class Definition:
     def known(self) -> bool:
         """Whether it says anything."""
         return bool(self.hash or self.fields or self.trouble or self.service_hash)
-
-
-def to_plain(definition: Definition) -> dict[str, Any]:
-    """Return a definition as JSON values."""
-    return {
-        "hash": definition.hash,
-        "trouble": definition.trouble,
-        "service_hash": definition.service_hash,
-        "fields": {name: [list(one) for one in of] for name, of in definition.fields.items()},
-    }
-
-
-def from_plain(raw: Any) -> Definition:
-    """Return a definition from its JSON values.
-
-    Raises:
-        ValueError: It is none.
-    """
-    try:
-        fields = {
-            _text(name): tuple((_text(key), _text(kind)) for key, kind in of)
-            for name, of in raw["fields"].items()
-        }
-        service_hash = _text(raw.get("service_hash", ""))  # an older replica tells none
-        return Definition(_text(raw["hash"]), fields, _text(raw["trouble"]), service_hash)
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"not a definition: {error!r}") from error
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"not a text in a definition: {value!r:.40}")
-    value.encode()  # a lone surrogate is a ValueError too
-    return value
 
 
 def nested(kind: str) -> str:

@@ -15,8 +15,9 @@ from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.credentials import Holder, holder_of
-from fogft.model.membership import from_parts, to_dict
+from fogft.model.membership import from_content
 from fogft.model.names import gateway_slot, is_endpoint
+from fogft.model.plain import to_plain
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import COUNT_LIMIT, Record, RecordError, RecordKind
 
@@ -99,9 +100,8 @@ def dial_in(record: Record) -> str:
 
 def admission_content(membership: Membership) -> dict[str, Any]:
     """Return a membership as the content of the manager's admission record."""
-    whole = to_dict(membership)
-    content = {"name": whole["pool"], "members": whole["members"]}
-    return {**content, "topology": whole["topology"]} if membership.topology else content
+    whole = to_plain(membership)
+    return {key: whole[key] for key in ("pool", "members", "topology")}
 
 
 def admission(record: Record) -> Membership:
@@ -111,14 +111,8 @@ def admission(record: Record) -> Membership:
         RecordError: Its content is none.
     """
     try:
-        return from_parts(
-            pool=record.content.get("name"),
-            pool_uid=record.pool_uid,
-            epoch=record.generation,
-            version=record.sequence,
-            members=record.content.get("members"),
-            topology=record.content.get("topology"),
-        )
+        order = {"epoch": record.generation, "version": record.sequence}
+        return from_content({**record.content, **order, "pool_uid": record.pool_uid, "revoked": []})
     except StateError as error:
         raise RecordError("malformed", error.message) from error
 

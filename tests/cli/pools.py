@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
-from fogft.model.intent import Intent, to_json
+from fogft.model.intent import Intent
+from fogft.model.plain import to_plain
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, write_identity
 from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
@@ -94,7 +95,7 @@ def lay_down(home: Path, status: PoolStatus | None = STATUS, *, age_s: float = 0
     paths = PoolPaths.of(name, home)
     paths.folder.mkdir(parents=True)
     paths.spec.write_text(SPEC.replace("planner\n", f"{name}\n", 1))
-    paths.intent.write_text(json.dumps(to_json(Intent())))
+    paths.intent.write_text(json.dumps(to_plain(Intent())))
     if status is not None:
         observed: dict[str, Any] = replace(status, observed_at=time.time() - age_s).to_json()
         disk.write_json(paths.status, observed)

@@ -160,9 +160,7 @@ def test_losses_of_the_pool_are_shown(pool, capsys):
     with store.paths.history.open("a") as lines:
         for at, event in ((now - 200, "launch"), (now - 190, "ready"), (now - 60, "gone")):
             lines.write(
-                json.dumps(
-                    {"at": at, "event": event, "slot": 0, "generation": 1, "location": place}
-                )
+                json.dumps({"at": at, "kind": event, "slot": 0, "generation": 1, "location": place})
                 + "\n"
             )
     assert main.run(["plan", str(pool), "--json"]) == 0

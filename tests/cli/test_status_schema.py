@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 
 from fogft.cli import main
+from fogft.model.plain import from_plain, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.commands.status import Seen
@@ -89,6 +90,6 @@ def test_the_schema_in_the_docs_is_this_one() -> None:
 
 
 def test_a_reason_survives_json() -> None:
-    assert Reason.from_plain(json.loads(json.dumps(FULL.to_plain()))) == FULL
+    assert from_plain(Reason, json.loads(json.dumps(to_plain(FULL)))) == FULL
     assert all(getattr(FULL, field.name) for field in fields(FULL)), "every field is tried"
-    assert Reason(Cause.NOTICE).to_plain() == {"cause": "preemption_notice"}
+    assert to_plain(Reason(Cause.NOTICE)) == {"cause": "preemption_notice"}

@@ -11,6 +11,7 @@ import pytest
 from fogft import disk
 from fogft.cli import main, progress
 from fogft.errors import FogftError, SpecError
+from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.pool.commands import composition, init, preview, startup
 from fogft.pool.commands.status import Seen, refreshed
@@ -245,7 +246,7 @@ def test_a_file_that_was_given_up_is_not_announced_as_a_change(home, file, looks
     file.write_text(POOL.replace("_service", "_node"))
     disk.write_whole(paths.spec, file.read_text())
     fault = Reason(Cause.REPLICA_FAILS, replica="0.2", because=(Reason(Cause.SETUP),))
-    trial = {"file": digest(file.read_bytes()), "began_at": 1.0, "fault": fault.to_plain()}
+    trial = {"file": digest(file.read_bytes()), "began_at": 1.0, "fault": to_plain(fault)}
     disk.write_json(paths.trial, trial)
     looks(updated(file, "rolled back", words(fault)))
     assert main.run(["up", str(file)]) == 1

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from fogft.errors import FogftError, StateError
 from fogft.model import intent as intents
 from fogft.model.intent import Intent
+from fogft.model.plain import from_plain, stored, to_plain
 from tests.planning.pool_worlds import spec
 
 counts = st.one_of(st.none(), st.integers(0, 16))
@@ -32,17 +33,17 @@ anything = st.recursive(
 @given(made)
 def test_json_round_trip(intent: Intent) -> None:
     """What is written is what is read."""
-    assert intents.from_json(intents.to_json(intent)) == intent
+    assert from_plain(Intent, to_plain(intent)) == intent
 
 
-@given(made, st.sampled_from(sorted(intents.to_json(Intent()))), anything)
+@given(made, st.sampled_from(sorted(to_plain(Intent()))), anything)
 def test_garbage_is_an_error_or_a_valid_intent(intent: Intent, key: str, junk: object) -> None:
     """A damaged file raises StateError and nothing else."""
     try:
-        read = intents.from_json({**intents.to_json(intent), key: junk})
+        read = stored(Intent, {**to_plain(intent), key: junk}, "not an intent")
     except StateError:
         return
-    assert intents.from_json(intents.to_json(read)) == read
+    assert from_plain(Intent, to_plain(read)) == read
 
 
 @given(st.integers(1, 8), st.lists(st.sampled_from([-2, -1, 1, 2]), max_size=10))

@@ -410,7 +410,7 @@ def test_where_all_rest_the_one_resting_longest_is_tried_once_a_minute():
     assert Reason(Cause.FAILED_LONGEST_AGO) in launch.reason.because
     again = replace(world, events=(*world.events, *refused("b/r/1", 59.0, generation=21)))
     assert not again.plan().launches
-    quota = tuple(e._replace(reason=e.reason and Reason(Cause.QUOTA)) for e in world.events)
+    quota = tuple(replace(e, reason=e.reason and Reason(Cause.QUOTA)) for e in world.events)
     assert not replace(world, events=quota).plan().launches
 
 

@@ -120,7 +120,7 @@ def test_a_slot_is_written_by_its_own_launch_only(role, common_name):
 
 @pytest.mark.parametrize("kind", [RecordKind.ADMISSION, RecordKind.TOPOLOGY, RecordKind.REVOCATION])
 def test_only_the_manager_admits_and_revokes(kind):
-    content = {"name": "p", "members": [], "names": []}
+    content = {"pool": "p", "members": [], "names": []}
     record = Record(UID, kind, "", 9, 9, content)
     held = merged(world.signed(record))
     assert held.get(kind) == record

@@ -20,7 +20,7 @@ import contextlib
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,8 @@ from typing import Any
 from fogft import disk
 from fogft.cloud.local import processes
 from fogft.errors import CloudError, StateError
-from fogft.model.reason import Reason, plain
+from fogft.model.plain import stored, to_plain
+from fogft.model.reason import Reason
 from fogft.model.replica import MachinePhase, Placement, ReplicaId
 
 RECORD = "machine.json"
@@ -154,37 +155,16 @@ class MachineFolder:
     def record(self) -> Record:
         """Return the order."""
         raw = disk.read_json(self.path / RECORD)
-        try:
-            return Record(
-                id=ReplicaId(**raw["id"]),
-                pool=str(raw["pool"]),
-                placement=Placement(**raw["placement"]),
-                usd_per_hour=float(raw["usd_per_hour"]),
-                spec_hash=str(raw["spec_hash"]),
-                launched_at=float(raw["launched_at"]),
-                boot_s=float(raw["boot_s"]),
-                notice_s=float(raw["notice_s"]),
-                relay=bool(raw["relay"]),
-                serve=tuple(map(str, raw["serve"])),
-                task=dict(raw["task"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise StateError(f"`{self.path / RECORD}` is damaged: {error!r}") from error
+        return stored(Record, raw, f"`{self.path / RECORD}` is damaged")
 
     def state(self) -> State | None:
         """Return how far the machine has come; None if its process never ran."""
         raw = disk.read_json(self.path / STATE)
-        if raw is None:
-            return None
-        try:
-            failure = Reason.from_plain(raw["failure"]) if raw["failure"] else None
-            return State(**{**raw, "phase": MachinePhase(raw["phase"]), "failure": failure})
-        except (KeyError, TypeError, ValueError) as error:
-            raise StateError(f"`{self.path / STATE}` is damaged: {error!r}") from error
+        return None if raw is None else stored(State, raw, f"`{self.path / STATE}` is damaged")
 
     def write_state(self, state: State) -> None:
         """Say how far the machine has come. Raises `StateError` on a full disk."""
-        disk.write_json(self.path / STATE, asdict(state, dict_factory=plain), durable=False)
+        disk.write_json(self.path / STATE, to_plain(state), durable=False)
 
     def notice_at(self) -> float | None:
         """Return when a preempted machine ends; None without a notice."""
@@ -227,7 +207,7 @@ def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes])
         beside.mkdir(mode=0o700)
         for name, content in files.items():
             disk.write_whole(beside / name, content, durable=False)
-        disk.write_json(beside / RECORD, asdict(record), durable=False)
+        disk.write_json(beside / RECORD, to_plain(record), durable=False)
         beside.rename(folder.path)
     except (OSError, StateError, TypeError, ValueError) as error:
         with contextlib.suppress(OSError):

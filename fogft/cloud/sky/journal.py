@@ -14,15 +14,15 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from fogft.cloud.sky.naming import cluster_name, replica_of
 from fogft.disk import locked, make_folder, read_json, write_json, write_whole
-from fogft.errors import StateError
-from fogft.model.reason import Reason, plain
+from fogft.model.plain import stored, to_plain
+from fogft.model.reason import Reason
 from fogft.model.replica import Placement, ReplicaId
 
 
@@ -120,7 +120,7 @@ class Journal:
     def get(self, id: ReplicaId) -> Entry | None:
         """Return an entry, or None. Raises StateError: it cannot be read."""
         value = read_json(self._path(id))
-        return None if value is None else _entry(value, self._path(id))
+        return None if value is None else stored(Entry, value, f"`{self._path(id)}` is damaged")
 
     def entries(self, pool_uid: str = "") -> list[Entry]:
         """Return the entries of one pool, or of all, ordered by id.
@@ -144,19 +144,4 @@ class Journal:
         return self._folder / f"{cluster_name(id)}.json"
 
     def _write(self, entry: Entry) -> None:
-        write_json(self._path(entry.id), asdict(entry, dict_factory=plain))
-
-
-def _entry(value: Any, path: Path) -> Entry:
-    try:
-        return Entry(
-            **{
-                **value,
-                "id": ReplicaId(**value["id"]),
-                "placement": Placement(**value["placement"]),
-                "stage": Stage(value["stage"]),
-                "failure": Reason.from_plain(value["failure"]) if value["failure"] else None,
-            }
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise StateError(f"`{path}` is damaged: {error}") from error
+        write_json(self._path(entry.id), to_plain(entry))

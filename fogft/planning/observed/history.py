@@ -16,9 +16,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from operator import itemgetter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
-from fogft.errors import StateError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import supply
 from fogft.planning.observed.expiring import Expiring, TtlCache, outdate
@@ -50,7 +49,8 @@ CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
 _ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
 
 
-class Event(NamedTuple):
+@dataclass(frozen=True)
+class Event:
     """One thing that happened.
 
     Attributes:
@@ -61,6 +61,8 @@ class Event(NamedTuple):
         by_s: Of CLOCK and SLEPT: so much later is all that was remembered before.
     """
 
+    omits_defaults: ClassVar = True  # written as plain data
+
     at: float
     kind: EventKind
     slot: int
@@ -69,45 +71,6 @@ class Event(NamedTuple):
     reason: Reason | None = None
     on_demand: bool = False
     by_s: float = 0.0
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the event as a JSON object."""
-        out: dict[str, Any] = {
-            "at": self.at,
-            "event": self.kind.value,
-            "slot": self.slot,
-            "generation": self.generation,
-        }
-        if self.location:
-            out["location"] = self.location
-        if self.reason is not None:
-            out["reason"] = self.reason.to_plain()
-        if self.on_demand:
-            out["on_demand"] = True
-        if self.by_s:
-            out["by_s"] = self.by_s
-        return out
-
-    @classmethod
-    def from_json(cls, value: Any) -> Event:
-        """Read one event back.
-
-        Raises:
-            StateError: It is not an event.
-        """
-        try:
-            return cls(
-                at=float(value["at"]),
-                kind=EventKind(value["event"]),
-                slot=int(value["slot"]),
-                generation=int(value["generation"]),
-                location=str(value.get("location", "")),
-                reason=Reason.from_plain(value["reason"]) if "reason" in value else None,
-                on_demand=bool(value.get("on_demand", False)),
-                by_s=float(value.get("by_s", 0.0)),
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise StateError(f"not an event: `{value!r:.120}`") from error
 
 
 @dataclass

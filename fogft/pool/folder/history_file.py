@@ -16,6 +16,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
+from fogft.model.plain import from_plain, to_plain
 from fogft.planning.observed.history import Event, History, compacted
 
 COMPACT_AFTER = 20_000
@@ -77,7 +78,7 @@ class HistoryFile:
 
 
 def _line(event: Event) -> str:
-    return json.dumps(event.to_json()) + "\n"
+    return json.dumps(to_plain(event)) + "\n"
 
 
 def _append_durably(path: Path, line: bytes) -> None:
@@ -115,6 +116,6 @@ def _read_events(path: Path) -> list[Event]:
 def _event(line: bytes) -> Event | None:
     try:
         value: Any = json.loads(line)
-        return Event.from_json(value)
+        return from_plain(Event, value)
     except (ValueError, StateError):
         return None

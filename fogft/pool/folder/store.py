@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from fogft import disk
 from fogft.errors import PoolNotFound, SpecError, StateError
-from fogft.model.intent import Intent, from_json, to_json
+from fogft.model.intent import Intent
 from fogft.model.membership import from_dict, to_dict
-from fogft.model.names import POOL_UID_PATTERN
-from fogft.model.reason import Reason, plain
+from fogft.model.names import PoolUid
+from fogft.model.plain import from_plain, stored, to_plain
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import Event, History
@@ -38,7 +38,7 @@ class Identity:
     """
 
     name: str
-    uid: str
+    uid: PoolUid
     cloud: str
     file: str
     created_at: float
@@ -201,11 +201,8 @@ class PoolStore:
         """Return what is remembered of the file applied last, or of an earlier one."""
         try:
             raw = disk.read_json(self.paths.trial)
-            if raw is None:
-                return Trial()
-            fault = Reason.from_plain(raw["fault"]) if raw["fault"] else None
-            return Trial(**{**raw, "fault": fault})
-        except (StateError, TypeError, ValueError, KeyError):
+            return Trial() if raw is None else from_plain(Trial, raw)
+        except (StateError, ValueError):
             return Trial()  # damaged: the file is tried again
 
     def write_trial(self, trial: Trial) -> None:
@@ -214,16 +211,16 @@ class PoolStore:
         Raises:
             StateError: It cannot be written.
         """
-        disk.write_json(self.paths.trial, asdict(trial, dict_factory=plain))
+        disk.write_json(self.paths.trial, to_plain(trial))
 
     def intent(self) -> Intent:
         """Return what the user wants besides the file; nothing where nothing was asked."""
         raw = disk.read_json(self.paths.intent)
-        return Intent() if raw is None else from_json(raw)
+        return Intent() if raw is None else stored(Intent, raw, "not an intent")
 
     def write_intent(self, intent: Intent) -> None:
         """Store the user's wishes; the caller holds `intent_lock`."""
-        disk.write_json(self.paths.intent, to_json(intent))
+        disk.write_json(self.paths.intent, to_plain(intent))
 
     def history(self) -> History:
         """Return what happened so far."""
@@ -269,21 +266,9 @@ def read_identity(paths: PoolPaths) -> Identity:
     raw = disk.read_json(paths.identity)
     if raw is None:
         raise PoolNotFound(f"there is no pool `{paths.folder.name}`", "`fogft up FILE` starts one")
-    try:
-        identity = Identity(
-            name=str(raw["name"]),
-            uid=str(raw["uid"]),
-            cloud=str(raw["cloud"]),
-            file=str(raw["file"]),
-            created_at=float(raw["created_at"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise StateError(f"`{paths.identity}` is damaged: {error!r}") from error
-    if not POOL_UID_PATTERN.fullmatch(identity.uid):
-        raise StateError(f"`{paths.identity}` is damaged: `uid` is not 16 hexadecimal digits")
-    return identity
+    return stored(Identity, raw, f"`{paths.identity}` is damaged")
 
 
 def write_identity(paths: PoolPaths, identity: Identity) -> None:
     """Store what a pool is; the caller holds `intent_lock`."""
-    disk.write_json(paths.identity, asdict(identity))
+    disk.write_json(paths.identity, to_plain(identity))

@@ -6,12 +6,13 @@ Not here: how it is shown (`fogft.cli`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fogft.errors import StateError
-from fogft.model.reason import Cause, Reason, plain
+from fogft.model.plain import from_plain, to_plain
+from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
 from fogft.planning.observed.history import MOVING, Event, EventKind, History
 from fogft.reason_words import words
@@ -175,7 +176,7 @@ class PoolStatus:
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form."""
-        return asdict(self, dict_factory=plain)
+        return dict(to_plain(self))
 
 
 def from_json(raw: Any) -> PoolStatus:
@@ -185,23 +186,9 @@ def from_json(raw: Any) -> PoolStatus:
         StateError: It is none, or of another version of fogft.
     """
     try:
-        update = raw["update"]
-        found = {
-            "replicas": [_with_reason(ReplicaStatus, one) for one in raw["replicas"]],
-            "by_hand": [_with_reason(ReplicaStatus, one) for one in raw["by_hand"]],
-            "services": [ServiceStatus(**one) for one in raw["services"]],
-            "events": [_with_reason(EventStatus, one) for one in raw["events"]],
-            "update": _with_reason(UpdateStatus, update) if update else None,
-            "reasons": [Reason.from_plain(one) for one in raw["reasons"]],
-        }
-        return PoolStatus(**{**raw, **found})
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        return from_plain(PoolStatus, raw)
+    except ValueError as error:
         raise StateError(f"not a status: {error}", "is the manager of another version?") from error
-
-
-def _with_reason(cls: Callable[..., T], raw: Mapping[str, Any]) -> T:
-    reason = raw["reason"]
-    return cls(**{**raw, "reason": Reason.from_plain(reason) if reason else None})
 
 
 def of_tick(
@@ -271,7 +258,13 @@ def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
         return {}
     links = [dict(one) for one in report.gateways] if report is not None else []
     robot = report.robot if report is not None else ""
-    return {"robot": robot, **here.to_plain(), "links": links}
+    return {
+        "robot": robot,
+        "gateways": to_plain(here.gateways),
+        "robots": here.robots,
+        "through": here.through,
+        "links": links,
+    }
 
 
 def _without_certificate(tick: Tick) -> list[Reason]:

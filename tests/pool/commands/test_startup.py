@@ -80,7 +80,7 @@ def test_an_up_cut_short_is_an_up_that_never_was(scene: Scene) -> None:
     """Without the identity there is no pool, and the next `up` starts over with a new CA."""
     first = scene.write()
     scene.paths.identity.unlink()
-    scene.paths.history.write_text('{"at": 1, "event": "launch", "slot": 0, "generation": 7}\n')
+    scene.paths.history.write_text('{"at": 1, "kind": "launch", "slot": 0, "generation": 7}\n')
     with pytest.raises(PoolNotFound):
         scene.store.identity()
     second = scene.write()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -40,7 +41,7 @@ def test_history_outlives_the_process(pool: Scene) -> None:
     assert pool.paths.history.stat().st_mode & 0o777 == 0o600
 
 
-@pytest.mark.parametrize("torn", ["{", '{"at": 3, "event": "rea', "\x00\x00\x00", "null"])
+@pytest.mark.parametrize("torn", ["{", '{"at": 3, "kind": "rea', "\x00\x00\x00", "null"])
 def test_torn_last_line_costs_that_line_only(pool: Scene, torn: str) -> None:
     """A crash in the middle of a write loses nothing before it and nothing after it."""
     pool.store.append(LAUNCH)
@@ -64,7 +65,7 @@ def test_full_disk_is_an_error_and_nothing_has_happened(
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
         with pytest.raises(StateError, match="No space left"):
-            pool.store.append(LAUNCH._replace(generation=2))
+            pool.store.append(replace(LAUNCH, generation=2))
     assert pool.store.history().generation(0) == 1
     assert store_of(pool.home).recent() == [LAUNCH]
 
