@@ -10,8 +10,8 @@ from pathlib import Path
 from fogft import disk
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
 from fogft.errors import CredentialError, FogftError
+from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
-from fogft.model.middleware import Speaks
 from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths

@@ -18,6 +18,7 @@ from fogft.model.keys import (
     Map,
     Maps,
     Number,
+    OneOf,
     Special,
     Table,
     Text,
@@ -49,6 +50,29 @@ class Compression(str, Enum):
 
     AUTO = "auto"  # where it pays, as measured
     OFF = "off"
+
+
+class Speaks(str, Enum):
+    """How a proxy speaks ROS."""
+
+    RCLPY = "rclpy"  # by the ROS 2 that is installed where it runs, whatever its middleware
+    ZENOH = "zenoh"  # as the nodes of `rmw_zenoh` do, with no ROS installed
+
+
+@dataclass(frozen=True)
+class Middleware:
+    """How each side's proxy speaks ROS."""
+
+    robot: Speaks = key(
+        OneOf(Speaks),
+        "How every robot's client proxy talks to the robot's nodes.",
+        default=Speaks.RCLPY,
+    )
+    replica: Speaks = key(
+        OneOf(Speaks),
+        "How every replica's server proxy talks to what `run` starts; a change replaces replicas.",
+        default=Speaks.RCLPY,
+    )
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from fogft.model.choices import Speaks
 from fogft.model.credentials import CredentialPaths
 from fogft.model.keys import (
     PATH,
@@ -25,7 +26,6 @@ from fogft.model.keys import (
     key,
     only,
 )
-from fogft.model.middleware import Speaks
 from fogft.model.names import NOTICE_SOURCES, POOL_UID_PATTERN, ROBOT_BYTES_LIMIT, is_endpoint
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec

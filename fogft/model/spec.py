@@ -19,10 +19,12 @@ from fogft.model.choices import (
     Freshness,
     GroupSpec,
     MetricsSpec,
+    Middleware,
     MigrationSpec,
     OnDemandSpec,
     PlacementSpec,
     ScheduleSpec,
+    Speaks,
     TrafficSpec,
 )
 from fogft.model.keys import (
@@ -39,7 +41,6 @@ from fogft.model.keys import (
     key,
     only,
 )
-from fogft.model.middleware import Middleware, Speaks
 from fogft.model.names import is_endpoint
 from fogft.model.ros_names import (
     absolute_service_name,

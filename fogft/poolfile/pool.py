@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
-from fogft.model.choices import MAX_REPLICAS, GroupSpec
+from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
 from fogft.model.groups import MAX_GROUPS
-from fogft.model.middleware import Speaks
 from fogft.model.names import POOL_NAME_PATTERN
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.errors import StateError
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig, ServerProxyConfig
 from fogft.poolfile import config_file
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fogft.errors import RosError
 from fogft.model.cdr import Shape
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from fogft.model.type_definition import RESPONSE, Definition
 from fogft.proxy import start
 from fogft.ros import environment, memory_tuning

@@ -24,7 +24,7 @@ from typing import Any
 import zenoh
 from zenoh import handlers
 
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from fogft.proxy import middleware
 from fogft.ros import memory_tuning
 from tests.bench.floor import configuration

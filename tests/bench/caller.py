@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from fogft.proxy import middleware
 from tests.bench.service import FLAG, MAP
 

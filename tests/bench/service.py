@@ -17,7 +17,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from fogft.model.topic import ActionSpec, Origin, TopicSpec
 from fogft.poolfile.actions import action_services
 from fogft.proxy import middleware

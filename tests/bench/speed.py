@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from tests.bench import machine
 from tests.bench.caller import Caller, Flood, milliseconds, payloads
 from tests.bench.floor import Floor

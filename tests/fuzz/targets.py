@@ -96,7 +96,7 @@ def _records() -> list[SignedRecord]:
     member = {"slot": 0, "generation": 1, "endpoint": "h:1", "draining": False}
     return [
         _record(RecordKind.SLOT, "0", REPLICA, slot),
-        _record(RecordKind.ADMISSION, "", MANAGER, {"name": "p", "members": [member]}),
+        _record(RecordKind.ADMISSION, "", MANAGER, {"pool": "p", "members": [member]}),
         _record(RecordKind.REVOCATION, "", MANAGER, {"names": [f"robot.eve.1.{UID}"]}),
     ]
 

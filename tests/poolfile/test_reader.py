@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import SpecError
 from fogft.model import ros_names
-from fogft.model.choices import Compression, Freshness
-from fogft.model.middleware import Middleware, Speaks
+from fogft.model.choices import Compression, Freshness, Middleware, Speaks
 from fogft.model.names import POOL_NAME_PATTERN
 from fogft.model.spec import HealthSpec, HedgingMode, OnTimeout, PoolSpec, ServiceSpec
 from fogft.poolfile.plain import to_plain

@@ -11,7 +11,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.errors import StateError
 from fogft.model import ros_names
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec

@@ -23,7 +23,7 @@ from fogft.link.uplinks import UplinkDialer
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.model import names
-from fogft.model.middleware import Speaks
+from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.spec import Part, ServiceSpec
 from fogft.process import start_log, stop_on_signal

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft.model.choices import MetricsSpec
-from fogft.model.middleware import Middleware, Speaks
+from fogft.model.choices import MetricsSpec, Middleware, Speaks
 from fogft.model.replica import Offer, Placement, ReplicaId
 from fogft.model.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
 from fogft.planning.planner import PlannedLaunch
