@@ -12,7 +12,6 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol
 
 from fogft.cloud.port import Launch
 from fogft.errors import NoCapacity
@@ -24,15 +23,11 @@ RETRY_S = 60.0
 
 
 class Fleet:
-    """Machines ordered by a fixed policy.
-
-    Attributes:
-        ordered: Each machine ordered and not yet refused, ended or missed.
-    """
+    """Machines ordered by a fixed policy."""
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.ordered: dict[ReplicaId, Offer] = {}
+        self.ordered: dict[ReplicaId, Offer] = {}  # not yet refused, ended or missed
         self._accepted: set[ReplicaId] = set()
         self._launched = 0
 
@@ -70,8 +65,7 @@ class Fleet:
 
     def leaving(self, id: ReplicaId) -> bool:
         """Whether a machine has a notice."""
-        vm = self.world.vms.get(id)
-        return vm is not None and vm.noticed
+        return id in self.world.vms and self.world.vms[id].noticed
 
 
 class Static:
@@ -180,11 +174,15 @@ class Search:
             self._spot_from = self._fleet.world.now + RETRY_S
 
 
-class Rule(Protocol):
+class Rule:
     """Where the next spot machine is ordered."""
+
+    def __init__(self, spot: Sequence[Offer]) -> None:
+        self._spot = spot
 
     def place(self, taken: Sequence[Offer]) -> Offer:
         """Return the offer to order, given those in use."""
+        raise NotImplementedError
 
     def lost(self, offer: Offer) -> None:
         """Take into account that a location took a machine away, or had no room."""
@@ -193,7 +191,7 @@ class Rule(Protocol):
         """Take into account that a machine became ready there."""
 
 
-class InTurn:
+class InTurn(Rule):
     """The next location of a list, wherever the others are: round robin."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
@@ -203,20 +201,14 @@ class InTurn:
         """Return the next offer."""
         return next(self._turns)
 
-    def lost(self, offer: Offer) -> None:
-        """Remember nothing."""
 
-    def ready(self, offer: Offer) -> None:
-        """Remember nothing."""
-
-
-class Naive:
+class Naive(Rule):
     """The cheapest location with the fewest replicas, not again where it just failed."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
+        super().__init__(spot)
         self._failed: dict[str, int] = {}
         self._failures = itertools.count(1)
-        self._spot = spot
 
     def place(self, taken: Sequence[Offer]) -> Offer:
         """Return the offer to order: of equals the one whose failure is longest ago."""
@@ -235,11 +227,8 @@ class Naive:
         """Ask there last."""
         self._failed[offer.placement.location] = next(self._failures)
 
-    def ready(self, offer: Offer) -> None:
-        """Remember nothing."""
 
-
-class ActiveZones:
+class ActiveZones(Rule):
     """SkyServe's spot placer: the cheapest active location with the fewest replicas.
 
     A location is active until a replica is lost or refused there, and again once one becomes
@@ -247,7 +236,7 @@ class ActiveZones:
     """
 
     def __init__(self, spot: Sequence[Offer]) -> None:
-        self._spot = spot
+        super().__init__(spot)
         self._preempted: set[str] = set()
 
     def place(self, taken: Sequence[Offer]) -> Offer:

@@ -10,7 +10,7 @@ import logging
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -96,10 +96,6 @@ class Estimate:
     low: float
     high: float
 
-    def to_json(self) -> dict[str, float]:
-        """Return mean and interval."""
-        return dict(self.__dict__)
-
 
 @dataclass(frozen=True)
 class Row:
@@ -131,10 +127,10 @@ class Row:
         """Return all figures."""
         out: dict[str, Any] = {"policy": self.name}
         for figure in FIGURES:
-            out[figure] = self.estimate(figure).to_json()
+            out[figure] = asdict(self.estimate(figure))
         out["usd_per_month"] = out["usd_per_hour"]["mean"] * HOURS_A_MONTH
         out["longest_outage_s"] = self.longest_outage_s
-        out["by_seed"] = [o.to_json() for o in self.outcomes]
+        out["by_seed"] = [asdict(o) for o in self.outcomes]
         return out
 
 
@@ -222,22 +218,20 @@ def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
 
 
 def compare(scenario: Scenario, told: Callable[[int], None] = lambda done: None) -> list[Row]:
-    """Run every policy in every market.
-
-    Args:
-        scenario: What is simulated.
-        told: Called with the number of runs done.
-    """
+    """Run every policy in every market; `told` is called with the number of runs done."""
     made = policies(scenario)
     outcomes: dict[str, list[Outcome]] = {name: [] for name in made}
     curves: dict[str, tuple[tuple[float, int], ...]] = {}
-    for done, (seed, name, world) in enumerate(_worlds(scenario, made)):
-        told(done)
-        with unlogged():
-            meter = world.run(made[name](world))
-        outcomes[name].append(meter.outcome())
-        if seed == scenario.seeds[0]:
-            curves[name] = tuple((at - meter.begin_s, ready) for at, ready in meter.curve)
+    for index, seed in enumerate(scenario.seeds):
+        market = scenario.market(seed)
+        for number, (name, make) in enumerate(made.items()):
+            told(index * len(made) + number)
+            world = World(market, seed=seed, length_s=scenario.length_s, settle_s=SETTLE_S)
+            with unlogged():
+                meter = world.run(make(world))
+            outcomes[name].append(meter.outcome())
+            curve = tuple((at - meter.begin_s, ready) for at, ready in meter.curve)
+            curves.setdefault(name, curve)
     return [Row(name, tuple(outcomes[name]), curves[name]) for name in made]
 
 
@@ -251,20 +245,3 @@ def unlogged() -> Iterator[None]:
         yield
     finally:
         log.setLevel(before)
-
-
-def _worlds(scenario: Scenario, made: Mapping[str, Factory]) -> Iterator[tuple[int, str, World]]:
-    for seed in scenario.seeds:
-        market = scenario.market(seed)
-        for name in made:
-            yield (
-                seed,
-                name,
-                World(
-                    market,
-                    seed=seed,
-                    length_s=scenario.length_s,
-                    settle_s=SETTLE_S,
-                    keep_curve=seed == scenario.seeds[0],
-                ),
-            )

@@ -42,7 +42,6 @@ class _Generator:
         self._regimes: dict[str, Moments] = {}
 
     def timelines(self, locations: Sequence[str]) -> dict[str, Timeline]:
-        """Return each location's timeline."""
         own = self._rates.strikes * (1 - self._rates.together)
         shared = self._rates.strikes * self._rates.together
         common: dict[str, Moments] = {}

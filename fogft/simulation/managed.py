@@ -32,8 +32,8 @@ LOOK_EVERY_S = 6 * 3600.0  # a safety net: tests show that the results do not de
 _COMPACT_AFTER = 2_000
 
 
-class Memory:
-    """Implements `fogft.pool.folder.store.Store` in memory."""
+class _Memory:
+    """Implements `fogft.pool.folder.store.Store`, of a pool file that never changes."""
 
     def __init__(self, spec: PoolSpec, now: float) -> None:
         self.the_spec = spec
@@ -44,56 +44,44 @@ class Memory:
         self._history = History()
 
     def identity(self) -> Identity:
-        """Return what the pool is."""
         return self._identity
 
     def spec(self) -> PoolSpec:
-        """Return the pool file."""
         return self.the_spec
 
     def applied(self) -> str:
-        """Return a digest: the file never changes."""
         return _TRIAL.file
 
     def good(self) -> PoolSpec | None:
-        """Return the pool file: no other one is ever on trial."""
         return self.the_spec
 
     def keep_good(self, spec: PoolSpec) -> bool:
-        """Keep nothing: the good file is the pool file."""
         return False
 
     def trial(self) -> Trial:
-        """Return what never changes."""
         return _TRIAL
 
     def write_trial(self, trial: Trial) -> None:
-        """Remember nothing."""
+        pass
 
     def intent(self) -> Intent:
-        """Return no wishes besides the file."""
         return _NO_WISHES
 
     def history(self) -> History:
-        """Return what happened so far."""
         return self._history
 
     def append(self, event: Event) -> None:
-        """Remember an event."""
         self._appended += 1
         self.events.append(event)
         self._history.add(event)
 
     def membership(self) -> Membership | None:
-        """Return the membership as last written."""
         return self.published
 
     def write_membership(self, membership: Membership) -> None:
-        """Publish a membership."""
         self.published = membership
 
     def compact(self, now: float) -> None:
-        """Forget what no decision needs, as the store on disk does from time to time."""
         if self._appended > _COMPACT_AFTER:
             self._appended = 0
             self.events = compacted(self.events, now, history=self._history)
@@ -114,7 +102,7 @@ class Managed:
     def __init__(self, world: World, spec: PoolSpec, target: Target) -> None:
         self.world = world
         self.wanted = target
-        self.store = Memory(replace(spec, max_hours=None), world.now)  # a run is as long as asked
+        self.store = _Memory(replace(spec, max_hours=None), world.now)  # a run is as long as asked
         health = spec.health
         patience_s = health.replace_after_s
         world.silences = [

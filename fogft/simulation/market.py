@@ -34,13 +34,7 @@ def remembered(find: FindOffers) -> FindOffers:
 
 @dataclass(frozen=True)
 class Market:
-    """Where, when and at what price.
-
-    Attributes:
-        find: What can be bought for a task's `resources`, as a cloud answers it.
-        timelines: Location -> its capacity for spot machines. A location without one
-            sells on-demand machines only.
-    """
+    """What can be bought, and each location's capacity for spot machines (none: on demand only)."""
 
     find: FindOffers
     timelines: Mapping[str, Timeline]
@@ -57,17 +51,12 @@ class Market:
 
 @dataclass(frozen=True)
 class Change:
-    """A location's capacity changes.
+    """A location's capacity changes."""
 
-    Attributes:
-        at_s: From here on no more machines than `capacity` are accepted.
-        ends_s: When machines beyond it end; after `at_s` where there is a notice.
-    """
-
-    at_s: float
+    at_s: float  # from here on no more machines than `capacity` are accepted
     location: str
     capacity: int
-    ends_s: float
+    ends_s: float  # when machines beyond it end; after `at_s` where there is a notice
 
 
 def changes(market: Market, tick_s: float) -> Iterator[Change]:
@@ -80,15 +69,12 @@ def changes(market: Market, tick_s: float) -> Iterator[Change]:
         came_s = 0.0
         for at, capacity in timeline.changes:
             at_s = rounded_up(at, tick_s)
-            if capacity > before:
-                came_s = at_s
-                yield Change(at_s, location, capacity, at_s)
-            else:
+            announced_s = at_s
+            if capacity <= before:
                 notice_s = rounded_up(market.timing.notice_s, tick_s)
                 announced_s = max(came_s, at_s - notice_s, 0.0)
-                yield Change(announced_s, location, capacity, at_s)
-                came_s = announced_s
-            before = capacity
+            yield Change(announced_s, location, capacity, at_s)
+            came_s, before = announced_s, capacity
 
 
 def rounded_up(seconds: float, tick_s: float) -> float:

@@ -6,7 +6,6 @@ Owns: adding up between events.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 HOURS_A_MONTH = 730.0
 DAY_S = 86_400.0
@@ -36,17 +35,12 @@ class Outcome:
     outages: int
     longest_outage_s: float
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures by name."""
-        return dict(self.__dict__)
-
 
 @dataclass
 class Meter:
-    """Adds up what happens from `begin_s` on; `curve` keeps each step if asked to."""
+    """Adds up what happens from `begin_s` on; `curve` is from when how many served."""
 
     begin_s: float
-    keep_curve: bool = False
     seconds: float = 0.0
     wanted_s: float = 0.0
     up_s: float = 0.0
@@ -60,7 +54,7 @@ class Meter:
     longest_outage_s: float = 0.0
     curve: list[tuple[float, int]] = field(default_factory=list)
     _down_s: float = 0.0
-    _pending: tuple[float, float, int, int, float] | None = None
+    _pending: tuple[float, int, int, float] = (0.0, -1, 0, 0.0)  # unlike any other
 
     def pass_time(
         self, now_s: float, seconds: float, *, ready: int, wanted: int, usd_per_hour: float
@@ -73,17 +67,17 @@ class Meter:
         seconds = min(seconds, now_s - self.begin_s)
         if seconds <= 0:
             return
-        if self._pending is not None:
-            _, before_s, *same = self._pending
-            if same == [ready, wanted, usd_per_hour]:
-                self._pending = (now_s, before_s + seconds, ready, wanted, usd_per_hour)
-                return
-            self._add(*self._pending)
-        self._pending = (now_s, seconds, ready, wanted, usd_per_hour)
+        before_s, *same = self._pending
+        if same != [ready, wanted, usd_per_hour]:
+            self._add_pending()
+            before_s = 0.0
+            if not self.curve or self.curve[-1][1] != ready:
+                self.curve.append((now_s - seconds, ready))
+        self._pending = (before_s + seconds, ready, wanted, usd_per_hour)
 
-    def _add(
-        self, now_s: float, seconds: float, ready: int, wanted: int, usd_per_hour: float
-    ) -> None:
+    def _add_pending(self) -> None:
+        seconds, ready, wanted, usd_per_hour = self._pending
+        self._pending = (0.0, ready, wanted, usd_per_hour)
         self.seconds += seconds
         self.ready_s += seconds * ready
         self.usd += seconds / 3600.0 * usd_per_hour
@@ -93,12 +87,10 @@ class Meter:
             self.up_s += seconds if ready else 0.0
         if ready or not wanted:
             self._down_s = 0.0
-        else:
+        elif seconds:
             self.outages += self._down_s == 0.0
             self._down_s += seconds
             self.longest_outage_s = max(self.longest_outage_s, self._down_s)
-        if self.keep_curve and (not self.curve or self.curve[-1][1] != ready):
-            self.curve.append((now_s - seconds, ready))
 
     def counts(self, now_s: float) -> bool:
         """Whether what happens now is counted."""
@@ -106,9 +98,7 @@ class Meter:
 
     def outcome(self) -> Outcome:
         """Return the figures so far."""
-        if self._pending is not None:
-            self._add(*self._pending)
-            self._pending = None
+        self._add_pending()
         return Outcome(
             seconds=self.seconds,
             available=self.up_s / self.wanted_s if self.wanted_s else 1.0,

@@ -68,28 +68,17 @@ class MarketModel:
 
 @dataclass(frozen=True)
 class Rates:
-    """What the generator works with; docs/design/simulation.md derives it.
+    """What the generator works with; docs/design/simulation.md derives it."""
 
-    Attributes:
-        strikes: How often a zone's state is drawn anew, per second.
-        together: Share of the strikes that are one for the whole region.
-        world: How likely a strike follows the world's regime; likewise the others; else
-            chance decides.
-    """
-
-    strikes: float
-    together: float
-    world: float
+    strikes: float  # how often a zone's state is drawn anew, per second
+    together: float  # share of the strikes that are one for the whole region
+    world: float  # how likely a strike follows the world's regime; else chance decides
     cloud: float
     region: float
 
 
 def rates(model: MarketModel) -> Rates:
-    """Return the rates that give a model's means and correlations.
-
-    Raises:
-        FogftError: The correlations are too high together.
-    """
+    """Return the rates of a model. Raises FogftError: its correlations are too high together."""
     at_most = (model.correlation_region - model.correlation_cloud) / (1 - model.correlation_cloud)
     same = min(model.together / (2 - model.together), at_most)
     by_regime = (model.correlation_region - same) / (1 - same)
@@ -119,11 +108,7 @@ TIMING_KEYS = tuple(f.name for f in fields(Timing))
 
 
 def read_values(text: str) -> dict[str, float]:
-    """Read ``KEY=VALUE,...``; empty for no keys.
-
-    Raises:
-        FogftError: A key is unknown or given twice, or a value is no number in its range.
-    """
+    """Read ``KEY=VALUE,...``. Raises FogftError: a key is unknown, or a value out of range."""
     out: dict[str, float] = {}
     for part in filter(None, (p.strip() for p in text.split(","))):
         key, equals, value = (p.strip() for p in part.partition("="))
@@ -155,11 +140,7 @@ def _number(key: str, text: str) -> float:
 def applied(
     market: MarketModel, timing: Timing, values: Mapping[str, float]
 ) -> tuple[MarketModel, Timing]:
-    """Return both with some values changed; ``correlation`` stands for region and cloud.
-
-    Raises:
-        FogftError: The correlations contradict one another.
-    """
+    """Return both with some values changed; ``correlation`` stands for region and cloud."""
     chosen = dict(values)
     if "correlation" in chosen:
         both = chosen.pop("correlation")

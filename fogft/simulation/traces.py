@@ -31,14 +31,10 @@ MAX_BYTES = 64 << 20
 
 @dataclass(frozen=True)
 class Trace:
-    """One file.
-
-    Attributes:
-        place: ``cloud/region/zone``, or the zone alone.
-    """
+    """One file."""
 
     file: str
-    place: str
+    place: str  # ``cloud/region/zone``, or the zone alone
     timeline: Timeline
 
 
@@ -48,12 +44,12 @@ def read(folder: Path) -> list[Trace]:
     Raises:
         FogftError: There is none, or one is no trace; nothing is skipped.
     """
+    if not folder.is_dir():
+        raise FogftError(f"{folder}: is not a folder of traces", FORMAT)
     try:
         files = sorted(path for path in folder.rglob("*.json") if path.is_file())
     except OSError as error:
         raise FogftError(f"{folder}: cannot be read: {error.strerror}") from None
-    if not folder.is_dir():
-        raise FogftError(f"{folder}: is not a folder of traces", FORMAT)
     if not files:
         raise FogftError(f"{folder}: there is no trace (`*.json`) in it", FORMAT)
     return [_read_file(path, folder) for path in files]
@@ -75,11 +71,7 @@ def _read_file(path: Path, folder: Path) -> Trace:
 
 
 def parse(value: Any, file: str) -> Timeline:
-    """Return the timeline of a trace.
-
-    Raises:
-        FogftError: It is no trace; the message names the place in the file.
-    """
+    """Return the timeline of a trace. Raises FogftError, which names the place in the file."""
     if not isinstance(value, Mapping):
         raise FogftError(f"{file}: must be a JSON object", FORMAT)
     metadata = value.get("metadata")
@@ -137,22 +129,18 @@ def _is_number(value: Any) -> bool:
 def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, Timeline]:
     """Return the timelines by location, of those traces whose location is on offer.
 
-    Args:
-        traces: Of any places.
-        offered: What can be bought anywhere, not only what this pool may buy.
-
-    Raises:
-        FogftError: A trace is of a place that does not exist, or two are of the same.
+    `offered` is what can be bought anywhere, not only what this pool may buy. Raises FogftError: a
+    trace is of a place that does not exist, or two are of the same.
     """
     found: dict[str, tuple[str, Timeline]] = {}
     for trace in traces:
         places = sorted({p.location for p in offered if trace.place in _names(p)})
         if not places:
-            every = sorted({p.location for p in offered} | {_short(p) for p in offered})
+            known = {p.location for p in offered}
             raise FogftError(
-                f"{trace.file}: there is no location `{trace.place}` among the "
-                f"{len({p.location for p in offered})} that are offered",
-                nearest(trace.place, every),
+                f"{trace.file}: there is no location `{trace.place}` among the {len(known)} that "
+                "are offered",
+                nearest(trace.place, sorted(known | {p.region + p.zone for p in offered})),
             )
         if len(places) > 1:
             raise FogftError(
@@ -170,12 +158,5 @@ def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, 
 
 def _names(placement: Placement) -> set[str]:
     """Return what a trace may call a placement's zone: clouds prefix it with the region."""
-    return {placement.location, placement.zone, _short(placement), _dashed(placement)}
-
-
-def _short(placement: Placement) -> str:
-    return placement.region + placement.zone
-
-
-def _dashed(placement: Placement) -> str:
-    return f"{placement.region}-{placement.zone}"
+    region, zone = placement.region, placement.zone
+    return {placement.location, zone, region + zone, f"{region}-{zone}"}

@@ -29,19 +29,13 @@ NEVER = float("inf")
 UNSEEN = object()
 
 Happening = Callable[[], object]
-
-
 Target = Callable[[float], int]
 
 
 class Policy(Protocol):
-    """Who decides what runs.
+    """Who decides what runs."""
 
-    Attributes:
-        wanted: How many replicas the pool file wants ready at a time.
-    """
-
-    wanted: Target
+    wanted: Target  # how many replicas the pool file wants ready at a time
 
     def tick(self, now: float) -> float:
         """Act on the world as it is; return when to be asked again should nothing happen."""
@@ -85,12 +79,11 @@ class World:
         seed: int,
         length_s: float,
         settle_s: float = 0.0,
-        keep_curve: bool = False,
     ) -> None:
         self.now = EPOCH
         self.market = market
         self.vms: dict[ReplicaId, Vm] = {}
-        self.meter = Meter(EPOCH + settle_s, keep_curve)
+        self.meter = Meter(EPOCH + settle_s)
         self.asked = 0  # how often the policy was
         # A policy that goes by links can notice so long after that a machine is gone, if it then
         # says so; any other one sees it at once.
@@ -108,10 +101,7 @@ class World:
     # -- time -------------------------------------------------------------------------------
 
     def at(self, time: float, happen: Happening) -> None:
-        """Let something happen at a time, or now where that is over.
-
-        It returns `UNSEEN` if nobody in the pool can notice it.
-        """
+        """Let something happen at a time; it returns `UNSEEN` if nobody in the pool can notice."""
         heapq.heappush(self._queue, (max(time, self.now), next(self._order), happen))
 
     def after(self, seconds: float, happen: Happening) -> None:
@@ -121,10 +111,8 @@ class World:
     def run(self, policy: Policy, *, every_tick: bool = False) -> Meter:
         """Let a policy work until the end.
 
-        Args:
-            policy: Who decides.
-            every_tick: Ask at each tick, as the manager's loop does, and not only when
-                something can have changed. Slow: to check that it makes no difference.
+        `every_tick` asks it as often as the manager's loop, not only when something can have
+        changed: slow, and to check that it makes no difference.
         """
         wake = self.now
         while True:
@@ -225,11 +213,7 @@ class World:
         return [vm.machine or _listed(vm) for vm in self.vms.values()]
 
     def launch(self, order: Launch) -> None:
-        """Start a machine if there is room.
-
-        Raises:
-            NoCapacity: There is none.
-        """
+        """Start a machine if there is room."""
         if order.id in self.vms:
             return
         timing, place = self.market.timing, order.placement
