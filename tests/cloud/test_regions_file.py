@@ -64,10 +64,10 @@ def test_instances_replace_the_built_in_ones(write):
     [
         ("region: {}", "1: region: unknown key"),
         ("boot_s: soon", "1: boot_s: must be a number, not the text `soon`"),
-        ("relay: maybe", "1: relay: must be true or false, not `maybe`"),
+        ("relay: maybe", "1: relay: must be true or false, not the text `maybe`"),
         ("\ncapacity: -1", "2: capacity: must be from 0 to 10000, not `-1`"),
         ("regions: {}", "1: regions: is empty"),
-        ("regions:\n  Moon: {}", "2: regions.Moon: is not the name of a region"),
+        ("regions:\n  Moon: {}", "2: regions.Moon: `Moon` is not the name of a region"),
         ("regions:\n  moon: {zones: [A]}", "2: regions.moon.zones: `A` is not the name of a zone"),
         ("regions:\n  moon: {zones: [1]}", "2: regions.moon.zones: `1` is not the name of a zone"),
         ("regions:\n  moon:\n    zone: [a]", "3: regions.moon.zone: unknown key"),

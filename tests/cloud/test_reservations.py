@@ -8,15 +8,14 @@ import sys
 from pathlib import Path
 
 from fogft.cloud.local.reservations import (
-    HIGH_DOMAINS,
-    LOW_DOMAINS,
+    DOMAINS,
     reserve_domain,
     reserve_port,
 )
 from tests.cloud.waiting import wait_for
 
 CHECKOUT = Path(__file__).parents[2]
-EVERY = {*LOW_DOMAINS, *HIGH_DOMAINS}
+EVERY = set(DOMAINS)
 
 
 def test_a_domain_is_given_once_and_again_after_its_release():

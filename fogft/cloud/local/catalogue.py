@@ -33,23 +33,15 @@ CLOUD = "local"
 
 @dataclass(frozen=True)
 class Zone:
-    """One zone.
-
-    Attributes:
-        boot_s: From the order until the machine runs.
-        notice_s: Between a preemption notice and the end.
-        capacity: How many machines fit.
-        price_factor: Of all prices here.
-        relay: Whether a relay stands before the machines, so that links can be slowed and cut.
-    """
+    """One zone."""
 
     region: str
     name: str
-    boot_s: float = 0.5
-    notice_s: float = 5.0
-    capacity: int = 8
-    price_factor: float = 1.0
-    relay: bool = True
+    boot_s: float = 0.5  # from the order until the machine runs
+    notice_s: float = 5.0  # between a preemption notice and the end
+    capacity: int = 8  # how many machines fit
+    price_factor: float = 1.0  # of all prices here
+    relay: bool = True  # before the machines, so that links can be slowed and cut
 
     @property
     def location(self) -> str:
@@ -151,40 +143,36 @@ def read(path: Path) -> Catalogue:
 
 def _regions(section: Section, default: Zone) -> Iterator[Zone]:
     for name in section.children:
-        _check_name(section, name, "region")
+        _named(section, name, name, "a region")
         region = section.section(name, "write `{zones: [a, b]}`")
         region.only((*ZONE_KEYS, "zones"))
         here = replace(_zone(region, default), region=name)
         zones = region.children.get("zones")
         if zones is None or isinstance(zones.value, tuple):
             for zone in plain(zones) if zones else ["a"]:
-                yield replace(here, name=_zone_name(region, zone))
+                yield replace(here, name=_named(region, "zones", zone, "a zone"))
         else:
             below = region.section("zones", "write `[a, b]` or `{a: {capacity: 2}}`")
             for zone in below.children:
                 settings = below.section(zone, "write `{capacity: 2}` or `{}`")
                 settings.only(ZONE_KEYS)
-                yield replace(_zone(settings, here), name=_zone_name(region, zone))
+                yield replace(_zone(settings, here), name=_named(region, "zones", zone, "a zone"))
 
 
 def _zone(section: Section, default: Zone) -> Zone:
-    relay = section.children.get("relay")
-    if relay is not None and not isinstance(relay.value, bool):
-        what = f"must be true or false, not {shown(relay.value)}"
-        raise section.error("relay", what, "write `relay: true`")
     return replace(
         default,
         boot_s=section.number("boot_s", 86_400, "seconds", default.boot_s),
         notice_s=section.number("notice_s", 86_400, "seconds", default.notice_s),
         capacity=section.whole("capacity", default.capacity, 0, 10_000),
         price_factor=section.number("price_factor", 1000, "times", default.price_factor),
-        relay=default.relay if relay is None else bool(relay.value),
+        relay=section.flag("relay", default.relay),
     )
 
 
 def _instances(section: Section) -> Iterator[Instance]:
     for name in section.children:
-        _check_name(section, name, "instance")
+        _named(section, name, name, "an instance")
         entry = section.section(name, "write `{cpus: 4, memory_gb: 16, usd_per_hour: 0.2}`")
         entry.only(INSTANCE_KEYS)
         usd_per_hour = entry.number("usd_per_hour", 10_000, "US dollars per hour", 0.05)
@@ -201,14 +189,9 @@ def _instances(section: Section) -> Iterator[Instance]:
         )
 
 
-def _zone_name(section: Section, name: object) -> str:
+def _named(section: Section, key: str, name: object, what: str) -> str:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
-        what = f"{shown(name)} is not the name of a zone"
-        raise section.error("zones", what, "use lower-case letters, digits and dashes")
-    return name
-
-
-def _check_name(section: Section, name: str, what: str) -> None:
-    if not _NAME.fullmatch(name):
+        said = f"{shown(name)} is not the name of {what}"
         hint = "use lower-case letters, digits and dashes"
-        raise section.error(name, f"is not the name of a {what}", hint, at_key=True)
+        raise section.error(key, said, hint, at_key=key == name)
+    return name

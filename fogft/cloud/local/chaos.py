@@ -18,9 +18,9 @@ from fogft.cloud.local import ending, faults, processes
 from fogft.cloud.local.catalogue import CLOUD
 from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.local.faults import CloudFaults, LinkFaults
-from fogft.cloud.local.folder import LINK, Life, MachineFolder
-from fogft.errors import CloudError, StateError
-from fogft.model.replica import Placement, ReplicaId
+from fogft.cloud.local.folder import LINK, MachineFolder
+from fogft.errors import CloudError
+from fogft.model.replica import ReplicaId
 from fogft.poolfile.tree import nearest, shown
 
 # In an outage a machine is cut off first, and gone so long after.
@@ -28,11 +28,7 @@ OUTAGE_KILL_AFTER_S = 1.0
 
 
 class Chaos:
-    """Faults in one local cloud, and all its pools.
-
-    Args:
-        root: The cloud's folder, as given to `LocalCloud`.
-    """
+    """Faults in one local cloud, and all its pools."""
 
     def __init__(self, root: Path) -> None:
         self._cloud = LocalCloud(root)
@@ -41,15 +37,14 @@ class Chaos:
     # -- one machine; all raise CloudError if it does not exist ------------------------------
 
     def preempt(self, id: ReplicaId, notice_s: float | None = None) -> float:
-        """Give a machine notice; it ends when that is over. Returns the seconds until then.
+        """Give a machine notice (None: its zone's); return the seconds until its end.
 
-        Args:
-            notice_s: None for its zone's own. A second notice never puts the end off.
+        A second notice never puts the end off.
         """
         folder = self._living(id)
         now = time.time()
         if notice_s is None:
-            notice_s = folder.record().notice_s
+            notice_s = folder.record().zone.notice_s
         return max(0.0, folder.ask_end(now + notice_s, notice=True) - now)
 
     def kill(self, id: ReplicaId) -> None:
@@ -82,28 +77,20 @@ class Chaos:
     ) -> None:
         """Delay all that passes to and from a machine, each way, and limit its rate.
 
-        Args:
-            delay_s: 0 for none.
-            rate_bytes_per_s: None for no limit.
-            for_s: None until `clear`.
+        ``for_s=None`` lasts until `clear`.
         """
         if not 0 <= delay_s <= 3600 or not (rate_bytes_per_s is None or rate_bytes_per_s >= 1):
             raise CloudError("a link cannot be slowed like that", "write a delay of 0 to 3600 s")
+        until, rate = _deadline(for_s), rate_bytes_per_s
         self._change_link(
             id,
-            lambda old: replace(
-                old,
-                delay_s=delay_s,
-                rate_bytes_per_s=rate_bytes_per_s,
-                slow_until=_deadline(for_s),
-            ),
+            lambda old: replace(old, delay_s=delay_s, rate_bytes_per_s=rate, slow_until=until),
         )
 
     def blackhole(self, id: ReplicaId, for_s: float | None = None) -> None:
         """Let nothing pass to or from a machine; its connections stay. None: until `clear`."""
-        self._change_link(
-            id, lambda old: replace(old, blackhole=True, blackhole_until=_deadline(for_s))
-        )
+        until = _deadline(for_s)
+        self._change_link(id, lambda old: replace(old, blackhole=True, blackhole_until=until))
 
     def reset(self, id: ReplicaId) -> None:
         """Reset all connections to a machine once."""
@@ -112,17 +99,12 @@ class Chaos:
     # -- locations; `region`, `region/zone`, with or without `local/` before -----------------
 
     def outage(self, location: str, for_s: float | None = None) -> list[ReplicaId]:
-        """Cut off and then end all machines in a location; launches there are refused.
-
-        Returns the machines. None: launches are refused until `clear`.
-        """
+        """Cut off and then end all machines in a location; refuse launches there meanwhile."""
         place = self._location(location)
-        with ending.cloud_lock(self._root):
-            known = faults.read_cloud(self._root)
-            outages = {**known.outages, place: _deadline(for_s)}
-            faults.write(self._root / faults.FILE, replace(known, outages=outages))
+        until = _deadline(for_s)
+        self._change_cloud(lambda old: replace(old, outages={**old.outages, place: until}))
         hit = []
-        for folder, placement in self._living_machines():
+        for folder, placement in self._cloud.living():
             if placement.within(place):
                 with contextlib.suppress(CloudError):  # it ends anyway
                     self.blackhole(folder.id)
@@ -135,16 +117,13 @@ class Chaos:
         place = self._location(location)
         if machines < 0:
             raise CloudError(f"{machines} machines cannot fit into `{place}`", "write 0 or more")
-        with ending.cloud_lock(self._root):
-            known = faults.read_cloud(self._root)
-            limits = {**known.capacity, place: machines}
-            faults.write(self._root / faults.FILE, replace(known, capacity=limits))
+        self._change_cloud(lambda old: replace(old, capacity={**old.capacity, place: machines}))
 
     def clear(self) -> None:
         """Undo what lasts: slow and dead links, frozen machines, outages, capacities."""
         with ending.cloud_lock(self._root):
             faults.write(self._root / faults.FILE, CloudFaults())
-        for folder, _ in self._living_machines():
+        for folder, _ in self._cloud.living():
             with contextlib.suppress(CloudError):  # it has just ended, or has no relay
                 self.thaw(folder.id)
                 self._change_link(folder.id, lambda old: LinkFaults(resets=old.resets))
@@ -153,33 +132,28 @@ class Chaos:
 
     def _living(self, id: ReplicaId) -> MachineFolder:
         folder = MachineFolder.under(self._cloud.machines_folder, id)
-        if not folder.exists or folder.life(time.time()) not in (Life.ORDERED, Life.ALIVE):
+        if not folder.exists or not folder.lives(time.time()):
             raise CloudError(
                 f"replica `{id.short}` has no machine on the local cloud now",
                 "`fogft status` shows which ones run",
             )
         return folder
 
-    def _living_machines(self) -> list[tuple[MachineFolder, Placement]]:
-        found = []
-        for folder in self._cloud.folders():
-            try:
-                if folder.life(time.time()) in (Life.ORDERED, Life.ALIVE):
-                    found.append((folder, folder.record().placement))
-            except StateError:
-                continue
-        return found
-
     def _change_link(self, id: ReplicaId, change: Callable[[LinkFaults], LinkFaults]) -> None:
         folder = self._living(id)
-        if not folder.record().relay:
+        if not folder.record().zone.relay:
             raise CloudError(
                 f"the link to replica `{id.short}` has no relay",
                 "remove `relay: false` from `regions.yaml` and replace the machine",
             )
-        path = folder.path / LINK
         with disk.locked(folder.path / "link.lock"):
+            path = folder.path / LINK
             faults.write(path, change(faults.read_link(path)))
+
+    def _change_cloud(self, change: Callable[[CloudFaults], CloudFaults]) -> None:
+        with ending.cloud_lock(self._root):
+            known = faults.read_cloud(self._root)
+            faults.write(self._root / faults.FILE, change(known))
 
     def _location(self, text: str) -> str:
         """Return a location in full, if it exists."""
@@ -188,9 +162,8 @@ class Chaos:
         zones = self._cloud.catalogue().zones
         known = {f"{CLOUD}/{zone.region}" for zone in zones} | {zone.location for zone in zones}
         if place not in known and place != CLOUD:
-            raise CloudError(
-                f"the local cloud has no location {shown(text)}", nearest(place, known)
-            )
+            what = f"the local cloud has no location {shown(text)}"
+            raise CloudError(what, nearest(place, known))
         return place
 
 

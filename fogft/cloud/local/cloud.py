@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,8 @@ class LocalCloud:
                 return
             if not folder.exists:
                 self._check_room(zone, order.id)
-                write_new(folder, self._record(order, zone), order.files)
+                record = Record(replace(order, files={}), zone, time.time(), self._serve)
+                write_new(folder, record, order.files)
             try:
                 self._spawn(folder)
             except OSError as error:
@@ -147,6 +149,16 @@ class LocalCloud:
                 self._warn_once(name, "it is not a machine's folder")
         return [folder for folder in found if folder is not None]
 
+    def living(self) -> list[tuple[MachineFolder, Placement]]:
+        """Return the machines of all pools that take up room."""
+        now = time.time()
+        found = []
+        for folder in self.folders():
+            with contextlib.suppress(StateError):
+                if folder.lives(now):
+                    found.append((folder, folder.record().order.placement))
+        return found
+
     # -- one machine ------------------------------------------------------------------------
 
     def _machine(self, folder: MachineFolder, now: float) -> Machine | None:
@@ -184,21 +196,6 @@ class LocalCloud:
             if life is not Life.DEAD or not ending.bury(self.root, folder):
                 return False
         return not ending.kept_log(self.root, folder.id).exists()
-
-    def _record(self, order: Launch, zone: Zone) -> Record:
-        return Record(
-            id=order.id,
-            pool=order.pool,
-            placement=order.placement,
-            usd_per_hour=order.usd_per_hour,
-            spec_hash=order.spec_hash,
-            launched_at=time.time(),
-            boot_s=zone.boot_s,
-            notice_s=zone.notice_s,
-            relay=zone.relay,
-            serve=self._serve,
-            task=order.task,
-        )
 
     def _spawn(self, folder: MachineFolder) -> None:
         environ = {k: v for k, v in os.environ.items() if k not in _NOT_INHERITED}
@@ -240,7 +237,7 @@ class LocalCloud:
                 raise NoCapacity(f"no capacity in `{zone.location}`: `{location}` is out")
         limits = {zone.location: zone.capacity}
         limits |= {where: n for where, n in wrong.capacity.items() if place.within(where)}
-        taken = [place for other, place in self._taken() if other != id]
+        taken = [placement for folder, placement in self.living() if folder.id != id]
         for location, limit in limits.items():
             here = sum(placement.within(location) for placement in taken)
             if here >= limit:
@@ -248,15 +245,6 @@ class LocalCloud:
                     f"no capacity in `{zone.location}`: {here} of {limit} machines "
                     f"in `{location}` are taken"
                 )
-
-    def _taken(self) -> list[tuple[ReplicaId, Placement]]:
-        now = time.time()
-        found = []
-        for folder in self.folders():
-            with contextlib.suppress(StateError):
-                if folder.life(now) in (Life.ORDERED, Life.ALIVE):
-                    found.append((folder.id, folder.record().placement))
-        return found
 
     def _warn_once(self, name: str, reason: str) -> None:
         if name not in self._warned:
@@ -266,15 +254,16 @@ class LocalCloud:
 
 def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machine:
     state = state or State(MachinePhase.PROVISIONING, progress="starting")
+    order = record.order
     return Machine(
         id=folder.id,
-        placement=record.placement,
+        placement=order.placement,
         phase=state.phase,
         launched_at=record.launched_at,
         endpoint=state.endpoint,
         notice=(folder.path / NOTICE).exists(),
-        usd_per_hour=record.usd_per_hour,
-        spec_hash=record.spec_hash,
+        usd_per_hour=order.usd_per_hour,
+        spec_hash=order.spec_hash,
         failure=state.failure,
         progress=state.progress,
     )

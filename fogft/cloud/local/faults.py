@@ -6,37 +6,28 @@ itself, whoever set it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from fogft import disk
-from fogft.errors import StateError
+from fogft.model.plain import Moment, stored, to_plain
 
+T = TypeVar("T")
 FILE = "faults.json"
 
 
 @dataclass(frozen=True)
 class LinkFaults:
-    """What is wrong with the path to one machine.
+    """What is wrong with the path to one machine. A deadline of None is never."""
 
-    Attributes:
-        delay_s: Added to everything, each way.
-        rate_bytes_per_s: The most that passes each way; None for no limit.
-        slow_until: When these two end; None for never.
-        blackhole: Nothing passes, but connections stay.
-        blackhole_until: When that ends; None for never.
-        resets: Counts up; each new value resets all connections once.
-    """
-
-    delay_s: float = 0.0
-    rate_bytes_per_s: float | None = None
-    slow_until: float | None = None
-    blackhole: bool = False
+    delay_s: Moment = 0.0  # added to everything, each way
+    rate_bytes_per_s: Moment | None = None  # the most that passes each way
+    slow_until: float | None = None  # when these two end
+    blackhole: bool = False  # nothing passes, but connections stay
     blackhole_until: float | None = None
-    resets: int = 0
+    resets: int = 0  # counts up; each new value resets all connections once
 
     def at(self, now: float) -> LinkFaults:
         """Return what is in force at a time."""
@@ -52,15 +43,10 @@ class LinkFaults:
 
 @dataclass(frozen=True)
 class CloudFaults:
-    """What is wrong with locations.
+    """What is wrong with locations."""
 
-    Attributes:
-        outages: Location -> when it ends; None for never.
-        capacity: Location -> how many machines fit, instead of the catalogue's number.
-    """
-
-    outages: Mapping[str, float | None] = field(default_factory=dict)
-    capacity: Mapping[str, int] = field(default_factory=dict)
+    outages: Mapping[str, float | None] = field(default_factory=dict)  # when each ends; None: never
+    capacity: Mapping[str, int] = field(default_factory=dict)  # instead of the catalogue's numbers
 
     def out(self, now: float) -> list[str]:
         """Return the locations that are out at a time."""
@@ -68,35 +54,19 @@ class CloudFaults:
 
 
 def read_link(path: Path) -> LinkFaults:
-    """Return a machine's link faults; none where there is no file.
-
-    Raises:
-        StateError: The file is damaged.
-    """
-    raw = disk.read_json(path)
-    try:
-        faults = LinkFaults(**(raw or {}))
-        numbers = (faults.delay_s, faults.rate_bytes_per_s or 1.0)
-        if not all(math.isfinite(n) and n >= 0 for n in numbers):
-            raise ValueError(numbers)
-    except (TypeError, ValueError) as error:
-        raise StateError(f"`{path}` is damaged: {error}") from error
-    return faults
+    """Return a machine's link faults; none where there is no file."""
+    return _read(LinkFaults, path)
 
 
 def read_cloud(root: Path) -> CloudFaults:
-    """Return the faults of locations; none where there is no file.
+    """Return the faults of locations; none where there is no file."""
+    return _read(CloudFaults, root / FILE)
 
-    Raises:
-        StateError: The file is damaged.
-    """
-    raw: Any = disk.read_json(root / FILE)
-    try:
-        return CloudFaults(**(raw or {}))
-    except TypeError as error:
-        raise StateError(f"`{root / FILE}` is damaged: {error}") from error
+
+def _read(kind: type[T], path: Path) -> T:
+    return stored(kind, disk.read_json(path) or {}, f"`{path}` is damaged")
 
 
 def write(path: Path, faults: LinkFaults | CloudFaults) -> None:
     """Replace what stands in a file. Raises StateError: it cannot be written."""
-    disk.write_json(path, asdict(faults), durable=False)
+    disk.write_json(path, to_plain(faults), durable=False)

@@ -19,18 +19,21 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from fogft import disk
 from fogft.cloud.local import processes
+from fogft.cloud.local.catalogue import Zone
+from fogft.cloud.port import Launch
 from fogft.errors import CloudError, StateError
 from fogft.model.plain import stored, to_plain
 from fogft.model.reason import Reason
-from fogft.model.replica import MachinePhase, Placement, ReplicaId
+from fogft.model.replica import MachinePhase, ReplicaId
 
 RECORD = "machine.json"
 STATE = "state.json"
@@ -49,6 +52,9 @@ SLOW_START_LIMIT_S = 60.0
 _NAME = re.compile(r"(?P<uid>[0-9a-f]{16})-(?P<slot>\d{1,6})\.(?P<generation>\d{1,9})")
 
 
+T = TypeVar("T")
+
+
 class Life(Enum):
     """Whether a machine lives, by its files and its lock."""
 
@@ -60,27 +66,12 @@ class Life(Enum):
 
 @dataclass(frozen=True)
 class Record:
-    """What was ordered: ``machine.json``.
+    """What was ordered, and how its zone was then: ``machine.json``."""
 
-    Attributes:
-        boot_s: How long the machine pretends to boot.
-        notice_s: Between a preemption notice and the end, unless told otherwise.
-        relay: Whether a relay stands before it.
-        serve: The command that starts a server proxy, without its options.
-        task: The SkyPilot task of the pool file.
-    """
-
-    id: ReplicaId
-    pool: str
-    placement: Placement
-    usd_per_hour: float
-    spec_hash: str
+    order: Launch  # without its files
+    zone: Zone
     launched_at: float
-    boot_s: float
-    notice_s: float
-    relay: bool
-    serve: tuple[str, ...]
-    task: Mapping[str, Any] = field(default_factory=dict)
+    serve: tuple[str, ...]  # the command that starts a server proxy, without its options
 
 
 @dataclass(frozen=True)
@@ -152,15 +143,18 @@ class MachineFolder:
             return True
         return age_s < SLOW_START_LIMIT_S and bool(processes.find(machine=str(self.id)))
 
+    def lives(self, now: float) -> bool:
+        """Whether the machine takes up room: it is ordered or alive."""
+        return self.life(now) in (Life.ORDERED, Life.ALIVE)
+
     def record(self) -> Record:
         """Return the order."""
-        raw = disk.read_json(self.path / RECORD)
-        return stored(Record, raw, f"`{self.path / RECORD}` is damaged")
+        return self._stored(Record, RECORD, disk.read_json(self.path / RECORD))
 
     def state(self) -> State | None:
         """Return how far the machine has come; None if its process never ran."""
         raw = disk.read_json(self.path / STATE)
-        return None if raw is None else stored(State, raw, f"`{self.path / STATE}` is damaged")
+        return None if raw is None else self._stored(State, STATE, raw)
 
     def write_state(self, state: State) -> None:
         """Say how far the machine has come. Raises `StateError` on a full disk."""
@@ -185,10 +179,15 @@ class MachineFolder:
 
     def _at(self, name: str) -> float | None:
         raw = disk.read_json(self.path / name)
-        try:
-            return None if raw is None else float(raw["at"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise StateError(f"`{self.path / name}` is damaged: {error!r}") from error
+        return None if raw is None else self._stored(_Moment, name, raw).at
+
+    def _stored(self, kind: type[T], name: str, raw: object) -> T:
+        return stored(kind, raw, f"`{self.path / name}` is damaged")
+
+
+@dataclass(frozen=True)
+class _Moment:
+    at: float
 
 
 def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes]) -> None:
@@ -221,9 +220,5 @@ def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes])
 
 def remove(path: Path) -> None:
     """Remove a folder with all that is in it; fine if there is none."""
-    import shutil
-
-    try:
+    with contextlib.suppress(FileNotFoundError):
         shutil.rmtree(path)
-    except FileNotFoundError:
-        return

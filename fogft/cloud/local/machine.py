@@ -39,7 +39,6 @@ log = logging.getLogger("fogft.machine")
 
 TICK_S = 0.05
 FOLDER_PATIENCE_S = 5.0  # somebody removed it: nobody can list or end this machine any more
-_LOCK_PATIENCE_S = 0.5
 
 
 class _Ended(Exception):
@@ -64,25 +63,10 @@ def main(arguments: list[str]) -> int:
         return 0  # it was ended before it began
     start_log()
     lock = disk.Lock(folder.path / LOCK)
-    if not _acquire(lock):
-        return 0  # it runs already
-    if folder.end_at() == 0:
-        return 0
-    Machine(folder, folder.record()).run()
+    with contextlib.suppress(FileNotFoundError):  # it has just been ended
+        if lock.acquire(wait=False) and folder.end_at() != 0:
+            Machine(folder, folder.record()).run()
     return 0
-
-
-def _acquire(lock: disk.Lock) -> bool:
-    """Take the machine's lock; whoever lists the machines may have it for a moment."""
-    deadline = time.monotonic() + _LOCK_PATIENCE_S
-    try:
-        while not lock.acquire(wait=False):
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.01)
-    except FileNotFoundError:
-        return False
-    return True
 
 
 class Machine:
@@ -104,7 +88,7 @@ class Machine:
     def run(self) -> None:
         """Live and die. Leaves a FAILED state behind if the machine could never run."""
         self._say(State(MachinePhase.PROVISIONING, progress="booting"))
-        self._guard = guard.start(lambda: _end_the_rest(self._record))
+        self._guard = guard.start(lambda: self._end_the_rest(set()))
         for number in ENDING_SIGNALS:
             signal.signal(number, self._on_signal)
         try:
@@ -116,13 +100,16 @@ class Machine:
             log.error("machine_failed replica=%s reason=%r", self._folder.id.short, reason)
             self._say(State(MachinePhase.FAILED, failure=failed.reason))
         finally:
-            processes.end_machine(str(self._folder.id), spare={self._guard})
-            sweep_shared_memory()
+            self._end_the_rest({self._guard})
+
+    def _end_the_rest(self, spare: set[int]) -> None:
+        processes.end_machine(str(self._folder.id), spare=spare)
+        sweep_shared_memory()
 
     def _live(self) -> None:
-        id, placement = self._folder.id, self._record.placement
+        id, placement = self._folder.id, self._record.order.placement
         log.info("machine_boots replica=%s zone=%s", id.short, placement.location)
-        booted_at = time.monotonic() + self._record.boot_s
+        booted_at = time.monotonic() + self._record.zone.boot_s
         self._wait(lambda: time.monotonic() >= booted_at)
         workdir = self._workdir()
         self._set_up(workdir)
@@ -132,7 +119,7 @@ class Machine:
 
     def _workdir(self) -> Path:
         """Return where `setup` and `run` run: the pool's own folder, used in place."""
-        wanted = self._record.task.get("workdir")
+        wanted = self._record.order.task.get("workdir")
         if wanted is None:
             workdir = self._folder.path / "workdir"
             workdir.mkdir(exist_ok=True)
@@ -143,9 +130,9 @@ class Machine:
 
     def _set_up(self, workdir: Path) -> None:
         for key in ("file_mounts", "volumes"):
-            if self._record.task.get(key):
+            if self._record.order.task.get(key):
                 log.warning("task_key_ignored key=%s reason='not made on the local cloud'", key)
-        command = self._record.task.get("setup")
+        command = self._record.order.task.get("setup")
         if not command:
             return
         # One at a time in a folder: machines share it, and two builds in it would clash.
@@ -155,7 +142,7 @@ class Machine:
         self._say(State(MachinePhase.PROVISIONING, progress="setup"))
         log.info("setup_started command=%r", command)
         begin = logfile.size(self._folder.log)
-        environ = task_commands.environment(self._record.task)
+        environ = task_commands.environment(self._record.order.task)
         pid = self._spawn(["bash", "-c", str(command)], workdir, environ)
         self._wait(lambda: pid in self._statuses)
         turn.release()
@@ -176,7 +163,7 @@ class Machine:
         begin = logfile.size(self._folder.log)
         pid = self._start_server(workdir, domain, port)
         endpoint = f"127.0.0.1:{port.number}"
-        if self._record.relay:
+        if self._record.zone.relay:
             from fogft.cloud.local.relay import Relay  # late: it loads asyncio
 
             self._relay = Relay(("127.0.0.1", port.number))
@@ -295,11 +282,6 @@ class Machine:
 
     def _on_signal(self, number: int, _: object) -> None:
         self._signal = number
-
-
-def _end_the_rest(record: Record) -> None:
-    processes.end_machine(str(record.id))
-    sweep_shared_memory()
 
 
 def _in_words(code: int) -> str:

@@ -14,10 +14,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-# Above 101 the ports of a domain reach Linux's ephemeral ones. Robots' domains, chosen by
-# hand or by tests, tend to be 0 or high: the low half is tried first.
-LOW_DOMAINS = range(1, 60)
-HIGH_DOMAINS = range(60, 102)
+DOMAINS = range(1, 102)  # above, the ports of a domain reach Linux's ephemeral ones
+_LOW_DOMAINS = 60  # robots' own, chosen by hand or by tests, tend to be 0 or above these
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ones
 
 _FIRST_DDS_PORT = 7400
@@ -37,21 +35,11 @@ class Reservation:
 
 
 def reserve_domain(not_these: Iterable[int] = ()) -> Reservation | None:
-    """Reserve a ROS domain id whose ports nobody has bound; None if there is none left.
-
-    Args:
-        not_these: Domains that are somebody else's, such as the robot's.
-    """
+    """Reserve a ROS domain id, none of these, whose ports nobody has bound; None: none is left."""
     taken = set(not_these) | _domains_in_use()
-    low, high = list(LOW_DOMAINS), list(HIGH_DOMAINS)
-    random.shuffle(low)
-    random.shuffle(high)
-    for domain in (*low, *high):
-        if domain not in taken:
-            reservation = _reserve("ros-domain", domain)
-            if reservation is not None:
-                return reservation
-    return None
+    tried = sorted(DOMAINS, key=lambda domain: (domain >= _LOW_DOMAINS, random.random()))
+    reserved = (_reserve("ros-domain", domain) for domain in tried if domain not in taken)
+    return next(filter(None, reserved), None)
 
 
 def reserve_port() -> Reservation | None:
