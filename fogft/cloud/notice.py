@@ -17,7 +17,6 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
 
 from fogft.cloud import notice_formats
 from fogft.cloud.notice_formats import Notice, NoticeKind
@@ -37,14 +36,16 @@ _METADATA = "169.254.169.254"
 _ELSEWHERE = {"aws": "AWS_EC2_METADATA_SERVICE_ENDPOINT", "gcp": "GCE_METADATA_HOST"}
 
 
-class Source(Protocol):
+class Source:
     """Something that can be asked for notices."""
 
-    def here(self) -> bool:
-        """Whether this source exists on this machine."""
+    def is_here(self) -> bool:
+        """Whether this source exists on this machine. Raises OSError: it does not answer."""
+        raise NotImplementedError
 
-    def ask(self) -> Iterator[Notice]:
+    def ask(self) -> Iterator[Notice | None]:
         """Yield the notices in force now, again each time. Raises OSError: it does not answer."""
+        raise NotImplementedError
 
 
 class Watch:
@@ -70,7 +71,7 @@ class Watch:
         failures = 0
         while not self._closed.is_set():
             if source is None:
-                source = next((s for s in self._sources if s.here()), None)
+                source = next(filter(_is_here, self._sources), None)
             if source is not None:
                 try:
                     self._tell(source)
@@ -84,14 +85,12 @@ class Watch:
 
     def _tell(self, source: Source) -> None:
         for notice in source.ask():
-            if notice.kind in self._told or self._closed.is_set():
+            if notice is None or notice.kind in self._told or self._closed.is_set():
                 continue
             self._told.add(notice.kind)
+            kind, source_name = notice.kind.value, notice.source
             log.warning(
-                "notice_received kind=%s source=%s detail=%r",
-                notice.kind.value,
-                notice.source,
-                notice.detail,
+                "notice_received kind=%s source=%s detail=%r", kind, source_name, notice.detail
             )
             self._on_notice(notice)
 
@@ -109,8 +108,7 @@ def watch(
         source: ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers.
         on_notice: Called from that thread, once for each kind of notice; must not block.
         poll_s: Seconds between two looks; None for what suits the source.
-        metadata: ``host[:port]`` of the metadata server; None for the clouds' own address,
-            or for where the environment says that it is.
+        metadata: ``host[:port]`` of the metadata server; None for where the environment says.
 
     Raises:
         CloudError: There is no such source.
@@ -121,8 +119,8 @@ def watch(
     elif source in NOTICE_SOURCES:
         known: dict[str, Source] = {
             "aws": _Aws(metadata or _address("aws")),
-            "gcp": _Gcp(metadata or _address("gcp")),
-            "azure": _Azure(metadata or _METADATA),
+            "gcp": _Gcp(metadata or _address("gcp"), **{"Metadata-Flavor": "Google"}),
+            "azure": _Azure(metadata or _METADATA, Metadata="true"),
         }
         sources = list(known.values()) if source == "auto" else [known[source]]
     else:
@@ -138,14 +136,20 @@ def _address(cloud: str) -> str:
     return told or _METADATA
 
 
-class _File:
+def _is_here(source: Source) -> bool:
+    with contextlib.suppress(OSError):
+        return source.is_here()
+    return False
+
+
+class _File(Source):
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def __str__(self) -> str:
         return f"file:{self._path}"
 
-    def here(self) -> bool:
+    def is_here(self) -> bool:
         return True
 
     def ask(self) -> Iterator[Notice]:
@@ -153,23 +157,20 @@ class _File:
             yield notice_formats.file_notice(self._path.read_text(errors="replace"))
 
 
-class _Server:
+class _Server(Source):
     """A metadata server: plain HTTP, never through a proxy, answers of a few kilobytes."""
 
-    name = ""
-
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, **headers: str) -> None:
         self._address = address
+        self._headers = headers
 
     def __str__(self) -> str:
-        return self.name
+        return type(self).__name__.strip("_").lower()
 
-    def _get(
-        self, path: str, headers: dict[str, str], method: str = "GET"
-    ) -> tuple[int, str, http.client.HTTPMessage]:
+    def _get(self, path: str, method: str = "GET") -> tuple[int, str, http.client.HTTPMessage]:
         connection = http.client.HTTPConnection(self._address, timeout=_TIMEOUT_S)
         try:
-            connection.request(method, path, headers=headers)
+            connection.request(method, path, headers=self._headers)
             answer = connection.getresponse()
             body = answer.read(65_536).decode(errors="replace")
         except http.client.HTTPException as error:
@@ -178,93 +179,55 @@ class _Server:
             connection.close()
         return answer.status, body, answer.headers
 
-
-class _Aws(_Server):
-    """Instance metadata version 2: with a token, which is renewed when it is refused."""
-
-    name = "aws"
-
-    def __init__(self, address: str) -> None:
-        super().__init__(address)
-        self._token = ""
-
-    def here(self) -> bool:
-        with contextlib.suppress(OSError):
-            return self._renewed()
-        return False
-
-    def ask(self) -> Iterator[Notice]:
-        action = self._read("/latest/meta-data/spot/instance-action")
-        notice = None if action is None else notice_formats.aws_action(action)
-        if notice is not None:
-            yield notice
-        hint = self._read("/latest/meta-data/events/recommendations/rebalance")
-        notice = None if hint is None else notice_formats.aws_rebalance(hint)
-        if notice is not None:
-            yield notice
-
-    def _read(self, path: str) -> str | None:
-        """Return an answer; None where there is nothing (404)."""
-        status, body, _ = self._get(path, {"X-aws-ec2-metadata-token": self._token})
-        if status == 401 and self._renewed():
-            status, body, _ = self._get(path, {"X-aws-ec2-metadata-token": self._token})
-        if status == 404:
-            return None
+    def _read(self, path: str) -> str:
+        status, body, _ = self._get(path)
         if status != 200:
             raise OSError(f"the metadata server answers {status}")
         return body
 
-    def _renewed(self) -> bool:
-        ttl = {"X-aws-ec2-metadata-token-ttl-seconds": "21600"}
-        status, body, _ = self._get("/latest/api/token", ttl, "PUT")
-        self._token = body.strip() if status == 200 else ""
-        return bool(self._token)
+
+class _Aws(_Server):
+    """Instance metadata version 2: with a token, which is renewed when it is refused."""
+
+    def is_here(self) -> bool:
+        self._headers = {"X-aws-ec2-metadata-token-ttl-seconds": "21600"}
+        status, body, _ = self._get("/latest/api/token", "PUT")
+        token = body.strip() if status == 200 else ""
+        self._headers = {"X-aws-ec2-metadata-token": token}
+        return bool(token)
+
+    def ask(self) -> Iterator[Notice | None]:
+        for path, read in (
+            ("spot/instance-action", notice_formats.aws_action),
+            ("events/recommendations/rebalance", notice_formats.aws_rebalance),
+        ):
+            status, body, _ = self._get(f"/latest/meta-data/{path}")
+            if status == 401 and self.is_here():
+                status, body, _ = self._get(f"/latest/meta-data/{path}")
+            if status == 200:
+                yield read(body)
+            elif status != 404:  # which says that there is nothing
+                raise OSError(f"the metadata server answers {status}")
 
 
 class _Gcp(_Server):
-    name = "gcp"
-    _HEADERS = {"Metadata-Flavor": "Google"}  # noqa: RUF012
+    def is_here(self) -> bool:
+        return self._get("/computeMetadata/v1/")[2].get("Metadata-Flavor") == "Google"
 
-    def here(self) -> bool:
-        with contextlib.suppress(OSError):
-            return (
-                self._get("/computeMetadata/v1/", self._HEADERS)[2].get("Metadata-Flavor")
-                == "Google"
-            )
-        return False
-
-    def ask(self) -> Iterator[Notice]:
+    def ask(self) -> Iterator[Notice | None]:
         path = "/computeMetadata/v1/instance/preempted"
-        status, body, _ = self._get(path, self._HEADERS)
-        if status != 200:
-            raise OSError(f"the metadata server answers {status}")
-        notice = notice_formats.gcp_preempted(body)
-        if notice is not None:
-            yield notice
+        yield notice_formats.gcp_preempted(self._read(path))
 
 
 class _Azure(_Server):
-    name = "azure"
-    _HEADERS = {"Metadata": "true"}  # noqa: RUF012
+    _machine = ""
 
-    def __init__(self, address: str) -> None:
-        super().__init__(address)
-        self._machine = ""
-
-    def here(self) -> bool:
+    def is_here(self) -> bool:
         path = "/metadata/instance/compute/name?api-version=2021-02-01&format=text"
-        with contextlib.suppress(OSError):
-            status, body, _ = self._get(path, self._HEADERS)
-            self._machine = body.strip() if status == 200 else ""
-            return bool(self._machine)
-        return False
+        self._machine = self._read(path).strip()
+        return bool(self._machine)
 
-    def ask(self) -> Iterator[Notice]:
+    def ask(self) -> Iterator[Notice | None]:
         # The first question of all can take two minutes, while Azure begins to schedule.
         path = "/metadata/scheduledevents?api-version=2020-07-01"
-        status, body, _ = self._get(path, self._HEADERS)
-        if status != 200:
-            raise OSError(f"the metadata server answers {status}")
-        notice = notice_formats.azure_events(body, self._machine)
-        if notice is not None:
-            yield notice
+        yield notice_formats.azure_events(self._read(path), self._machine)

@@ -29,18 +29,12 @@ class NoticeKind(str, Enum):
 
 @dataclass(frozen=True)
 class Notice:
-    """A machine was told that it may have to go, or will.
-
-    Attributes:
-        at: When it ends, in seconds since the epoch; None when that was not said.
-        source: Who said so: ``aws``, ``gcp``, ``azure`` or ``file``.
-        detail: The words, for the log.
-    """
+    """A machine was told that it may have to go, or will."""
 
     kind: NoticeKind
-    at: float | None
-    source: str
-    detail: str = ""
+    at: float | None  # when it ends, in seconds since the epoch; None when that was not said
+    source: str  # who said so: ``aws``, ``gcp``, ``azure`` or ``file``
+    detail: str = ""  # the words, for the log
 
 
 def aws_action(body: str) -> Notice | None:
@@ -48,18 +42,18 @@ def aws_action(body: str) -> Notice | None:
 
     The address exists only when there is one, so its very answer is the news.
     """
-    value = _json(body)
-    action = value.get("action", "unknown") if isinstance(value, dict) else "unknown"
+    value = _map(body)
+    action = value.get("action", "unknown")
     if action == "none":
         return None
-    at = _iso(value.get("time")) if isinstance(value, dict) else None
+    at = _iso(value.get("time"))
     return Notice(NoticeKind.PREEMPTION, at, "aws", f"spot instance action: {action}")
 
 
 def aws_rebalance(body: str) -> Notice | None:
     """Read ``events/recommendations/rebalance``. Its time is that of the notice, not of an end."""
-    value = _json(body)
-    if not isinstance(value, dict) or "noticeTime" not in value:
+    value = _map(body)
+    if "noticeTime" not in value:
         return None
     return Notice(NoticeKind.REBALANCE, None, "aws", f"rebalance, {value['noticeTime']}")
 
@@ -72,20 +66,14 @@ def gcp_preempted(body: str) -> Notice | None:
 
 
 def azure_events(body: str, machine: str) -> Notice | None:
-    """Read ``scheduledevents``: the events of all machines of a group.
-
-    Args:
-        body: The document.
-        machine: This machine's name; empty takes every event as its own.
-    """
-    value = _json(body)
-    events = value.get("Events") if isinstance(value, dict) else None
+    """Read ``scheduledevents``: the events of all machines of a group, of which one is ours."""
+    events = _map(body).get("Events")
     for event in events if isinstance(events, list) else ():
         if not isinstance(event, dict) or event.get("EventType") not in ("Preempt", "Terminate"):
             continue
         if event.get("EventStatus") in ("Completed", "Canceled"):
             continue
-        if machine and machine not in (event.get("Resources") or [machine]):
+        if machine not in (event.get("Resources") or [machine]):
             continue
         at = _http_date(event.get("NotBefore"))
         return Notice(NoticeKind.PREEMPTION, at, "azure", f"scheduled {event['EventType']}")
@@ -97,18 +85,18 @@ def file_notice(content: str) -> Notice:
 
     That the file exists is the news; one that is empty or says something else is a preemption.
     """
-    value = _json(content)
-    value = value if isinstance(value, dict) else {}
+    value = _map(content)
     at = value.get("at")
     kind = NoticeKind.REBALANCE if value.get("action") == "rebalance" else NoticeKind.PREEMPTION
     return Notice(kind, float(at) if isinstance(at, (int, float)) else None, "file")
 
 
-def _json(body: str) -> Any:
+def _map(body: str) -> dict[str, Any]:
     try:
-        return json.loads(body)
+        value = json.loads(body)
     except ValueError:
-        return None
+        return {}
+    return value if isinstance(value, dict) else {}
 
 
 def _iso(text: Any) -> float | None:

@@ -18,24 +18,20 @@ from fogft.model.replica import Machine, Offer, Placement, ReplicaId
 
 @dataclass(frozen=True)
 class Launch:
-    """An order for one machine.
-
-    Attributes:
-        pool: The pool's name, for people.
-        task: The SkyPilot task of the pool file, without its `fogft` section.
-        files: What the machine needs to serve: file name -> content. Holds
-            ``replica.yaml``, ``ca.crt``, ``replica.crt`` and ``replica.key``; the
-            configuration names the others relative to its own folder. Kept 0600.
-        dials_out: The replica dials its robots: nobody reaches it, so no port need be open.
-    """
+    """An order for one machine."""
 
     id: ReplicaId
-    pool: str
+    pool: str  # the pool's name, for people
     placement: Placement
     usd_per_hour: float
     spec_hash: str
+    # The SkyPilot task of the pool file, without its `fogft` section.
     task: Mapping[str, Any] = field(default_factory=dict)
+    # What the machine needs to serve: file name -> content. Holds ``replica.yaml``,
+    # ``ca.crt``, ``replica.crt`` and ``replica.key``; the configuration names the others
+    # relative to its own folder. Kept 0600.
     files: Mapping[str, bytes] = field(default_factory=dict)
+    # The replica dials its robots: nobody reaches it, so no port need be open.
     dials_out: bool = False
 
 
@@ -106,15 +102,11 @@ class Accounts(Protocol):
 
 @dataclass(frozen=True)
 class Audit:
-    """What exists, asked past every memory.
+    """What exists, asked past every memory."""
 
-    Attributes:
-        machines: In any phase, ordered by id.
-        asked: Clouds (as in `Placement.cloud`) whose own list was read. Of all others it is
-            what was remembered, or what somebody else says.
-    """
-
-    machines: tuple[Machine, ...]
+    machines: tuple[Machine, ...]  # in any phase, ordered by id
+    # Clouds (as in `Placement.cloud`) whose own list was read. Of all others it is what was
+    # remembered, or what somebody else says.
     asked: frozenset[str]
 
 

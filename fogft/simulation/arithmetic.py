@@ -33,8 +33,3 @@ def staying(model: MarketModel, timing: Timing) -> float:
 def independent(one: float, replicas: int) -> float:
     """Return how available so many replicas are if they fail independently."""
     return 1 - system_unavailability([one] * replicas)
-
-
-def correlated_pair(one: float, correlation: float) -> float:
-    """Return how available two replicas are whose states have a correlation."""
-    return 1 - (one * one + correlation * one * (1 - one))

@@ -45,23 +45,16 @@ _RESAMPLES = 1000
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is simulated.
-
-    Attributes:
-        find: What a cloud offers for a task's `resources`.
-        recorded: Location -> what was recorded there; empty to make markets up.
-        model: To make them up from.
-        days: How long each run is measured, after the first hour.
-        seeds: One run each.
-    """
+    """What is simulated."""
 
     spec: PoolSpec
-    find: FindOffers
+    find: FindOffers  # what a cloud offers for a task's `resources`
     timing: Timing
-    model: MarketModel
+    model: MarketModel  # to make them up from
+    # Location -> what was recorded there; empty to make markets up.
     recorded: Mapping[str, Timeline] = field(default_factory=dict)
-    days: float = 7.0
-    seeds: Sequence[int] = tuple(range(20))
+    days: float = 7.0  # how long each run is measured, after the first hour
+    seeds: Sequence[int] = tuple(range(20))  # one run each
 
     @property
     def length_s(self) -> float:
@@ -99,14 +92,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Row:
-    """One policy over all seeds.
-
-    Attributes:
-        curve: Of the first seed: from when how many served, in seconds from the beginning.
-    """
+    """One policy over all seeds."""
 
     name: str
     outcomes: tuple[Outcome, ...]
+    # Of the first seed: from when how many served, in seconds from the beginning.
     curve: tuple[tuple[float, int], ...] = ()
 
     def estimate(self, figure: str) -> Estimate:

@@ -6,7 +6,6 @@ Not here: the machines themselves (`world`).
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,13 +20,14 @@ FindOffers = Callable[[Mapping[str, Any]], Sequence[Offer]]
 
 def remembered(find: FindOffers) -> FindOffers:
     """Return the same, each question asked only once: nothing changes while one simulates."""
-    known: dict[str, Sequence[Offer]] = {}
+    known: list[tuple[Mapping[str, Any], Sequence[Offer]]] = []
 
     def ask(resources: Mapping[str, Any]) -> Sequence[Offer]:
-        key = json.dumps(resources, sort_keys=True, default=str)
-        if key not in known:
-            known[key] = tuple(find(resources))
-        return known[key]
+        for asked, sold in known:
+            if asked == resources:
+                return sold
+        known.append((resources, find(resources)))
+        return known[-1][1]
 
     return ask
 

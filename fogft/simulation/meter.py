@@ -13,26 +13,17 @@ DAY_S = 86_400.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """One policy in one market, measured over `seconds`.
-
-    Attributes:
-        available: Fraction of the time in which any replica is wanted that one served.
-        under_target: Fraction of that time that fewer served than the pool file wants.
-        launches: Machines that a cloud agreed to.
-        refusals: Orders that it refused.
-        preemptions: Machines that were taken away or failed.
-        outages: How often the pool stopped to answer, and how long the longest was.
-    """
+    """One policy in one market, measured over `seconds`."""
 
     seconds: float
-    available: float
-    under_target: float
+    available: float  # fraction of the time in which any replica is wanted that one served
+    under_target: float  # fraction of that time that fewer served than the pool file wants
     mean_ready: float
     usd_per_hour: float
-    launches: int
-    refusals: int
-    preemptions: int
-    outages: int
+    launches: int  # machines that a cloud agreed to
+    refusals: int  # orders that it refused
+    preemptions: int  # machines that were taken away or failed
+    outages: int  # how often the pool stopped to answer, and how long the longest was
     longest_outage_s: float
 
 

@@ -18,22 +18,15 @@ HINT = "write `KEY=VALUE,...`, such as `mttf_s=54000,mttr_s=3600,correlation=0.2
 
 @dataclass(frozen=True)
 class Timing:
-    """How fast machines come and go. Seconds.
+    """How fast machines come and go. Seconds."""
 
-    Attributes:
-        boot_s: From the order until the service answers, on average; each launch takes
-            between 3/4 and 5/4 of it, all equally likely.
-        notice_s: Between a preemption notice and the end. 0: no notice.
-        answer_s: Until the cloud accepts or refuses an order.
-        detect_s: Until the loss of a machine without a notice is seen.
-        on_demand_mttf_s: Mean time to the failure of an on-demand machine; 0: never.
-    """
-
+    # From the order until the service answers, on average; each launch takes between 3/4 and
+    # 5/4 of it, all equally likely.
     boot_s: float = 240.0
-    notice_s: float = 120.0
-    answer_s: float = 5.0
-    detect_s: float = 5.0
-    on_demand_mttf_s: float = 0.0
+    notice_s: float = 120.0  # between a preemption notice and the end. 0: no notice
+    answer_s: float = 5.0  # until the cloud accepts or refuses an order
+    detect_s: float = 5.0  # until the loss of a machine without a notice is seen
+    on_demand_mttf_s: float = 0.0  # mean time to the failure of an on-demand machine; 0: never
 
 
 @dataclass(frozen=True)
@@ -42,22 +35,18 @@ class MarketModel:
 
     The defaults were fitted to the public traces of AWS V100 machines (nine zones, 45 days
     of 2023): scarce machines, so on the safe side for common ones.
-
-    Attributes:
-        correlation_region: Of having room, between two zones of one region; below 1.
-        correlation_cloud: Between zones of two regions of one cloud; at most that of a region.
-        correlation_world: Between zones of two clouds; at most that of a cloud.
-        together: Share of a zone's changes that strike its whole region at one moment. Where
-            `correlation_region` is too low for it, as much as that allows.
-        regime_s: How long times of scarcity and plenty last: the correlation time.
     """
 
     mttf_s: float = 12_000.0
     mttr_s: float = 6_600.0
-    correlation_region: float = 0.43
+    correlation_region: float = 0.43  # of having room, between two zones of one region; below 1
+    # Between zones of two regions of one cloud; at most that of a region.
     correlation_cloud: float = 0.14
-    correlation_world: float = 0.0
+    correlation_world: float = 0.0  # between zones of two clouds; at most that of a cloud
+    # Share of a zone's changes that strike its whole region at one moment. Where
+    # `correlation_region` is too low for it, as much as that allows.
     together: float = 0.16
+    # How long times of scarcity and plenty last: the correlation time.
     regime_s: float = 12 * 3600.0
 
     @property

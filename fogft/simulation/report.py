@@ -23,20 +23,15 @@ MAX_POOL_DAYS = 1_000_000
 
 @dataclass(frozen=True)
 class Report:
-    """Policies side by side.
-
-    Attributes:
-        replicas: How many the planner wants outside of the schedule's windows.
-        expected: What independent arithmetic says of as many replicas that move, and that
-            stay; None where the traces cannot be fitted.
-        notes: What a reader should know, in sentences.
-    """
+    """Policies side by side."""
 
     scenario: Scenario
     rows: tuple[Row, ...]
-    replicas: int
+    replicas: int  # how many the planner wants outside of the schedule's windows
+    # What independent arithmetic says of as many replicas that move, and that stay; None
+    # where the traces cannot be fitted.
     expected: Mapping[str, float] | None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what a reader should know, in sentences
 
     def to_json(self) -> dict[str, Any]:
         """Return everything, seed by seed."""

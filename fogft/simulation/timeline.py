@@ -15,15 +15,11 @@ UNLIMITED = 1 << 30
 
 @dataclass(frozen=True)
 class Timeline:
-    """A step function from time to capacity, from 0 on.
+    """A step function from time to capacity, from 0 on."""
 
-    Attributes:
-        changes: ``(at_s, capacity)``, times ascending from 0, capacities alternating.
-        length_s: Until when it is known.
-    """
-
+    # ``(at_s, capacity)``, times ascending from 0, capacities alternating.
     changes: tuple[tuple[float, int], ...]
-    length_s: float
+    length_s: float  # until when it is known
 
     def capacity(self, at_s: float) -> int:
         """Return how many machines fit at a time."""

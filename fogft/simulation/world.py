@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from fogft.cloud.port import Launch
 from fogft.errors import NoCapacity
 from fogft.model.replica import LinkReport, Machine, MachinePhase, Offer, ReplicaId
-from fogft.simulation.market import Change, Market, changes, rounded_up
+from fogft.simulation.market import Change, Market, changes, remembered, rounded_up
 from fogft.simulation.meter import Meter
 
 EPOCH = 1_704_067_200.0  # a Monday, 00:00 UTC: simulated time is a time of day as well
@@ -43,18 +43,13 @@ class Policy(Protocol):
 
 @dataclass(eq=False)
 class Vm:
-    """A machine. Times in seconds since the epoch.
-
-    Attributes:
-        ready: It runs and its service answers.
-        gone_at: It was taken away then, and may still be listed.
-    """
+    """A machine. Times in seconds since the epoch."""
 
     order: Launch
     launched_at: float
-    ready: bool = False
+    ready: bool = False  # it runs and its service answers
     noticed: bool = False
-    gone_at: float = NEVER
+    gone_at: float = NEVER  # it was taken away then, and may still be listed
     machine: Machine | None = None  # as listed; None when that has to be made anew
     report: LinkReport | None = None  # of its link while it answers; likewise
 
@@ -88,7 +83,7 @@ class World:
         # A policy that goes by links can notice so long after that a machine is gone, if it then
         # says so; any other one sees it at once.
         self.silences: Sequence[tuple[float, Callable[[], bool]]] = ()
-        self._sold: list[tuple[Mapping[str, Any], Sequence[Offer]]] = []  # answers, by question
+        self._find = remembered(market.offers)
         self._until = EPOCH + length_s
         self._chance = random.Random(f"machines {seed}")
         self._capacity: dict[str, int] = {}
@@ -202,11 +197,7 @@ class World:
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """List what the market sells; full locations too."""
-        for asked, sold in self._sold:
-            if asked == resources:
-                return sold
-        self._sold.append((resources, self.market.offers(resources)))
-        return self._sold[-1][1]
+        return self._find(resources)
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         """List the machines, those lost and not yet missed included."""

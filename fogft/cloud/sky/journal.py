@@ -44,24 +44,18 @@ ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
 
 @dataclass(frozen=True)
 class Entry:
-    """One launch, as the journal remembers it.
-
-    Attributes:
-        launched_at: Seconds since the epoch.
-        request: SkyPilot's id of the launch request; empty until it is known.
-        job: SkyPilot's number of the job that runs the server proxy; None until known.
-        failure: As in `Machine.failure`.
-    """
+    """One launch, as the journal remembers it."""
 
     id: ReplicaId
     placement: Placement
     usd_per_hour: float
     spec_hash: str
-    launched_at: float
+    launched_at: float  # seconds since the epoch
     stage: Stage = Stage.ASKING
-    request: str = ""
+    request: str = ""  # SkyPilot's id of the launch request; empty until it is known
+    # SkyPilot's number of the job that runs the server proxy; None until known
     job: int | None = None
-    failure: Reason | None = None
+    failure: Reason | None = None  # as in `Machine.failure`
 
 
 class Journal:

@@ -16,19 +16,14 @@ from fogft.model.replica import Placement, ReplicaId
 
 @dataclass(frozen=True)
 class Instance:
-    """A machine in the provider's list that carries our labels and still costs money.
-
-    Attributes:
-        key: The provider's own name of it.
-        launched_at: Seconds since the epoch.
-    """
+    """A machine in the provider's list that carries our labels and still costs money."""
 
     id: ReplicaId
-    key: str
+    key: str  # the provider's own name of it
     placement: Placement
     labels: Mapping[str, str]
     public_ip: str = ""
-    launched_at: float = 0.0
+    launched_at: float = 0.0  # seconds since the epoch
 
 
 class NotAllowedError(Exception):

@@ -43,20 +43,14 @@ class ClusterState(Enum):
 
 @dataclass(frozen=True)
 class Cluster:
-    """A record of SkyPilot's list.
-
-    Attributes:
-        placement: None while SkyPilot has not decided, or when it forgot.
-        launched_at: Seconds since the epoch.
-        progress: What SkyPilot says it is doing, or why the state is what it is.
-    """
+    """A record of SkyPilot's list."""
 
     name: str
     state: ClusterState
-    placement: Placement | None = None
+    placement: Placement | None = None  # none while SkyPilot has not decided, or when it forgot
     head_ip: str = ""
-    launched_at: float = 0.0
-    progress: str = ""
+    launched_at: float = 0.0  # seconds since the epoch
+    progress: str = ""  # what SkyPilot says it is doing, or why the state is what it is
     labels: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -30,19 +30,14 @@ _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
 
 @dataclass(frozen=True)
 class Row:
-    """A machine in a place. Prices are NaN where it is not sold in that way.
-
-    Attributes:
-        as_of: When the prices were true, in seconds since the epoch; 0 for not known.
-        source: Who says so.
-    """
+    """A machine in a place. Prices are NaN where it is not sold in that way."""
 
     cloud: str
     region: str
     zone: str
     instance: Instance
-    as_of: float
-    source: str
+    as_of: float  # when the prices were true, in seconds since the epoch; 0 for not known
+    source: str  # who says so
 
 
 class PriceTable:
