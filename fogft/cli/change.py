@@ -82,9 +82,7 @@ def include(
     location: Annotated[
         str,
         typer.Argument(
-            metavar="LOCATION",
-            autocompletion=options.excluded,
-            help="As given to `exclude`.",
+            metavar="LOCATION", autocompletion=options.excluded, help="As given to `exclude`."
         ),
     ],
     pool: PoolOption = None,

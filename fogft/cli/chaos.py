@@ -25,9 +25,7 @@ Location = Annotated[
 ]
 Duration = Annotated[
     float | None,
-    typer.Option(
-        "--for", min=0, metavar="S", help="Seconds; by default until `clear`.", show_default=False
-    ),
+    typer.Option("--for", min=0, metavar="S", help="Seconds; by default until `clear`."),
 ]
 
 
@@ -39,13 +37,7 @@ def preempt(
     slot: Slot,
     notice: Annotated[
         float | None,
-        typer.Option(
-            "--notice",
-            min=0,
-            metavar="S",
-            show_default=False,
-            help="Seconds until the end; by default the zone's.",
-        ),
+        typer.Option(min=0, metavar="S", help="Seconds until the end; by default the zone's."),
     ] = None,
     pool: PoolOption = None,
 ) -> None:
@@ -86,10 +78,7 @@ def slow(
         float, typer.Argument(min=0, metavar="MS", help="Milliseconds added each way.")
     ],
     rate: Annotated[
-        float | None,
-        typer.Option(
-            "--rate", min=0.001, metavar="MBPS", help="Megabits per second.", show_default=False
-        ),
+        float | None, typer.Option(min=0.001, metavar="MBPS", help="Megabits per second.")
     ] = None,
     lasting: Duration = None,
     pool: PoolOption = None,

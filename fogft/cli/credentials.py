@@ -32,7 +32,6 @@ PassphraseFile = Annotated[
     typer.Option(
         "--passphrase-file",
         metavar="FILE",
-        show_default=False,
         help="Read the passphrase from a file's first line; `-` for standard input.",
     ),
 ]
@@ -47,12 +46,10 @@ def issue(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Its name; a replica's slot.")],
     *,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", show_default=False, help="The file to write."),
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="The file to write.")
     ] = None,
     hours: Annotated[
-        float,
-        typer.Option("--hours", min=0.1, max=720, metavar="H", help="How long it can be used."),
+        float, typer.Option(min=0.1, max=720, metavar="H", help="How long it can be used.")
     ] = DAY_H,
     passphrase_file: PassphraseFile = None,
     pool: PoolOption = None,
@@ -131,10 +128,7 @@ def revoke(
 def rotate(
     role: RoleName,
     name: Annotated[
-        str,
-        typer.Argument(
-            metavar="NAME", help="A replica's slot; by default all.", show_default=False
-        ),
+        str, typer.Argument(metavar="NAME", help="A replica's slot; by default all.")
     ] = "",
     pool: PoolOption = None,
 ) -> None:

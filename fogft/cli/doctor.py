@@ -19,8 +19,7 @@ _STYLES = {"ok": "green", "warn": "bold yellow", "fail": "bold red"}
 
 def doctor(
     file: Annotated[
-        Path | None,
-        typer.Argument(metavar="FILE", help="A pool file to check as well.", show_default=False),
+        Path | None, typer.Argument(metavar="FILE", help="A pool file to check as well.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

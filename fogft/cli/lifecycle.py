@@ -22,22 +22,15 @@ REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup
 
 def init(
     name: Annotated[
-        str,
-        typer.Argument(metavar="NAME", help="Which example.", autocompletion=options.examples),
+        str, typer.Argument(metavar="NAME", help="Which example.", autocompletion=options.examples)
     ] = "",
     into: Annotated[
         Path | None,
-        typer.Option(
-            "--into",
-            metavar="DIR",
-            show_default=False,
-            help="Target folder; by default one with the example's name.",
-        ),
+        typer.Option(metavar="DIR", help="Target folder; by default one with the example's name."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
     schema: Annotated[
-        bool,
-        typer.Option("--schema", help="Print the JSON Schema of pool files, and stop."),
+        bool, typer.Option("--schema", help="Print the JSON Schema of pool files, and stop.")
     ] = False,
 ) -> None:
     """Write an example pool: its pool file and its nodes."""
@@ -62,9 +55,7 @@ def up(
     cloud: Annotated[
         str | None,
         typer.Option(
-            "--cloud",
             metavar="NAME",
-            show_default=False,
             help="Where to run; by default what the file's resources name, else `local`.",
         ),
     ] = None,
@@ -74,11 +65,7 @@ def up(
     timeout: Annotated[
         float | None,
         typer.Option(
-            "--timeout",
-            min=1,
-            metavar="S",
-            show_default=False,
-            help="How long to wait for the services; 300, on real clouds 1800.",
+            min=1, metavar="S", help="How long to wait for the services; 300, on real clouds 1800."
         ),
     ] = None,
 ) -> None:
@@ -170,8 +157,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
 def down(
     pool: PoolArgument = None,
     yes: Annotated[
-        bool,
-        typer.Option("--yes", "-y", help="Do not ask. Without a terminal, nothing is asked."),
+        bool, typer.Option("--yes", "-y", help="Do not ask. Without a terminal, nothing is asked.")
     ] = False,
 ) -> None:
     """End a pool: its replicas, its client proxy and its manager.

@@ -69,15 +69,12 @@ PoolOption = Annotated[
         "-p",
         help="Pool name; required if there are several.",
         autocompletion=pools,
-        show_default=False,
         metavar="NAME",
     ),
 ]
 PoolArgument = Annotated[
     str | None,
-    typer.Argument(
-        help="Pool name; required if there are several.", autocompletion=pools, show_default=False
-    ),
+    typer.Argument(help="Pool name; required if there are several.", autocompletion=pools),
 ]
 Slot = Annotated[
     int, typer.Argument(min=0, metavar="SLOT", help="See `fogft status`.", autocompletion=slots)

@@ -23,11 +23,7 @@ def _endpoint(value: str | None) -> str | None:
 
 Listen = Annotated[
     str | None,
-    typer.Option(
-        metavar="HOST:PORT",
-        help="Where to listen; by default as the file says.",
-        show_default=False,
-    ),
+    typer.Option(metavar="HOST:PORT", help="Where to listen; by default as the file says."),
 ]
 
 Config = Annotated[
@@ -39,7 +35,6 @@ Metrics = Annotated[
     typer.Option(
         metavar="HOST:PORT",
         help="Where to serve metrics for Prometheus (GET /metrics).",
-        show_default=False,
         callback=_endpoint,
     ),
 ]
@@ -60,30 +55,18 @@ def serve(
     *,
     listen: Listen = None,
     domain_id: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=232, metavar="N", help="ROS domain of the service.", show_default=False
-        ),
+        int | None, typer.Option(min=0, max=232, metavar="N", help="ROS domain of the service.")
     ] = None,
     workdir: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Where to start the `run` command.", show_default=False),
+        Path | None, typer.Option(metavar="DIR", help="Where to start the `run` command.")
     ] = None,
     notice_file: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="A file that appears before this machine is preempted.",
-            show_default=False,
-        ),
+        typer.Option(metavar="FILE", help="A file that appears before this machine is preempted."),
     ] = None,
     advertise: Annotated[
         str | None,
-        typer.Option(
-            metavar="HOST:PORT",
-            help="Where others reach it, when it is behind NAT.",
-            show_default=False,
-        ),
+        typer.Option(metavar="HOST:PORT", help="Where others reach it, when it is behind NAT."),
     ] = None,
     metrics: Metrics = None,
 ) -> None:

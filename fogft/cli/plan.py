@@ -16,19 +16,14 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     cloud: Annotated[
         str | None,
         typer.Option(
-            "--cloud",
             metavar="NAME",
-            show_default=False,
             help="Whose prices; by default what the file's resources name, else `local`.",
         ),
     ] = None,
     prices: Annotated[
         Path | None,
         typer.Option(
-            "--prices",
-            metavar="CSV",
-            show_default=False,
-            help="Prices from a table with SkyPilot's columns, not from a cloud.",
+            metavar="CSV", help="Prices from a table with SkyPilot's columns, not from a cloud."
         ),
     ] = None,
     offline: Annotated[
@@ -40,12 +35,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     as_json: AsJson = False,
     plot: Annotated[
         Path | None,
-        typer.Option(
-            "--plot",
-            metavar="FILE",
-            show_default=False,
-            help="Draw price against distance to a PNG, SVG or PDF file.",
-        ),
+        typer.Option(metavar="FILE", help="Draw price against distance to a PNG, SVG or PDF file."),
     ] = None,
 ) -> None:
     """Show what a pool file would launch, why there, and what it costs. Launches nothing."""

@@ -41,7 +41,7 @@ def simulate(
         int, typer.Option(min=1, max=10_000, metavar="N", help="Number of markets.")
     ] = 20,
     first_seed: Annotated[
-        int, typer.Option("--first-seed", min=0, metavar="N", help="Seed of the first market.")
+        int, typer.Option(min=0, metavar="N", help="Seed of the first market.")
     ] = 0,
     cloud: Annotated[
         str | None, typer.Option(metavar="NAME", help="Whose prices; else the pool file's cloud.")

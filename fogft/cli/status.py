@@ -102,7 +102,6 @@ def logs(
             metavar="SLOT",
             help="Only this replica's log; by default all logs.",
             autocompletion=options.slots,
-            show_default=False,
         ),
     ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Keep showing new lines.")] = False,

@@ -22,10 +22,7 @@ def sweep(
     cloud: Annotated[
         str | None,
         typer.Option(
-            "--cloud",
-            metavar="NAME",
-            show_default=False,
-            help="Only `local` or `sky`; by default every cloud used from here.",
+            metavar="NAME", help="Only `local` or `sky`; by default every cloud used from here."
         ),
     ] = None,
 ) -> None:

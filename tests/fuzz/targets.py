@@ -93,7 +93,7 @@ def _records() -> list[SignedRecord]:
         "draining": False,
         "in_flight": 0,
     }
-    member = {"slot": 0, "generation": 1, "endpoint": "h:1", "draining": False}
+    member = {"id": {"pool_uid": UID, "slot": 0, "generation": 1}, "endpoint": "h:1"}
     return [
         _record(RecordKind.SLOT, "0", REPLICA, slot),
         _record(RecordKind.ADMISSION, "", MANAGER, {"pool": "p", "members": [member]}),
