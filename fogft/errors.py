@@ -24,7 +24,17 @@ class FogftError(Exception):
 
 
 class SpecError(FogftError):
-    """A pool file is wrong. The message begins with ``file:line: key:``."""
+    """A pool file is wrong. The message begins with ``file:line: key:``.
+
+    Attributes:
+        key: The key that it is about, such as ``fogft.replicas``; empty where it is about none.
+        what: What is wrong with it.
+    """
+
+    def __init__(self, message: str, hint: str = "", *, key: str = "", what: str = "") -> None:
+        super().__init__(message, hint)
+        self.key = key
+        self.what = what
 
 
 class StateError(FogftError):

@@ -236,15 +236,10 @@ def _clock(written: Any) -> int:
     return minutes * 60
 
 
-def _clock_text(seconds: int) -> str:
-    return f"{seconds // 3600}:{seconds // 60 % 60:02}"
-
-
-_CLOCK_FORM = Special("hours:minutes", _clock, _clock_text, {"type": ["string", "integer"]})
+_CLOCK_FORM = Special("hours:minutes", _clock, {"type": ["string", "integer"]})
 _DAYS_FORM = Special(
     "days of the week",
     _days,
-    lambda days: [DAYS[day] for day in sorted(days)],
     {"type": ["string", "array"]},
 )
 
@@ -355,7 +350,6 @@ class PlacementSpec:
         Special(
             "latitude and longitude",
             _robot_at,
-            lambda at: list(at or ()),
             {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
         ),
         "Where the robot is, in degrees: distances are estimated where they cannot be measured.",

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from fogft.model import keys
 from fogft.model.names import POOL_UID_PATTERN
 
 # The longest role, dots, six digits and the uid take 36 of a common name's 64 characters.
@@ -83,6 +82,6 @@ def holder_of(common_name: str) -> Holder:
 class CredentialPaths:
     """Where a process finds its certificate, its key and the pool's CA."""
 
-    ca: Path = keys.key(keys.PATH, "The pool's certificate authority.")
-    certificate: Path = keys.key(keys.PATH, "Certificate of this process.")
-    key: Path = keys.key(keys.PATH, "Its private key.")
+    ca: Path
+    certificate: Path
+    key: Path

@@ -18,7 +18,6 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, dataclass, field
 from enum import Enum
-from pathlib import Path
 from typing import Any, NamedTuple
 
 DAY_S = 86_400.0
@@ -65,20 +64,23 @@ class Text:
         hint: What to do where it is not.
         check: Returns the text as it is kept. Raises ValueError with what is wrong.
         suggest: Returns what was probably meant; empty for nothing.
+        has_parts: Whether the proxies are told of further ones that no file may name, such as the
+            types of an action's parts.
     """
 
     what: str
     hint: str
     check: Callable[[str], str] = str
     suggest: Callable[[str], str] = lambda text: ""
+    has_parts: bool = False
 
 
-def only(is_right: Callable[[str], object]) -> Callable[[str], str]:
-    """Return a check for `Text` that takes a text as it is, where it is right."""
+def only(is_right: Callable[[str], object], what: str = "") -> Callable[[str], str]:
+    """Return a check that takes a text as it is where it is right; `what` says what it must be."""
 
     def check(written: str) -> str:
         if not is_right(written):
-            raise ValueError
+            raise ValueError(f"`{written:.80}` is not {what}" if what else "")
         return written
 
     return check
@@ -142,25 +144,38 @@ class Special:
     Attributes:
         what: What may stand there, for people.
         read: Returns the value of what stands there. Raises ValueError; a hint may follow ``; ``.
-        plain: The way back.
         schema: As a JSON Schema has it.
     """
 
     what: str
     read: Callable[[Any], Any]
-    plain: Callable[[Any], Any]
     schema: dict[str, Any]
 
 
-def _path(written: Any) -> Path:
-    if not isinstance(written, str) or not written or "\0" in written:
-        raise ValueError(f"must be a path, not {written!r:.40}")
-    return Path(written)
-
-
-PATH = Special("a path, relative to the file's folder", _path, str, {"type": "string"})
-
 Form = Number | Whole | Flag | OneOf | Text | Listed | Table | Map | Maps | Free | Special
+
+
+def checked(form: Form, value: Any) -> Any:
+    """Return a value of a key that the proxies are told, if its form allows it.
+
+    Raises:
+        ValueError: It does not.
+    """
+    match form:
+        case Text() if not form.has_parts:
+            try:
+                return form.check(value)
+            except ValueError:
+                raise ValueError(f"`{value:.80}` is not {form.what}") from None
+        case Listed() | Maps() if len(value) > form.most:
+            raise ValueError(f"{len(value)} entries, where {form.most} are the limit")
+        case Listed():
+            return tuple(checked(form.of, one) for one in value)
+        case Number() if not 0 <= value <= max(form.most, LONGEST_S):
+            raise ValueError(f"{value:g} is not from 0 to {max(form.most, LONGEST_S):g}")
+        case Whole() if not form.least <= value <= form.most:
+            raise ValueError(f"{value} is not from {form.least} to {form.most}")
+    return value
 
 
 @dataclass(frozen=True)
@@ -173,9 +188,7 @@ class Key:
         name: The key, where the field is called otherwise.
         usual: The default in words, where the value says nothing to people.
         advanced: Whether it stands under `advanced`.
-        internal: Whether only the proxies' configurations have it.
         parameter: Whether it is a ROS parameter of the client proxy.
-        on_replica: Whether a replica needs it too.
     """
 
     form: Form
@@ -183,9 +196,7 @@ class Key:
     name: str = ""
     usual: str = ""
     advanced: bool = False
-    internal: bool = False
     parameter: bool = False
-    on_replica: bool = False
 
 
 class Entry(NamedTuple):

@@ -30,7 +30,7 @@ NO_VM_CLOUDS = ("k8s", "kubernetes", "slurm", "ssh")
 NOTICE_SOURCES = ("auto", "aws", "azure", "gcp")
 ROBOT_BYTES_LIMIT = 64  # of a robot's name
 POOL_UID_PATTERN = re.compile(r"[0-9a-f]{16}")
-PoolUid = Annotated[str, only(POOL_UID_PATTERN.fullmatch)]
+PoolUid = Annotated[str, only(POOL_UID_PATTERN.fullmatch, "16 hexadecimal digits")]
 POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
@@ -118,4 +118,5 @@ def is_endpoint(text: str) -> bool:
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
 
 
-Endpoint = Annotated[str, only(lambda text: not text or is_endpoint(text))]  # empty for none
+Endpoint = Annotated[str, only(is_endpoint, "`host:port`")]
+EndpointOrEmpty = Annotated[str, only(lambda text: not text or is_endpoint(text), "`host:port`")]

@@ -13,7 +13,8 @@ import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
 from functools import partial
-from typing import Annotated, Any, TypeVar
+from pathlib import Path, PurePath
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from fogft.errors import StateError
 from fogft.model import keys
@@ -24,38 +25,65 @@ Read = Callable[[Any], Any]
 _READERS: dict[Any, Read] = {}
 
 
-def _not_negative(value: float) -> None:
-    if not 0 <= value < float("inf"):  # false for NaN too
-        raise ValueError(f"{value!r:.40} is below 0, or no number")
+class Misfit(ValueError):
+    """This is no value of a class.
 
-
-Count = Annotated[int, _not_negative]
-Moment = Annotated[float, _not_negative]  # seconds since the epoch
-
-
-def to_plain(value: Any) -> Any:
-    """Return a value as JSON data: classes as maps, a set sorted.
-
-    A class with `omits_defaults` is written without the fields that have their defaults.
+    Attributes:
+        path: The keys and indices that lead to what is wrong.
+        what: What is wrong there.
     """
+
+    def __init__(self, path: tuple[str | int, ...], what: str) -> None:
+        parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+        self.path, self.what = path, what
+        super().__init__(f"{''.join(parts).lstrip('.')}: {what}")
+
+
+def within(least: float, most: float) -> Callable[[float], None]:
+    """Return a check of an `Annotated` number: that it is from `least` to `most`."""
+
+    def check(value: float) -> None:
+        if not least <= value <= most:  # nor NaN
+            raise ValueError(f"{value!r:.40} is not from {least:g} to {most:g}")
+
+    return check
+
+
+Count = Annotated[int, within(0, 2**53)]
+Generation = Annotated[int, within(1, 1 << 31)]
+Moment = Annotated[float, within(0, 1e12)]  # seconds since the epoch
+
+
+def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
+    """Return a value as JSON data: classes as maps by the names of their keys, a set sorted.
+
+    Args:
+        value: Of classes, enumerations, lists, maps and what JSON has itself.
+        omit_defaults: Whether fields that have their defaults are left out, as they are of every
+            class with `omits_defaults`.
+    """
+    again = partial(to_plain, omit_defaults=omit_defaults)
     if isinstance(value, Enum):
         return value.value
+    if isinstance(value, PurePath):
+        return str(value)
     if dataclasses.is_dataclass(value):
-        omits = getattr(value, "omits_defaults", False)
-        held = ((name, default, getattr(value, name)) for name, default in _fields(type(value)))
-        return {name: to_plain(one) for name, default, one in held if not omits or one != default}
+        omits = omit_defaults or getattr(value, "omits_defaults", False)
+        held = [(one, getattr(value, one.field)) for one in _entries(type(value))]
+        kept = [(one, it) for one, it in held if not omits or it != one.default]
+        return {one.name: again(dict(it) if one.is_pairs else it) for one, it in kept}
     if isinstance(value, Mapping):
-        return {str(key): to_plain(one) for key, one in value.items()}
+        return {str(key): again(one) for key, one in value.items()}
     if isinstance(value, (set, frozenset)):
-        return sorted(map(to_plain, value))
-    return [to_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+        return sorted(map(again, value))
+    return [again(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
 def from_plain(cls: type[T], raw: Any) -> T:
     """Return the value that JSON data describes.
 
     Raises:
-        ValueError: It describes none of this class.
+        ValueError: It describes none of this class; the message begins with the key.
     """
     try:
         made: T = _reader(cls)(raw)
@@ -76,12 +104,28 @@ def stored(cls: type[T], raw: Any, what: str) -> T:
         raise StateError(f"{what}: {error}") from error
 
 
-def _fields(cls: Any) -> Iterable[tuple[str, Any]]:
-    """Return the names of a class's fields, each with its default."""
-    return [
-        (f.name, f.default if f.default_factory is dataclasses.MISSING else f.default_factory())
-        for f in dataclasses.fields(cls)
-    ]
+class _Entry(NamedTuple):
+    name: str
+    field: str
+    default: Any
+    form: keys.Form | None
+
+    @property
+    def is_pairs(self) -> bool:
+        """Whether a map in plain data is kept as pairs."""
+        return isinstance(self.form, keys.Table) and self.form.as_pairs
+
+
+def _entries(cls: Any) -> list[_Entry]:
+    found = []
+    for one in dataclasses.fields(cls):
+        key: keys.Key | None = one.metadata.get("key")
+        default = one.default
+        if one.default_factory is not dataclasses.MISSING:
+            default = one.default_factory()
+        name, form = (one.name, None) if key is None else (key.name or one.name, key.form)
+        found.append(_Entry(name, one.name, default, form))
+    return found
 
 
 def _reader(hint: Any) -> Read:
@@ -111,6 +155,8 @@ def _made(hint: Any) -> Read:  # noqa: PLR0911
         return by_value
     if dataclasses.is_dataclass(hint):
         return _class(hint)
+    if hint is Path:
+        return _path
     return _scalar(hint)
 
 
@@ -125,6 +171,12 @@ def _scalar(kind: Any) -> Read:
         return kind(raw)
 
     return read
+
+
+def _path(raw: Any) -> Path:
+    if not isinstance(raw, str) or not raw or "\0" in raw:
+        raise ValueError(f"must be a path, not {raw!r:.40}")
+    return Path(raw)
 
 
 def _checked(read: Read, checks: Iterable[Callable[[Any], object]]) -> Read:
@@ -148,11 +200,20 @@ def _fixed(reads: list[Read]) -> Read:
 
 
 def _listed(make: Callable[[Iterable[Any]], Any], read: Read) -> Read:
-    return lambda raw: make(read(one) for one in _list(raw))
+    return lambda raw: make(_at(n, read, one) for n, one in enumerate(_list(raw)))
 
 
 def _map(key: Read, read: Read) -> Read:
-    return lambda raw: {key(name): read(one) for name, one in _items(raw)}
+    return lambda raw: {key(name): _at(name, read, one) for name, one in _items(raw)}
+
+
+def _at(place: str | int, read: Read, raw: Any) -> Any:
+    try:
+        return read(raw)
+    except Misfit as error:
+        raise Misfit((place, *error.path), error.what) from error
+    except ValueError as error:
+        raise Misfit((place,), str(error)) from error
 
 
 def _items(raw: Any) -> Iterable[tuple[Any, Any]]:
@@ -163,31 +224,29 @@ def _items(raw: Any) -> Iterable[tuple[Any, Any]]:
 
 def _class(cls: Any) -> Read:
     hints = typing.get_type_hints(cls, include_extras=True)
-    reads = {name: _reader(hints[name]) for name, _ in _fields(cls)}
-    required = [name for name, default in _fields(cls) if default is dataclasses.MISSING]
-    for entry in keys.keys_of(cls):
-        reads[entry.path[0]] = _of_form(entry.key.form, reads[entry.path[0]])
+    entries = {one.name: one for one in _entries(cls)}
+    reads = {one.name: _of_key(one, _reader(hints[one.field])) for one in entries.values()}
 
     def read(raw: Any) -> Any:
-        found = {name: reads[name](one) for name, one in _items(raw) if name in reads}
-        missing = [name for name in required if name not in found]
-        if missing:
-            raise ValueError(f"`{missing[0]}` is missing")
-        return cls(**found)
+        found = {n: _at(n, reads[n], value) for n, value in _items(raw) if n in reads}
+        for name, one in entries.items():
+            if one.default is dataclasses.MISSING and name not in found:
+                raise Misfit((name,), "is missing")
+        return cls(**{entries[name].field: value for name, value in found.items()})
 
     return read
 
 
-def _of_form(form: keys.Form, read: Read) -> Read:
-    """Return a reader of a pool file's key that keeps to what its form allows."""
-    if isinstance(form, keys.Text):
-        return _checked(read, [form.check])
+def _of_key(entry: _Entry, read: Read) -> Read:
+    """Return a reader that keeps to what a pool file may say, or to the key's default."""
+    form = entry.form
+    if form is None:
+        return read
+    if entry.is_pairs:
+        return lambda raw: read([list(pair) for pair in _items(raw)])
 
-    def check(values: Sequence[str]) -> None:
-        if isinstance(form, (keys.Listed, keys.Maps)) and len(values) > form.most:
-            raise ValueError(f"{len(values)} entries, where {form.most} are the limit")
-        if isinstance(form, keys.Listed):
-            for value in values:
-                form.of.check(value)
+    def checked(raw: Any) -> Any:
+        value = read(raw)
+        return value if value is None or value == entry.default else keys.checked(form, value)
 
-    return _checked(read, [check]) if isinstance(form, (keys.Listed, keys.Maps)) else read
+    return checked

@@ -1,38 +1,25 @@
 """What the proxies' configuration files hold. Values only; relative paths begin at the file.
 
-Owns: the keys of `proxy.yaml`, `gateway.yaml` and `replica.yaml`.
+Owns: the keys of `proxy.yaml`, `gateway.yaml`, `replica.yaml` and `rendezvous.yaml`.
 Not here: reading them (`fogft.proxy.config`), writing them (`fogft.pool.manager.configuration`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from fogft.model.choices import Speaks
 from fogft.model.credentials import CredentialPaths
-from fogft.model.keys import (
-    PATH,
-    Flag,
-    Free,
-    Listed,
-    Map,
-    Maps,
-    Number,
-    OneOf,
-    Text,
-    Whole,
-    key,
-    only,
-)
-from fogft.model.names import NOTICE_SOURCES, POOL_UID_PATTERN, ROBOT_BYTES_LIMIT, is_endpoint
+from fogft.model.keys import LONGEST_S, only
+from fogft.model.names import NOTICE_SOURCES, ROBOT_BYTES_LIMIT, Endpoint, EndpointOrEmpty, PoolUid
+from fogft.model.plain import Generation, within
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.uplinks import is_interface
-
-_LAST_GENERATION = 1 << 31
 
 
 def _is_robot(written: str) -> bool:
@@ -44,124 +31,104 @@ def _is_notice_source(written: str) -> bool:
     return (kind == "file" and path != "") or written in ("none", *NOTICE_SOURCES)
 
 
-_POOL = Text("a pool's name", "write the pool's name")
-_UID = Text("a pool's uid", "quote its 16 hexadecimal digits", only(POOL_UID_PATTERN.fullmatch))
-_ENDPOINT = Text("`host:port`", "write an address and a port", only(is_endpoint))
-_ENDPOINTS = Listed(_ENDPOINT, 64, least=0)
-_MAPS = "write a list of maps"
+_sources = f"one of file:PATH, none, {', '.join(NOTICE_SOURCES)}"
+Robot = Annotated[str, only(_is_robot, f"1 to {ROBOT_BYTES_LIMIT} printable bytes")]
+NoticeSource = Annotated[str, only(_is_notice_source, _sources)]
+Interface = Annotated[str, only(is_interface, "a network interface's name")]
+DomainId = Annotated[int, within(0, 232)]
+LastsFor = Annotated[float, within(1e-12, LONGEST_S)]
 
 
 @dataclass(frozen=True)
 class ClientProxyConfig:
-    """All that `fogft proxy` or `fogft gateway` needs to know."""
+    """All that `fogft proxy` or `fogft gateway` needs to know.
 
-    pool: str = key(_POOL, "Name of the pool.")
-    pool_uid: str = key(_UID, "The pool's identity.")
-    robot: str = key(
-        Text("a name", f"write 1 to {ROBOT_BYTES_LIMIT} printable bytes", only(_is_robot)),
-        "Name of this robot, or gateway.",
-    )
-    membership: Path = key(PATH, "Which replicas there are; written by the manager.")
-    status: Path = key(PATH, "What the proxy reports to the manager.")
-    lease: Path = key(PATH, "Its beat tells that a manager lives.")
-    lock: Path = key(PATH, "Held while the proxy lives.")
-    credentials: CredentialPaths = key(Map(CredentialPaths), "Certificate, key and CA.")
-    services: tuple[ServiceSpec, ...] = key(Maps(ServiceSpec, _MAPS), "The proxied services.")
-    suspect_after_s: float = key(
-        Number(3600, "seconds"),
-        "Send nothing more to a replica after this long without a probe reply.",
-        default=2.0,
-    )
-    tell_losers: bool = key(
-        Flag(),
-        "Tell replicas which requests were answered elsewhere.",
-        default=True,
-    )
-    domain_id: int | None = key(
-        Whole(0, 232), "ROS domain; ROS_DOMAIN_ID where it is not set.", default=None
-    )
-    rendezvous: tuple[str, ...] = key(_ENDPOINTS, "Where rendezvous listen.", default=())
-    records: Path | None = key(
-        PATH, "What was learned from rendezvous, for the next start.", default=None
-    )
-    revocations: Path | None = key(
-        PATH, "The manager's signed revocations, to be passed on to replicas.", default=None
-    )
-    dial_in: str = key(
-        _ENDPOINT, "Address that replicas which cannot be reached are given.", default=""
-    )
-    dial_in_listen: str = key(
-        _ENDPOINT, "Where to listen for them, if not on that port of all addresses.", default=""
-    )
-    uplinks: tuple[str, ...] = key(
-        Listed(
-            Text("a network interface's name", "write what `ip link` lists", only(is_interface)),
-            64,
-            0,
-        ),
-        "Network interfaces to use at once, the preferred one first.",
-        default=(),
-    )
-    metrics: str = key(_ENDPOINT, "Where to answer Prometheus.", default="")
-    topics: tuple[TopicSpec, ...] = key(Maps(TopicSpec, _MAPS), "The proxied topics.", default=())
-    rmw: Speaks = key(OneOf(Speaks), "How the proxy speaks ROS.", default=Speaks.RCLPY)
-    listen: str = key(_ENDPOINT, "Where a gateway listens for robots.", default="")
+    Attributes:
+        robot: Name of this robot, or gateway.
+        membership: Which replicas there are; written by the manager.
+        status: What the proxy reports to the manager.
+        lease: Its beat tells that a manager lives.
+        lock: Held while the proxy lives.
+        suspect_after_s: Nothing more is sent to a replica after so long without a probe reply.
+        tell_losers: Whether replicas are told which requests were answered elsewhere.
+        domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
+        rendezvous: Where rendezvous listen.
+        records: What was learned from rendezvous, for the next start.
+        revocations: The manager's signed revocations, to be passed on to replicas.
+        dial_in: Address that replicas which cannot be reached are given.
+        dial_in_listen: Where to listen for them, if not on that port of all addresses.
+        uplinks: Network interfaces to use at once, the preferred one first.
+        metrics: Where to answer Prometheus.
+        rmw: How the proxy speaks ROS.
+        listen: Where a gateway listens for robots.
+    """
+
+    pool: str
+    pool_uid: PoolUid
+    robot: Robot
+    membership: Path
+    status: Path
+    lease: Path
+    lock: Path
+    credentials: CredentialPaths
+    services: tuple[ServiceSpec, ...]
+    suspect_after_s: LastsFor = 2.0
+    tell_losers: bool = True
+    domain_id: DomainId | None = None
+    rendezvous: tuple[Endpoint, ...] = ()
+    records: Path | None = None
+    revocations: Path | None = None
+    dial_in: EndpointOrEmpty = ""
+    dial_in_listen: EndpointOrEmpty = ""
+    uplinks: tuple[Interface, ...] = ()
+    metrics: EndpointOrEmpty = ""
+    topics: tuple[TopicSpec, ...] = ()
+    rmw: Speaks = Speaks.RCLPY
+    listen: EndpointOrEmpty = ""
 
 
 @dataclass(frozen=True)
 class ServerProxyConfig:
-    """All that `fogft serve` needs to know. Its options override the file."""
+    """All that `fogft serve` needs to know. Its options override the file.
 
-    pool: str = key(_POOL, "Name of the pool.")
-    pool_uid: str = key(_UID, "The pool's identity.")
-    slot: int = key(Whole(0, 999_999), "Slot of this replica.")
-    generation: int = key(Whole(1, _LAST_GENERATION), "Which launch of the slot this is.")
-    services: tuple[ServiceSpec, ...] = key(Maps(ServiceSpec, _MAPS), "The proxied services.")
-    credentials: CredentialPaths = key(Map(CredentialPaths), "Certificate, key and CA.")
-    run: str = key(
-        Text("a command", "write the command that starts the services"),
-        "Command that starts the services; none where they are started otherwise.",
-        default="",
-    )
-    listen: str = key(_ENDPOINT, "Where to listen.", default="0.0.0.0:7447")
-    workdir: Path = key(PATH, "Folder in which `run` starts.", default=Path())
-    envs: Mapping[str, str] = key(
-        Free("write a map of texts"), "Environment of `run`.", default_factory=dict
-    )
-    domain_id: int | None = key(
-        Whole(0, 232), "ROS domain; ROS_DOMAIN_ID where it is not set.", default=None
-    )
-    orphan_after_s: float = key(
-        Number(1e7, "seconds"),
-        "Shut down after this long without a sign of a manager.",
-        default=3600.0,
-    )
-    notice: str = key(
-        Text(
-            "a source of notices",
-            f"write one of file:PATH, none, {', '.join(NOTICE_SOURCES)}",
-            only(_is_notice_source),
-        ),
-        "Where preemption notices come from.",
-        default="auto",
-    )
-    max_in_flight: int = key(Whole(1, 1 << 20), "Most requests held at once.", default=512)
-    log_level: str = key(
-        Text("a log level", "write debug, info, warning or error"), "Log level.", default="info"
-    )
-    advertise: str = key(
-        _ENDPOINT, "Address at which this replica is reached, where it differs.", default=""
-    )
-    rendezvous: tuple[str, ...] = key(_ENDPOINTS, "Where rendezvous listen.", default=())
-    records: Path | None = key(
-        PATH, "What was learned from rendezvous, for the next start.", default=None
-    )
-    dial_out: tuple[str, ...] = key(
-        _ENDPOINTS, "Robots that this replica dials, where it cannot be reached.", default=()
-    )
-    metrics: str = key(_ENDPOINT, "Where to answer Prometheus.", default="")
-    topics: tuple[TopicSpec, ...] = key(Maps(TopicSpec, _MAPS), "The proxied topics.", default=())
-    rmw: Speaks = key(OneOf(Speaks), "How the proxy speaks ROS.", default=Speaks.RCLPY)
+    Attributes:
+        run: Command that starts the services; empty where they are started otherwise.
+        workdir: Folder in which `run` starts.
+        envs: Environment of `run`.
+        domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
+        orphan_after_s: It shuts down after so long without a sign of a manager.
+        notice: Where preemption notices come from.
+        max_in_flight: Most requests held at once.
+        advertise: Address at which this replica is reached, where it differs.
+        rendezvous: Where rendezvous listen.
+        records: What was learned from rendezvous, for the next start.
+        dial_out: Robots that this replica dials, where it cannot be reached.
+        metrics: Where to answer Prometheus.
+        rmw: How the proxy speaks ROS.
+    """
+
+    pool: str
+    pool_uid: PoolUid
+    slot: Annotated[int, within(0, 999_999)]
+    generation: Generation
+    services: tuple[ServiceSpec, ...]
+    credentials: CredentialPaths
+    run: str = ""
+    listen: Endpoint = "0.0.0.0:7447"
+    workdir: Path = Path()
+    envs: Mapping[str, str] = field(default_factory=dict)
+    domain_id: DomainId | None = None
+    orphan_after_s: LastsFor = 3600.0
+    notice: NoticeSource = "auto"
+    max_in_flight: Annotated[int, within(1, 1 << 20)] = 512
+    log_level: str = "info"
+    advertise: EndpointOrEmpty = ""
+    rendezvous: tuple[Endpoint, ...] = ()
+    records: Path | None = None
+    dial_out: tuple[Endpoint, ...] = ()
+    metrics: EndpointOrEmpty = ""
+    topics: tuple[TopicSpec, ...] = ()
+    rmw: Speaks = Speaks.RCLPY
 
     @property
     def id(self) -> ReplicaId:
@@ -171,11 +138,17 @@ class ServerProxyConfig:
 
 @dataclass(frozen=True)
 class RendezvousConfig:
-    """All that `fogft rendezvous` needs to know."""
+    """All that `fogft rendezvous` needs to know.
 
-    pool_uid: str = key(_UID, "The pool's identity.")
-    credentials: CredentialPaths = key(Map(CredentialPaths), "Certificate, key and CA.")
-    listen: str = key(_ENDPOINT, "Where to listen.", default="0.0.0.0:7450")
-    records: Path = key(PATH, "File that keeps the records.", default=Path("records.json"))
-    status: Path | None = key(PATH, "File for what was counted.", default=None)
-    metrics: str = key(_ENDPOINT, "Where to answer Prometheus.", default="")
+    Attributes:
+        records: File that keeps the records.
+        status: File for what was counted.
+        metrics: Where to answer Prometheus.
+    """
+
+    pool_uid: PoolUid
+    credentials: CredentialPaths
+    listen: Endpoint = "0.0.0.0:7450"
+    records: Path = Path("records.json")
+    status: Path | None = None
+    metrics: EndpointOrEmpty = ""

@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import Annotated
 
 from fogft.model.keys import only
-from fogft.model.names import Endpoint, PoolUid, gateway_certificate_name
+from fogft.model.names import EndpointOrEmpty, PoolUid, gateway_certificate_name
 from fogft.model.plain import Count
 from fogft.model.reason import Reason
 from fogft.model.topology import Topology
@@ -262,7 +262,7 @@ class Member:
     """
 
     id: ReplicaId
-    endpoint: Endpoint
+    endpoint: EndpointOrEmpty
     draining: bool = False
     gateway: str = ""
     version: Annotated[str, only(_VERSION.fullmatch)] = ""

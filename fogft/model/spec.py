@@ -105,7 +105,6 @@ class ServiceSpec:
     name: str = key(
         Text("a service name", "write a name such as `/detect`", absolute_service_name),
         "Name of the service, on the robot and on the replicas; `detect` is `/detect`.",
-        on_replica=True,
     )
     type: str = key(
         Text(
@@ -113,10 +112,10 @@ class ServiceSpec:
             "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`",
             service_type,
             suggested_service_type,
+            has_parts=True,
         ),
         "Its type. It must be installed on the robot; with `rmw: zenoh` only where a policy looks "
         "into responses.",
-        on_replica=True,
     )
     timeout_s: float = key(
         Number(DAY_S, "seconds"),
@@ -164,7 +163,6 @@ class ServiceSpec:
         "Requests that a replica gives the service at once.",
         default=0,
         usual="learned",
-        on_replica=True,
     )
     cancel: str = key(
         Text(
@@ -175,7 +173,6 @@ class ServiceSpec:
         "Service (`std_srvs/srv/Trigger`) that cancels the request at work, called when the robot "
         "has its answer from elsewhere.",
         default="",
-        on_replica=True,
     )
     quorum: int = key(
         Whole(2, MAX_REPLICAS, "replicas"),
@@ -199,7 +196,6 @@ class ServiceSpec:
         "The service keeps state: all replicas apply all requests in one order, and a new replica "
         "is given the state of another.",
         default=None,
-        on_replica=True,
     )
     fallback: FallbackSpec | None = key(
         Map(FallbackSpec, "name a service on the robot, such as `{name: /detect_onboard}`"),
@@ -212,7 +208,6 @@ class ServiceSpec:
         "Which request goes first where several wait: the one with the nearest deadline (`every`), "
         "or the newest (`latest`), for services whose older requests are worth less.",
         default=Freshness.EVERY,
-        on_replica=True,
     )
     trace: bool = key(
         Flag(),
@@ -243,9 +238,7 @@ class ServiceSpec:
         advanced=True,
         parameter=True,
     )
-    part: Part = key(
-        OneOf(Part), "Part of an action.", default=Part.NONE, internal=True, on_replica=True
-    )
+    part: Part = Part.NONE
 
     @property
     def needs_type(self) -> bool:

@@ -26,14 +26,12 @@ class StateService:
     name: str = key(
         Text("a service name", "write a name such as `/svc/get_state`", absolute_service_name),
         "Name of the service.",
-        on_replica=True,
     )
     type: str = key(
         Text("a service type", _END_HINT, service_type, suggested_service_type),
         "Its type.",
         default="",
         usual=f"`{SNAPSHOT_TYPE}`, `{RESTORE_TYPE}`",
-        on_replica=True,
     )
     field: str = key(
         Text("the path of a field", f"write a path such as `field: {FIELD}`", only(is_field_path)),
@@ -41,7 +39,6 @@ class StateService:
         "request for a restore.",
         default="",
         usual=f"`{FIELD}`",
-        on_replica=True,
     )
 
 
@@ -53,11 +50,9 @@ class StateSpec:
         Map(StateService, _HINT, short=("name",)),
         "The service that returns the whole state, called between two requests. A name alone "
         f"stands for one of type `{SNAPSHOT_TYPE}` with the state in `{FIELD}`.",
-        on_replica=True,
     )
     restore: StateService = key(
         Map(StateService, _HINT, short=("name",)),
         "The service that replaces the whole state. A name alone stands for one of type "
         f"`{RESTORE_TYPE}`.",
-        on_replica=True,
     )

@@ -45,49 +45,43 @@ class TopicSpec:
     name: str = key(
         Text("the name of a topic", "write a name such as `/topic`", absolute_service_name),
         "Name of the topic, on the robot and on the replicas.",
-        on_replica=True,
     )
     type: str = key(
         Text(
             "a message type",
             "write `package/msg/Name`, such as `type: sensor_msgs/msg/Image`",
             message_type,
+            has_parts=True,
         ),
         "Its type; it must be installed on the robot.",
-        on_replica=True,
     )
     origin: Origin = key(
         OneOf(Origin),
         "Who publishes it. `robot`: each message goes to every replica. `replicas`: what they "
         "publish comes to the robot, duplicates dropped.",
         name="from",
-        on_replica=True,
     )
     select: Select = key(
         OneOf(Select, hidden=(Select.GOAL, Select.STATUS)),
         "With `from: replicas`, which messages the robot gets: those of one replica at a time "
         "(`leader`), the first with each `header.stamp` (`stamp`), or every one (`all`).",
         default=Select.LEADER,
-        on_replica=True,
     )
     depth: int = key(
         Whole(1, DEPTH_LIMIT, "messages"),
         "Messages kept for a slow subscriber, and of a latched topic for a late one.",
         default=10,
-        on_replica=True,
     )
     reliable: bool = key(
         Flag(),
         "Reliability at both ends; a publisher that offers best effort only needs `false`.",
         default=True,
-        on_replica=True,
     )
     latched: bool = key(
         Flag(),
         "Transient local at both ends: nodes and replicas that come later get the last `depth` "
         "messages.",
         default=False,
-        on_replica=True,
     )
 
     @property

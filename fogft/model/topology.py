@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from fogft.model.credentials import NAME_PATTERN, Holder, Role
 from fogft.model.keys import Listed, Maps, Text, key, only
 from fogft.model.names import is_endpoint
-from fogft.model.plain import Count
+from fogft.model.plain import Generation
 
 GATEWAYS_LIMIT = 64
 ROBOTS_LIMIT = 512
@@ -49,7 +49,7 @@ class Gateway:
         default=(),
         usual="the replicas",
     )
-    generations: tuple[Count, ...] = ()
+    generations: tuple[Generation, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fogft.errors import SpecError, StateError
+from fogft.model.plain import Misfit, from_plain, to_plain
 from fogft.poolfile import yaml_tree
-from fogft.poolfile.plain import to_plain
-from fogft.poolfile.reader import Reader
-from fogft.poolfile.tree import Node, Section, tree
+from fogft.poolfile.tree import below, plain
 
 T = TypeVar("T")
 _HINT = "it is written by `fogft up` or `fogft join`: run that again"
@@ -26,7 +25,9 @@ def document(config: Any, heading: str) -> str:
     import yaml
 
     comment = "".join(f"# {line}\n" for line in heading.splitlines())
-    return comment + yaml.safe_dump(to_plain(config), sort_keys=False, width=100)
+    return comment + yaml.safe_dump(
+        to_plain(config, omit_defaults=True), sort_keys=False, width=100
+    )
 
 
 def read(cls: type[T], path: Path, override: Mapping[str, Any] | None = None) -> T:
@@ -42,16 +43,17 @@ def read(cls: type[T], path: Path, override: Mapping[str, Any] | None = None) ->
     """
     try:
         root = yaml_tree.tree(path.read_text(), str(path))
-        given = {k: v for k, v in (override or {}).items() if v is not None}
-        if isinstance(root.value, Mapping):
-            kept = {k: child for k, child in root.value.items() if child.value is not None}
-            over = {key: tree(value) for key, value in given.items()}
-            root = Node({**kept, **over}, root.line, root.key_line)
-        made = Reader({}, internal=True).map(cls, Section(str(path), "", root))
+        raw = plain(root)
+        if isinstance(raw, dict):
+            given = {key: value for key, value in (override or {}).items() if value is not None}
+            raw = {key: value for key, value in raw.items() if value is not None} | to_plain(given)
+        made = from_plain(cls, raw)
     except SpecError as error:
         raise StateError(error.message, error.hint or _HINT) from error
+    except Misfit as error:
+        raise StateError(f"{path}:{below(root, error.path).line}: {error}", _HINT) from error
     except (OSError, ValueError, RecursionError) as error:
-        raise StateError(f"`{path}` cannot be read: {error}", _HINT) from error
+        raise StateError(f"`{path}` cannot be used: {error}", _HINT) from error
     resolved: T = _resolved(made, path.resolve().parent)
     return resolved
 

@@ -14,21 +14,15 @@ from typing import Any
 from fogft.errors import SpecError
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import yaml_tree
-from fogft.poolfile.tree import nearest
+from fogft.poolfile.tree import below, nearest
 
 
 def located(error: SpecError, source: str, file: Path) -> SpecError:
     """Return a cloud's complaint about a key with the file and the line that it is about."""
     key, colon, _ = error.message.partition(": ")
-    node = yaml_tree.tree(source, str(file))
-    for part in re.findall(r"[^.\[\]]+", key) if colon else ():
-        value = node.value
-        if isinstance(value, tuple) and part.isdigit() and int(part) < len(value):
-            node = value[int(part)]
-        elif isinstance(value, Mapping) and part in value:
-            node = value[part]
-        else:
-            break
+    path = re.findall(r"[^.\[\]]+", key) if colon else ()
+    root = yaml_tree.tree(source, str(file))
+    node = below(root, [int(part) if part.isdigit() else part for part in path])
     return SpecError(f"{file}:{node.key_line}: {error.message}", error.hint)
 
 

@@ -25,7 +25,7 @@ def reference() -> str:
 
 def _tables(title: str, cls: type, seen: set[type]) -> Iterator[str]:
     seen.add(cls)
-    entries = [entry for entry in keys_of(cls) if not entry.key.internal]
+    entries = keys_of(cls)
     usual = [entry for entry in entries if not entry.key.advanced]
     advanced = [entry for entry in entries if entry.key.advanced]
     yield from _table(f"### {title}", usual)

@@ -15,8 +15,8 @@ from typing import Any, TypeAlias
 
 from fogft.errors import SpecError
 from fogft.model.keys import LONGEST_S, keys_of
+from fogft.model.plain import to_plain
 from fogft.model.spec import OnTimeout, Part, ServiceSpec
-from fogft.poolfile.plain import to_plain
 from fogft.poolfile.reader import ADVANCED, Reader
 from fogft.poolfile.rules import RULES
 from fogft.poolfile.tree import Section, tree
@@ -64,7 +64,7 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         return spec
     if spec.part is not Part.NONE:
         return replace(spec, timeout_s=_timeout(spec, news["timeout_s"]))
-    raw: dict[str, Any] = {**to_plain(spec), **news}
+    raw: dict[str, Any] = {**to_plain(spec, omit_defaults=True), **news}
     if raw.get("on_timeout") != OnTimeout.FALLBACK.value:
         raw.pop("fallback_service", None)
     if raw.get("ok_field") == "":
@@ -74,8 +74,8 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
     try:
         read: ServiceSpec = Reader(RULES).map(ServiceSpec, section)
     except SpecError as error:
-        reason = error.message.partition(f"{spec.name}.")[2] or error.message
-        reason = reason.removeprefix(f"{ADVANCED}.")
+        key = error.key.removeprefix(f"{spec.name}.").removeprefix(f"{ADVANCED}.")
+        reason = f"{key}: {error.what}"
         raise ValueError(f"{reason}; {error.hint}" if error.hint else reason) from None
     return replace(read, min_replicas=spec.min_replicas, traffic=spec.traffic)
 

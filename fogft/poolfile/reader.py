@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 from fogft.errors import SpecError
 from fogft.model import keys
 from fogft.model.keys import Entry, Form, keys_of
-from fogft.model.ros_names import message_type, service_type
 from fogft.poolfile import removed
 from fogft.poolfile.tree import Node, Section, plain, shown
 
@@ -30,13 +29,10 @@ class Reader:
 
     Args:
         rules: Dataclass -> judges a value that was read, and may return another.
-        internal: Whether it reads a configuration of our own: names are taken as they are, and
-            keys that only configurations have may stand there.
     """
 
-    def __init__(self, rules: Mapping[type, Rule], *, internal: bool = False) -> None:
+    def __init__(self, rules: Mapping[type, Rule]) -> None:
         self._rules = rules
-        self._internal = internal
 
     def map(self, cls: type[T], section: Section) -> T:
         """Return the dataclass that a map describes.
@@ -44,15 +40,13 @@ class Reader:
         Raises:
             SpecError: The first mistake.
         """
-        entries = [e for e in keys_of(cls) if self._internal or not e.key.internal]
-        has_advanced = any(e.key.advanced for e in entries)
-        known = [e.name for e in entries if self._internal or not e.key.advanced]
-        if not self._internal:  # an older program takes what it knows of a newer configuration
-            allowed = [*known, ADVANCED] if has_advanced else known
-            section.only(allowed, hints=removed.hints(cls), elsewhere=removed.places(cls))
-        advanced = section.section(ADVANCED if has_advanced and not self._internal else "")
+        entries = keys_of(cls)
+        below = [e.name for e in entries if e.key.advanced]
+        known = [e.name for e in entries if not e.key.advanced]
+        allowed = [*known, ADVANCED] if below else known
+        section.only(allowed, hints=removed.hints(cls), elsewhere=removed.places(cls))
+        advanced = section.section(ADVANCED if below else "")
         if advanced.children:
-            below = [e.name for e in entries if e.key.advanced]
             advanced.only(below, elsewhere=removed.places(None))
         values: dict[tuple[str, ...], Any] = {}
         for entry in entries:
@@ -63,14 +57,12 @@ class Reader:
                 raise here.error(entry.name, "is missing", _hint(entry))
         made: T = _build(cls, values)
         rule = self._rules.get(cls)
-        return made if rule is None or self._internal else rule(section, made)
+        return made if rule is None else rule(section, made)
 
     def maps(self, form: keys.Maps, key: str, section: Section) -> tuple[Any, ...]:
         """Return the dataclasses that a list of maps describes, each with a name of its own."""
         found: list[Any] = []
         lines: dict[str, int] = {}
-        if self._internal and section.children[key].value == ():
-            return ()
         sections = section.sections(key, form.hint)
         if len(sections) > form.most:
             raise section.error(key, f"has {len(sections)} entries", f"list {form.most} at most")
@@ -89,23 +81,20 @@ class Reader:
         name, default = entry.name, entry.default
         match entry.key.form:
             case keys.Number() as form:
-                most = max(form.most, keys.LONGEST_S) if self._internal else form.most
-                return section.number(name, most, form.unit, zero=form.from_zero)
+                return section.number(name, form.most, form.unit, zero=form.from_zero)
             case keys.Whole() as form:
-                least = 0 if self._internal else form.least
                 usual = default if isinstance(default, int) else form.least - 1
-                return section.whole(name, usual, least, form.most)
+                return section.whole(name, usual, form.least, form.most)
             case keys.Flag():
                 return section.flag(name, bool(default))
             case keys.OneOf() as form:
-                hidden = () if self._internal else form.hidden
-                return section.choice(name, [m for m in form.of if m not in hidden])
+                return section.choice(name, [m for m in form.of if m not in form.hidden])
             case keys.Text() as form:
-                return self._text(form, section, name, section.text(name, form.hint))
+                return _text(form, section, name, section.text(name, form.hint))
             case keys.Listed() as form:
-                return self._listed(form, section, name)
+                return _listed(form, section, name)
             case keys.Table() as form:
-                return self._table(form, section.section(name, form.name.hint))
+                return _table(form, section.section(name, form.name.hint))
             case keys.Map() as form:
                 return self._map(form, section, name)
             case keys.Maps() as form:
@@ -116,45 +105,6 @@ class Reader:
                 return _special(form, section, name)
         raise AssertionError(entry)
 
-    def _text(self, form: keys.Text, section: Section, key: str, text: str) -> str:
-        if self._internal and form.check in (service_type, message_type):
-            return text  # an action's parts have types of their own
-        try:
-            return form.check(text)
-        except ValueError as error:
-            why = f": {error}" if str(error) else ""
-            meant = form.suggest(text)
-            hint = f"did you mean `{meant}`?" if meant else form.hint
-            raise section.error(key, f"{shown(text)} is not {form.what}{why}", hint) from None
-
-    def _listed(self, form: keys.Listed, section: Section, key: str) -> tuple[str, ...]:
-        listed = section.children[key].value
-        if not isinstance(listed, tuple) or len(listed) < form.least:
-            raise section.error(key, "must be a list", form.of.hint)
-        found: list[str] = []
-        for node in listed:
-            if not isinstance(node.value, str):
-                what = f"{shown(node.value)} is not {form.of.what}"
-                raise section.error(key, what, form.of.hint)
-            text = self._text(form.of, section, key, node.value)
-            if text in found:
-                raise section.error(key, f"has `{text}` twice", "list each of them once")
-            found.append(text)
-        if len(found) > form.most:
-            raise section.error(key, f"has {len(found)} entries", f"list {form.most} at most")
-        return tuple(found)
-
-    def _table(self, form: keys.Table, section: Section) -> Any:
-        for name in section.children:
-            try:
-                form.name.check(name)
-            except ValueError:
-                what = f"{shown(name)} is not {form.name.what}"
-                raise section.error(name, what, form.name.hint, at_key=True) from None
-        unit, zero = form.of.unit, form.of.from_zero
-        found = {n: section.number(n, form.of.most, unit, zero=zero) for n in section.children}
-        return tuple(found.items()) if form.as_pairs else found
-
     def _map(self, form: keys.Map, section: Section, key: str) -> Any:
         node = section.children[key]
         if form.off and node.value is False:
@@ -164,12 +114,49 @@ class Reader:
             below = section.below(key, children)
             try:
                 return self.map(form.of, below)
-            except SpecError as error:  # the key that was written, not the one it stands for
-                message = error.message
-                for name in form.short:
-                    message = message.replace(f"{key}.{name}: ", f"{key}: ")
-                raise SpecError(message, error.hint) from None
+            except SpecError as error:  # of the key that was written, not the one it stands for
+                raise section.error(key, error.what, error.hint) from None
         return self.map(form.of, section.section(key, form.hint))
+
+
+def _text(form: keys.Text, section: Section, key: str, text: str) -> str:
+    try:
+        return form.check(text)
+    except ValueError as error:
+        why = f": {error}" if str(error) else ""
+        meant = form.suggest(text)
+        hint = f"did you mean `{meant}`?" if meant else form.hint
+        raise section.error(key, f"{shown(text)} is not {form.what}{why}", hint) from None
+
+
+def _listed(form: keys.Listed, section: Section, key: str) -> tuple[str, ...]:
+    listed = section.children[key].value
+    if not isinstance(listed, tuple) or len(listed) < form.least:
+        raise section.error(key, "must be a list", form.of.hint)
+    found: list[str] = []
+    for node in listed:
+        if not isinstance(node.value, str):
+            what = f"{shown(node.value)} is not {form.of.what}"
+            raise section.error(key, what, form.of.hint)
+        text = _text(form.of, section, key, node.value)
+        if text in found:
+            raise section.error(key, f"has `{text}` twice", "list each of them once")
+        found.append(text)
+    if len(found) > form.most:
+        raise section.error(key, f"has {len(found)} entries", f"list {form.most} at most")
+    return tuple(found)
+
+
+def _table(form: keys.Table, section: Section) -> Any:
+    for name in section.children:
+        try:
+            form.name.check(name)
+        except ValueError:
+            what = f"{shown(name)} is not {form.name.what}"
+            raise section.error(name, what, form.name.hint, at_key=True) from None
+    unit, zero = form.of.unit, form.of.from_zero
+    found = {n: section.number(n, form.of.most, unit, zero=zero) for n in section.children}
+    return tuple(found.items()) if form.as_pairs else found
 
 
 def _special(form: keys.Special, section: Section, key: str) -> Any:

@@ -40,7 +40,7 @@ def pool_schema() -> dict[str, Any]:
 def _map(cls: type, definitions: dict[str, Any]) -> dict[str, Any]:
     if cls.__name__ not in definitions:
         definitions[cls.__name__] = {}  # a name for those that contain themselves
-        entries = [entry for entry in keys_of(cls) if not entry.key.internal]
+        entries = keys_of(cls)
         parts: dict[bool, dict[str, Any]] = {False: {}, True: {}}
         for entry in entries:
             described = _form(entry.key.form, definitions) | {"description": entry.key.help}

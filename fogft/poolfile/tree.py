@@ -48,6 +48,17 @@ def plain(node: Node) -> Any:
     return node.value
 
 
+def below(node: Node, path: Iterable[str | int]) -> Node:
+    """Return what stands at keys and indices below a node, or as far down as there is something."""
+    for part in path:
+        value: Any = node.value
+        known = dict(enumerate(value)) if isinstance(value, tuple) else value
+        if not isinstance(known, Mapping) or part not in known:
+            break
+        node = known[part]
+    return node
+
+
 def tree(value: Any, line: int = 1) -> Node:
     """Return plain lists and dictionaries as a tree: the way back of `plain`, all in one line."""
     if isinstance(value, Mapping):
@@ -106,7 +117,8 @@ class Section:
         line = self.node.key_line if node is None else node.key_line if at_key else node.line
         word = key if key and key == key.strip() else f'"{key}"'
         full = f"{self.path}.{word}" if self.path else word
-        return SpecError(f"{self.file}:{line}: {shown(full, 80)[1:-1]}: {what}", hint)
+        message = f"{self.file}:{line}: {shown(full, 80)[1:-1]}: {what}"
+        return SpecError(message, hint, key=full, what=what)
 
     def only(
         self,

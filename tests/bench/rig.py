@@ -25,10 +25,10 @@ from typing import Any
 from fogft import disk
 from fogft.model import membership as memberships
 from fogft.model import names
+from fogft.model.plain import to_plain
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
 from fogft.pool.credentials import authority
-from fogft.poolfile.plain import to_plain
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
 from tests.bench.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS

@@ -6,10 +6,10 @@ import pytest
 
 from fogft.errors import FogftError, SpecError
 from fogft.model.intent import Intent, scale
+from fogft.model.plain import from_plain, to_plain
 from fogft.model.spec import ServiceSpec
 from fogft.model.state import StateService, StateSpec
 from fogft.poolfile import file as pool_file
-from fogft.poolfile.plain import from_plain, to_plain
 from fogft.poolfile.pool import Checks
 
 FILE = """
@@ -53,8 +53,6 @@ def test_any_types_and_fields_can_be_named():
 def test_both_proxies_read_what_is_written(state):
     (service,) = parse(state).services
     assert from_plain(ServiceSpec, to_plain(service)) == service
-    for_replica = to_plain(service, on_replica=True)
-    assert from_plain(ServiceSpec, for_replica).state == service.state
 
 
 def test_running_replicas_are_replaced_when_a_service_becomes_stateful():

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from fogft.errors import SpecError
+from fogft.model.plain import from_plain, to_plain
 from fogft.model.spec import Part, ServiceSpec
 from fogft.model.topic import Origin, Select, TopicSpec
 from fogft.poolfile import file
-from fogft.poolfile.plain import from_plain, to_plain
 from fogft.poolfile.pool import Checks
 
 FILE = """\

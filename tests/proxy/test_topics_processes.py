@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from fogft.model.plain import to_plain
 from fogft.model.topic import ActionSpec, Origin, TopicSpec
 from fogft.poolfile.actions import action_services, action_topics
-from fogft.poolfile.plain import to_plain
 from fogft.ros import environment
 from tests.needs import needs
 from tests.proxy.by_hand import Parts, Replica, Robot

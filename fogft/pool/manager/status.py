@@ -260,7 +260,7 @@ def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
     robot = report.robot if report is not None else ""
     return {
         "robot": robot,
-        "gateways": to_plain(here.gateways),
+        "gateways": [vars(one) for one in here.gateways],
         "robots": here.robots,
         "through": here.through,
         "links": links,

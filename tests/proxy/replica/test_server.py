@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from fogft.link.port import Probe
+from fogft.model.plain import from_plain, to_plain
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.topic import ActionSpec
 from fogft.poolfile.actions import action_services
-from fogft.poolfile.plain import from_plain, to_plain
 from fogft.proxy.replica.server import ServerProxy
 from tests.proxy.fakes import UID, Clock, FakeIncoming, FakeListener, FakeNode, FakeSupervisor
 
@@ -185,7 +185,7 @@ def test_close_stops_the_command_and_leaves_the_wire_and_ros():
 def action() -> Scene:
     """A replica that offers an action, of which it knows what the manager writes for it."""
     parts = action_services(ActionSpec("/count", "p/action/T", 5.0, 60.0))
-    told = [from_plain(ServiceSpec, to_plain(part, on_replica=True)) for part in parts]
+    told = [from_plain(ServiceSpec, to_plain(part)) for part in parts]
     scene = Scene(*told)
     scene.proxy.run_once()
     return scene
