@@ -82,11 +82,7 @@ class Accounts(Protocol):
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
         """Test credentials: cloud -> empty, or what is wrong and what to do about it.
 
-        Args:
-            clouds: Their names, as a pool file has them; none for all that can be used.
-
-        Raises:
-            CloudError: Nothing can be tested here.
+        Without names of clouds it tests all that can be used.
         """
 
     def check_task(self, task: Mapping[str, Any]) -> None:

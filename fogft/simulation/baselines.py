@@ -91,16 +91,10 @@ class Static:
 
 
 class Search:
-    """Spot machines wherever a rule finds room, and on-demand ones while too few are ready.
+    """Spot machines wherever a rule finds room, and `extra` ones besides.
 
-    After a refusal in every location it waits a minute.
-
-    Args:
-        spot: What the rule chooses among.
-        on_demand: What runs for each replica that no ready spot machine serves; None for nothing.
-        replicas: How many should be ready.
-        rule: Says where next.
-        extra: So many spot machines are kept besides.
+    `on_demand` runs for each replica that no ready spot machine serves. After a refusal in every
+    location it waits a minute.
     """
 
     def __init__(

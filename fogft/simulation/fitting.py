@@ -23,9 +23,6 @@ def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
 
     A correlation that no pair of locations can tell is that of the next narrower domain,
     and 0 between clouds. Negative ones become 0, and no wider one exceeds a narrower one.
-
-    Raises:
-        FogftError: Nothing ever changed there.
     """
     spells = [spell for line in timelines.values() for spell in line.spells()]
     means = []

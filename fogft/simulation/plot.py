@@ -21,19 +21,11 @@ ENDINGS = (".png", ".svg", ".pdf")
 _COLOURS = ("#0072b2", "#666666", "#e69f00", "#009e73", "#cc79a7")  # told apart by all eyes
 _MARKS = ("o", "s", "^", "D", "v")
 _SHOWN_DAYS = 3.0
-_STYLE: Any = {
-    "font.size": 9,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-}
+_STYLE: Any = {"font.size": 9, "axes.spines.right": False, "axes.spines.top": False}
 
 
 def check(path: Path) -> None:
-    """Check, before hours of simulation, that a plot can be drawn to a file.
-
-    Raises:
-        FogftError: Matplotlib is missing, or the file's ending is unknown.
-    """
+    """Check, before hours of simulation, that a plot can be drawn to a file."""
     if path.suffix not in ENDINGS:
         known = ", ".join(f"`{ending}`" for ending in ENDINGS)
         raise FogftError(f"{path}: cannot draw a `{path.suffix}` file", f"endings: {known}")
@@ -48,11 +40,7 @@ def check(path: Path) -> None:
 
 
 def draw(report: Report, path: Path) -> None:
-    """Draw a report to a file; its ending tells the format.
-
-    Raises:
-        FogftError: It cannot be written, or `check` says no.
-    """
+    """Draw a report to a file; its ending tells the format."""
     check(path)
     import matplotlib
     from matplotlib.figure import Figure
@@ -74,11 +62,7 @@ def draw(report: Report, path: Path) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure to a file, whose bytes depend on nothing but the figure.
-
-    Raises:
-        FogftError: It cannot be written.
-    """
+    """Write a figure to a file, whose bytes depend on nothing but the figure."""
     import matplotlib
 
     metadata: dict[str, Any] = {".svg": {"Date": None}, ".png": {"Software": None}}

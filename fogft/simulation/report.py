@@ -57,11 +57,7 @@ def simulate(
     notes: Sequence[str] = (),
     told: Callable[[int], None] = lambda done: None,
 ) -> Report:
-    """Run a scenario.
-
-    Raises:
-        FogftError: It is too long or too short, or longer than what was recorded.
-    """
+    """Run a scenario. Raises FogftError: it is too long, or longer than what was recorded."""
     scenario, more = _fitting(scenario)
     rows = compare(scenario, told)
     world = World(scenario.market(scenario.seeds[0]), seed=0, length_s=0.0)

@@ -44,9 +44,6 @@ def simulate(
         seeds: One run of each policy a seed.
         cloud: Whose prices; None for the one that the pool file names, else `local`.
         told: Called with the number of runs done.
-
-    Raises:
-        FogftError: The file, the traces or the numbers are wrong.
     """
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.parent)

@@ -62,9 +62,7 @@ class Vm:
 class World:
     """One market with one pool in it. Implements `fogft.cloud.port.Cloud`.
 
-    Args:
-        seed: Of boot times, victims and failures of on-demand machines.
-        settle_s: What happens before is not measured.
+    `seed` is of boot times and victims; what happens before `settle_s` is not measured.
     """
 
     def __init__(

@@ -111,11 +111,7 @@ _NAME = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
 def read(path: Path) -> Catalogue:
-    """Return what a file describes, or the built-in catalogue where there is none.
-
-    Raises:
-        SpecError: The first mistake in it, as ``file:line: key: what is wrong``.
-    """
+    """Return what a file describes, or the built-in catalogue where there is none."""
     try:
         text = path.read_text()
     except FileNotFoundError:

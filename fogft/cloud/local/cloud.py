@@ -41,10 +41,8 @@ _UNKNOWN = Placement("local", "unknown", "unknown", "unknown")
 class LocalCloud:
     """Replicas as processes on this machine (`fogft.cloud.port.Cloud`). Any thread, any process.
 
-    Args:
-        root: Folder of this cloud; made when needed.
-        serve: Command that starts a server proxy; gets ``--config``, ``--listen``,
-            ``--domain-id``, ``--workdir`` and ``--notice-file``.
+    `serve` starts a server proxy; it gets ``--config``, ``--listen``, ``--domain-id``,
+    ``--workdir`` and ``--notice-file``.
     """
 
     def __init__(self, root: Path, serve: Sequence[str] = SERVE) -> None:
@@ -60,11 +58,7 @@ class LocalCloud:
         return self.root / "machines"
 
     def catalogue(self) -> Catalogue:
-        """Return what is sold: ``regions.yaml``, or what is built in.
-
-        Raises:
-            SpecError: ``regions.yaml`` is wrong.
-        """
+        """Return what is sold: ``regions.yaml``, or what is built in."""
         return catalogue.read(self.root / catalogue.FILE)
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
@@ -130,24 +124,22 @@ class LocalCloud:
         return None
 
     def folders(self) -> list[MachineFolder]:
-        """Return the folders of all pools' machines, in any state, unordered.
-
-        Raises:
-            CloudUnreachable: The cloud's folder cannot be read.
-        """
+        """Return the folders of all pools' machines, in any state, unordered."""
         try:
             names = os.listdir(self.machines_folder)
         except FileNotFoundError:
             return []
         except OSError as error:
-            raise CloudUnreachable(
-                f"`{self.machines_folder}` cannot be read: {error.strerror}"
-            ) from error
-        found = [MachineFolder.at(self.machines_folder / name) for name in names]
-        for name, folder in zip(names, found, strict=True):
-            if folder is None and not name.startswith("."):
+            what = f"`{self.machines_folder}` cannot be read: {error.strerror}"
+            raise CloudUnreachable(what) from error
+        found = []
+        for name in names:
+            folder = MachineFolder.at(self.machines_folder / name)
+            if folder is not None:
+                found.append(folder)
+            elif not name.startswith("."):
                 self._warn_once(name, "it is not a machine's folder")
-        return [folder for folder in found if folder is not None]
+        return found
 
     def living(self) -> list[tuple[MachineFolder, Placement]]:
         """Return the machines of all pools that take up room."""

@@ -2,7 +2,7 @@
 
 Owns: what "gone" means. A machine is gone when none of its processes is left and its folder
 has been removed; then its log stands in ``logs/``, which also marks its id as used.
-Not here: who decides that one goes (`cloud`, `chaos`).
+Not here: who decides that one goes (`cloud`, `chaos`). `CloudUnreachable` says that it is not sure.
 """
 
 from __future__ import annotations
@@ -33,11 +33,7 @@ def kept_log(root: Path, id: ReplicaId) -> Path:
 
 
 def end(root: Path, folder: MachineFolder) -> None:
-    """End a machine, whatever state it is in; return when it is gone. Repeatable.
-
-    Raises:
-        CloudUnreachable: One of its processes does not end.
-    """
+    """End a machine, whatever state it is in; return when it is gone. Repeatable."""
     if folder.exists:
         with contextlib.suppress(StateError):  # a full disk keeps nobody alive
             folder.ask_end(0.0)  # a process that starts only now sees it
@@ -50,10 +46,7 @@ def end(root: Path, folder: MachineFolder) -> None:
 
 
 def bury(root: Path, folder: MachineFolder) -> bool:
-    """Remove what is left of a machine that is dead. Returns whether it is gone.
-
-    The caller holds the cloud's lock.
-    """
+    """Remove what is left of a dead machine, under the cloud's lock; return whether it is gone."""
     lock = disk.Lock(folder.path / LOCK)
     try:
         if not lock.acquire(wait=False):
@@ -86,11 +79,7 @@ def overdue(folder: MachineFolder, now: float, patience_s: float = 1.0) -> bool:
 
 @contextlib.contextmanager
 def cloud_lock(root: Path, limit_s: float = _LOCK_LIMIT_S) -> Iterator[None]:
-    """Hold the cloud's lock: nobody else launches or removes a machine meanwhile.
-
-    Raises:
-        CloudUnreachable: It cannot be had within `limit_s`, or the folder cannot be used.
-    """
+    """Hold the cloud's lock: nobody else launches or removes a machine meanwhile."""
     path = root / "cloud.lock"
     lock = disk.Lock(path)
     deadline = time.monotonic() + limit_s

@@ -191,11 +191,7 @@ class _Moment:
 
 
 def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes]) -> None:
-    """Make a machine's folder, whole or not at all. It must not exist.
-
-    Raises:
-        CloudError: A file cannot be written (the disk is full, ...), or has a name of ours.
-    """
+    """Make a machine's folder, whole or not at all. It must not exist."""
     wrong = [n for n in files if n in OWN_FILES or n != os.path.basename(n) or n.startswith(".")]
     if wrong:
         raise CloudError(f"a machine cannot be given a file of the name `{wrong[0]}`")

@@ -31,10 +31,7 @@ def become_subreaper() -> None:
 def start(end_the_rest: Callable[[], None]) -> int:
     """Become the machine, with a guard above it; return the guard's process id.
 
-    Call it before there are threads or children.
-
-    Args:
-        end_the_rest: Kills whatever is left of the machine. Runs in the guard.
+    Call it before there are threads or children. `end_the_rest` runs in the guard.
     """
     become_subreaper()
     guard = os.getpid()

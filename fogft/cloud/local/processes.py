@@ -27,11 +27,9 @@ _POLL_S = 0.005
 
 
 def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
-    """Return the living processes of a pool, a machine, or any machine; never this one, sorted.
+    """Return the living processes of a pool, a machine (as `ReplicaId` text), or any machine.
 
-    Args:
-        pool_uid: Only those of this pool.
-        machine: Only those of this machine (``str`` of its `ReplicaId`).
+    Sorted, and never this one.
     """
     marks = [f"{MACHINE}={machine}".encode()] if machine else []
     marks += [f"{POOL}={pool_uid}".encode()] if pool_uid else []
@@ -48,20 +46,14 @@ def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
         if parent is None:
             continue
         parents[int(entry)] = parent
-        if marks:
-            if all(mark in environ for mark in marks):
-                marked.add(int(entry))
-        elif any(item.startswith(f"{MACHINE}=".encode()) for item in environ):
+        ours = any(item.startswith(f"{MACHINE}=".encode()) for item in environ)
+        if ours and all(mark in environ for mark in marks):
             marked.add(int(entry))
     return sorted(_with_descendants(marked, parents) - {os.getpid()})
 
 
 def end(pids: Iterable[int], limit_s: float = _LIMIT_S) -> None:
-    """Kill processes (SIGKILL) and return when they are gone.
-
-    Raises:
-        CloudUnreachable: One hangs in the kernel, or belongs to another user.
-    """
+    """Kill processes (SIGKILL) and return when they are gone."""
     left = set(pids)
     send(left, signal.SIGKILL)
     deadline = time.monotonic() + limit_s
@@ -78,9 +70,6 @@ def end_machine(machine: str, *, spare: Collection[int] = ()) -> bool:
     """End all processes of a machine but those to spare. Returns whether there were any.
 
     Looks again until a look finds nothing, since what it kills may just have forked.
-
-    Raises:
-        CloudUnreachable: See `end`.
     """
     ended = False
     while pids := set(find(machine=machine)) - set(spare):

@@ -27,7 +27,6 @@ RETRY_S = 0.05
 _CHUNK_S = 0.02  # how much a slow path takes at a time
 _MIN_CHUNK_BYTES = 1024
 _SLACK_BYTES = 64 << 10
-_BACKLOG = 128
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER with no time: close sends RST
 
 
@@ -121,7 +120,7 @@ class Relay:
         self._passes = asyncio.Event()  # unless there is a blackhole
         self._passes.set()
         self._connections: dict[asyncio.Task[None], tuple[_Pipe, ...]] = {}
-        self._listener = socket.create_server(("127.0.0.1", 0), backlog=_BACKLOG)
+        self._listener = socket.create_server(("127.0.0.1", 0), backlog=128)
         self._listener.setblocking(False)
         self._accepting = self._loop.create_task(self._accept())
         self.reached = False  # whether the server has ever accepted a connection

@@ -35,10 +35,7 @@ _ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
 
 
 def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
-    """Return one offer for each zone that can meet the resources, the cheapest first.
-
-    In each zone it is the cheapest instance that suffices. Where alternatives overlap the
-    cheapest counts.
+    """Return for each zone the cheapest instance that meets the resources, the cheapest first.
 
     Raises:
         SpecError: They can never be met here; the message names the key.

@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from fogft.cloud.port import Audit, Launch
 from fogft.cloud.sky import listing, task, wheel
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
-from fogft.cloud.sky.failures import classify
 from fogft.cloud.sky.following import Following
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import ON_THE_MACHINE, UNDER_WAY, Entry, Journal, Stage
@@ -49,51 +49,30 @@ def _each_second(step: Callable[[], bool]) -> None:
     _on_thread(run)
 
 
+@dataclass
 class SkyCloud:
-    """Real clouds. Implements all of `fogft.cloud.port`.
+    """Real clouds. Implements all of `fogft.cloud.port`."""
 
-    Args:
-        folder: Where it remembers its launches, for all pools of this user.
-        sky: SkyPilot.
-        providers: Clouds that can be asked directly.
-        owner: Whose machines these are, for their labels.
-        base: Folder that relative paths of the pool file start from.
-        clock: Seconds since the epoch.
-        submit: Runs a function on another thread.
-        repeat: Calls a function every so often on another thread, until it returns False.
-        sleep: Waits some seconds.
-        make_wheel: Puts fogft's wheel into a folder below the one given, and returns that.
-    """
+    folder: Path  # where it remembers its launches, for all pools of this user
+    sky: InstalledSky
+    providers: Sequence[Provider] = ()  # clouds that can be asked directly
+    _: KW_ONLY
+    owner: str  # whose machines these are, for their labels
+    base: Path  # where relative paths of the pool file start
+    clock: Callable[[], float] = time.time
+    submit: Callable[[Callable[[], None]], object] = _on_thread
+    repeat: Callable[[Callable[[], bool]], object] = _each_second  # until it returns False
+    sleep: Callable[[float], object] = time.sleep
+    make_wheel: Callable[[Path], Path] = wheel.make
 
-    def __init__(
-        self,
-        folder: Path,
-        sky: InstalledSky,
-        providers: Sequence[Provider] = (),
-        *,
-        owner: str,
-        base: Path,
-        clock: Callable[[], float] = time.time,
-        submit: Callable[[Callable[[], None]], object] = _on_thread,
-        repeat: Callable[[Callable[[], bool]], object] = _each_second,
-        sleep: Callable[[float], object] = time.sleep,
-        make_wheel: Callable[[Path], Path] = wheel.make,
-    ) -> None:
-        self._folder = folder
-        self._sky = sky
-        self._owner = owner
-        self._base = base
-        self._clock = clock
-        self._repeat = repeat
-        self._make_wheel = make_wheel
-        by_name = {provider.cloud: provider for provider in providers}
-        self.journal = Journal(folder / "launches")
+    def __post_init__(self) -> None:
+        by_name = {provider.cloud: provider for provider in self.providers}
+        sky, clock, submit = self.sky, self.clock, self.submit
+        self.journal = journal = Journal(self.folder / "launches")
         self._census = Census(by_name, clock, submit)
-        self._presence = Presence(sky, self.journal, self._census, clock, submit)
-        self._ending = Ending(sky, self.journal, by_name, sleep, clock)
-        self._following = Following(
-            sky, self.journal, self._ending, clock, on_move=self._presence.forget
-        )
+        self._presence = Presence(sky, journal, self._census, clock, submit)
+        self._ending = Ending(sky, journal, by_name, self.sleep, clock)
+        self._following = Following(sky, journal, self._ending, clock, self._presence.forget)
         self._prices = Prices(sky, by_name, clock, submit)
         self._lock = threading.Lock()
         self._followed: set[ReplicaId] = set()
@@ -116,25 +95,20 @@ class SkyCloud:
         return machines
 
     def launch(self, order: Launch) -> None:
-        """See `Cloud`. Returns when SkyPilot has accepted the order: seconds.
-
-        Raises:
-            SpecError: The pool file asks for what cannot be honoured. Nothing was launched.
-            CloudError: SkyPilot refuses the task. Nothing was launched.
-        """
+        """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
         made = task.build(
             order,
             task.read(),
             files=self.journal.files(order.id),
-            wheel=self._make_wheel(self._folder / "wheels"),
-            owner=self._owner,
-            base=self._base,
+            wheel=self.make_wheel(self.folder / "wheels"),
+            owner=self.owner,
+            base=self.base,
         )
-        begun = Entry(order.id, order.placement, order.usd_per_hour, order.spec_hash, self._clock())
+        begun = Entry(order.id, order.placement, order.usd_per_hour, order.spec_hash, self.clock())
         if not self.journal.open(begun, order.files):
             return
         try:
-            request = self._sky.launch(made, cluster_name(order.id))
+            request = self.sky.launch(made, cluster_name(order.id))
         except RefusedError as error:
             self.journal.close(order.id)
             raise _refusal(error, order) from error
@@ -163,9 +137,9 @@ class SkyCloud:
         name = cluster_name(id)
         told = ""
         if entry is None or entry.stage in ON_THE_MACHINE:
-            told = self._sky.job_log(name, entry.job if entry else None, _LOG_LINES)
+            told = self.sky.job_log(name, entry.job if entry else None, _LOG_LINES)
         if not told and entry is not None:
-            told = self._sky.provision_log(name, _LOG_LINES)
+            told = self.sky.provision_log(name, _LOG_LINES)
         path = self.journal.provision_log(id)
         if told:
             write_whole(path, told, durable=False)
@@ -179,7 +153,7 @@ class SkyCloud:
 
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
         """See `Accounts`."""
-        return self._sky.check(clouds)
+        return self.sky.check(clouds)
 
     def check_task(self, task: Mapping[str, Any]) -> None:
         """See `Accounts`."""
@@ -190,20 +164,13 @@ class SkyCloud:
         return self._census.unverified(cloud)
 
     def audit(self, pool_uid: str = "") -> Audit:
-        """See `fogft.cloud.port.Auditing`. SkyPilot is asked, and each provider that can be.
-
-        Of all pools only those are listed whose machines carry this user's label.
-        """
+        """See `Auditing`. Of all pools only those whose machines carry this user's label."""
         self._presence.forget()
-        uids = {pool_uid} if pool_uid else self._pools()
-        listed = (
-            machine
-            for uid in sorted(uids)
-            for machine in self._presence.machines(
-                uid, self.journal.entries(uid), self._prices.regions
-            )
-        )
-        machines = {machine.id: machine for machine in listed}
+        machines: dict[ReplicaId, Machine] = {}
+        for uid in {pool_uid} if pool_uid else self._pools():
+            entries = self.journal.entries(uid)
+            listed = self._presence.machines(uid, entries, self._prices.regions)
+            machines |= {machine.id: machine for machine in listed}
         instances, asked = self._census.everywhere(pool_uid)
         for instance in instances:
             if pool_uid or self._mine(instance.labels):
@@ -224,7 +191,7 @@ class SkyCloud:
         return uids
 
     def _mine(self, labels: Mapping[str, str]) -> bool:
-        return labels.get(OWNER, label_value(self._owner)) == label_value(self._owner)
+        return labels.get(OWNER, label_value(self.owner)) == label_value(self.owner)
 
     # -- launches under way -------------------------------------------------------------------
 
@@ -233,7 +200,7 @@ class SkyCloud:
             if id in self._followed or self._closed.is_set():
                 return
             self._followed.add(id)
-        self._repeat(lambda: self._step(id))
+        self.repeat(lambda: self._step(id))
 
     def _step(self, id: ReplicaId) -> bool:
         more = True
@@ -254,7 +221,7 @@ class SkyCloud:
 
 
 def _refusal(error: RefusedError, order: Launch) -> CloudError:
-    failure = classify(error.kind, error.texts)
+    failure = error.reason
     where = f"`{order.placement.location}`"
     if failure.cause is Cause.CAPACITY:
         return NoCapacity(f"no capacity in {where}: {failure.words}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import functools
 import importlib
+import itertools
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -41,14 +42,11 @@ class Aws:
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
         """See `Provider`. Regions are asked side by side.
 
-        Where everything is asked, a region may refuse as long as another one answers: many
-        accounts are kept out of most regions, and nothing of theirs can run there.
+        Of all regions some may refuse: many accounts are kept out of most, and run nothing there.
         """
         where = sorted(set(self.regions() if regions is None else regions))
         if not where:
             return []
-        found: list[Instance] = []
-        refused: list[NotAllowedError] = []
 
         def ask(region: str) -> Sequence[Instance] | NotAllowedError:
             try:
@@ -57,23 +55,17 @@ class Aws:
                 return error
 
         with ThreadPoolExecutor(min(8, len(where)), "aws") as pool:
-            for answer in pool.map(ask, where):
-                if isinstance(answer, NotAllowedError):
-                    refused.append(answer)
-                else:
-                    found += answer
+            answers = list(pool.map(ask, where))
+        refused = [answer for answer in answers if isinstance(answer, NotAllowedError)]
         if refused and (regions is not None or len(refused) == len(where)):
             raise refused[0]
-        return sorted(found, key=lambda i: (i.id, i.key))
+        found = (answer for answer in answers if not isinstance(answer, NotAllowedError))
+        return sorted(itertools.chain.from_iterable(found), key=lambda i: (i.id, i.key))
 
     def terminate(self, instances: Iterable[Instance]) -> None:
         """See `Provider`."""
-        by_region: dict[str, list[str]] = {}
-        for instance in instances:
-            by_region.setdefault(instance.placement.region, []).append(instance.key)
-        for region, keys in by_region.items():
-            for key in keys:  # one by one: a single unknown key fails a whole call
-                self._ask(region, functools.partial(_terminate, key))
+        for instance in instances:  # one by one: a single unknown key fails a whole call
+            self._ask(instance.placement.region, functools.partial(_terminate, instance.key))
 
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         """See `Provider`."""

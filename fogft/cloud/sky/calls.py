@@ -27,16 +27,9 @@ class Calls:
         self._given_up: dict[str, Future[Any]] = {}
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
-        """Run a call, for so long at most; turn its errors into ours.
+        """Run a call on a thread of its own, for so long at most; turn its errors into ours.
 
-        Args:
-            limit_s: How long to wait, in seconds.
-            subject: What it is about, in words; the same words are the same question.
-            call: What to run, on a thread of its own.
-
-        Raises:
-            CloudUnreachable: No answer in time, or none that says anything.
-            RefusedError: The answer is no.
+        `subject` says what it is about: the same words are the same question.
         """
         ends_at = time.monotonic() + limit_s
         with self._lock:

@@ -40,9 +40,6 @@ class Census:
         """Return the instance of a replica that SkyPilot does not list; None when it is gone.
 
         Where the provider cannot be asked, SkyPilot's word has to do.
-
-        Raises:
-            CloudUnreachable: The provider could be asked, and did not answer.
         """
         provider = self.providers.get(entry.placement.cloud)
         if provider is None:
@@ -72,13 +69,7 @@ class Census:
         return found
 
     def everywhere(self, pool_uid: str) -> tuple[Sequence[Instance], frozenset[str]]:
-        """Return what carries a pool's labels now (any pool's: empty), and which clouds were asked.
-
-        Takes seconds.
-
-        Raises:
-            CloudUnreachable: A provider did not answer.
-        """
+        """Return what carries a pool's labels now, or any pool's, and which clouds were asked."""
         found = [i for p in self.providers.values() for i in self._ask(p, None, pool_uid)]
         return found, frozenset(cloud for cloud in self.providers if self.vouches(cloud))
 

@@ -51,12 +51,7 @@ _KINDS = {
 
 
 def classify(kind: str, texts: Iterable[str]) -> Reason:
-    """Return why a launch failed.
-
-    Args:
-        kind: Class name of SkyPilot's exception.
-        texts: Its message, then those of its failover history.
-    """
+    """Return why a launch failed, by an exception's class name, its message and its history's."""
     told = [text for text in (plain(text) for text in texts) if text]
     for cause, pattern in _CODES:
         for text in told:

@@ -16,13 +16,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fogft.cloud.sky.ending import Ending
-from fogft.cloud.sky.failures import classify, tail
+from fogft.cloud.sky.failures import tail
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import UNDER_WAY, Entry, Journal, Stage
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.cloud.sky.task import SETUP_LIMIT_S
-from fogft.errors import CloudError, CloudUnreachable
+from fogft.errors import CloudError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
 from fogft.reason_words import words as in_words
@@ -140,7 +140,7 @@ class Following:
             log.warning("end_failed replica=%s reason=%r", entry.id.short, str(error))
 
     def _refused(self, entry: Entry, error: RefusedError) -> Reason:
-        failure = classify(error.kind, error.texts)
+        failure = error.reason
         if error.kind in ("CommandError", "ClusterSetUpError") and failure.cause is Cause.ERROR:
             log_tail = self._job_tail(entry)
             cause = Cause.SETUP if "setup" in " ".join(error.texts).lower() else Cause.ERROR
@@ -159,10 +159,7 @@ class Following:
         return f"\n{told}" if told else ""
 
     def _provision_tail(self, entry: Entry) -> str:
-        try:
-            told = tail(self.sky.provision_log(cluster_name(entry.id), 30))
-        except CloudUnreachable:
-            return ""
+        told = tail(self.sky.provision_log(cluster_name(entry.id), 30))
         return f"\n{told}" if told else ""
 
     def _move(self, entry: Entry, **changes: object) -> None:

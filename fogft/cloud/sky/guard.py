@@ -21,11 +21,7 @@ ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60
 
 
 def command() -> str:
-    """Return the command: one line, for a shell, which returns at once.
-
-    Raises:
-        FogftError: The installation is incomplete.
-    """
+    """Return the command: one line, for a shell, which returns at once."""
     text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(ALONE_MINUTES))
     packed = base64.b64encode(text.encode()).decode()
     path = "/run/fogft-guard"

@@ -5,7 +5,8 @@ journal is written before SkyPilot is asked, so a replica is listed from then on
 if the manager dies in that moment. It holds no secret. Losing it loses no machine: names
 and labels in the cloud say the same.
 
-Owns: these files, and the folder with each replica's own files.
+Owns: these files, and the folder with each replica's own files. All raise `StateError` where one
+cannot be read or written.
 Not here: what is true in the cloud (`adapter`).
 """
 
@@ -59,22 +60,14 @@ class Entry:
 
 
 class Journal:
-    """The entries of all pools of this user.
-
-    Args:
-        folder: Where they lie; made when it is missing.
-    """
+    """The entries of all pools of this user."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         make_folder(folder)
 
     def open(self, entry: Entry, files: Mapping[str, bytes]) -> bool:
-        """Write a new entry and its files; False when there is one for this id already.
-
-        Raises:
-            StateError: The disk refuses; nothing was begun.
-        """
+        """Write a new entry and its files; False when there is one for this id already."""
         with locked(self._folder / "journal.lock"):
             if self._path(entry.id).exists():
                 return False
@@ -86,11 +79,7 @@ class Journal:
             return True
 
     def update(self, id: ReplicaId, **changes: Any) -> Entry | None:
-        """Change an entry; None when it was closed meanwhile. A stage never moves back.
-
-        Raises:
-            StateError: It cannot be read or written.
-        """
+        """Change an entry; None when it was closed meanwhile. A stage never moves back."""
         with locked(self._folder / "journal.lock"):
             entry = self.get(id)
             if entry is None:
@@ -112,16 +101,12 @@ class Journal:
             self._path(id).unlink(missing_ok=True)
 
     def get(self, id: ReplicaId) -> Entry | None:
-        """Return an entry, or None. Raises StateError: it cannot be read."""
+        """Return an entry, or None."""
         value = read_json(self._path(id))
         return None if value is None else stored(Entry, value, f"`{self._path(id)}` is damaged")
 
     def entries(self, pool_uid: str = "") -> list[Entry]:
-        """Return the entries of one pool, or of all, ordered by id.
-
-        Raises:
-            StateError: One cannot be read: what it stood for must not be forgotten.
-        """
+        """Return the entries of one pool, or of all, ordered by id; a damaged one is an error."""
         ids = (replica_of(path.stem) for path in self._folder.glob("*.json"))
         wanted = sorted(id for id in ids if id and pool_uid in ("", id.pool_uid))
         return [entry for entry in map(self.get, wanted) if entry is not None]

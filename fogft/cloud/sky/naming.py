@@ -27,13 +27,9 @@ _NOT_A_LABEL = re.compile(r"[^a-z0-9_-]")
 
 
 def cluster_name(id: ReplicaId) -> str:
-    """Return the name of a replica's cluster: ``fogft-<uid>-<slot>-<generation>``.
-
-    Raises:
-        ValueError: The id is not one of ours; a name made of it could mean something else.
-    """
+    """Return the name of a replica's cluster: ``fogft-<uid>-<slot>-<generation>``."""
     name = f"{PREFIX}{id.pool_uid}-{id.slot}-{id.generation}"
-    if replica_of(name) != id:
+    if replica_of(name) != id:  # it could mean something else
         raise ValueError(f"not a replica's id: {id!r}")
     return name
 

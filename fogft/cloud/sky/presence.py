@@ -50,12 +50,7 @@ class Presence:
     ) -> list[Machine]:
         """Return a pool's machines, ordered by id.
 
-        Args:
-            entries: What the journal holds of it.
-            regions: Cloud -> where machines of the pool can be.
-
-        Raises:
-            CloudUnreachable: It cannot tell.
+        `entries` is what the journal holds of it, `regions` where machines of it can be, by cloud.
         """
         known = {entry.id: entry for entry in entries}
         clusters = self._clusters(pool_uid)
@@ -128,10 +123,7 @@ class Presence:
             log.warning("record_not_dropped replica=%s reason=%r", id.short, error.message)
 
     def _list_later(self) -> None:
-        """Read SkyPilot's list on another thread: it may be slow, and a loss does not wait for it.
-
-        What goes wrong there is told when the list that is known is too old to be used.
-        """
+        """Read SkyPilot's list on another thread: it may be slow, and no loss waits for it."""
         with self._lock:
             if self._listing:
                 return

@@ -19,7 +19,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fogft.cloud.sky.failures import classify
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError
@@ -92,8 +91,8 @@ class Prices:
         try:
             listed = self.sky.offers(resources)
         except RefusedError as error:
-            words = classify(error.kind, error.texts).words
-            raise SpecError(f"resources: SkyPilot refuses this section: {words}") from error
+            what = f"resources: SkyPilot refuses this section: {error.reason.words}"
+            raise SpecError(what) from error
         if not listed:
             raise SpecError(
                 "resources: no cloud that can be used here sells this",

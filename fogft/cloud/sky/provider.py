@@ -31,36 +31,24 @@ class NotAllowedError(Exception):
 
 
 class Provider(Protocol):
-    """One cloud, by its own interface. Calls come from any thread and have limits."""
+    """One cloud, by its own interface. Calls come from any thread and have limits.
+
+    All raise `CloudUnreachable` when the cloud cannot tell, or it is not known whether it heard,
+    and `NotAllowedError` where the account may not.
+    """
 
     @property
     def cloud(self) -> str:
         """Its name, as in `Placement.cloud`."""
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
-        """List what carries our labels and is not terminated.
+        """List what carries our labels (of one pool or, if empty, of all) and is not terminated.
 
-        Args:
-            regions: Where to look; None for everywhere.
-            pool_uid: Of which pool; empty for all pools.
-
-        Raises:
-            CloudUnreachable: It cannot tell.
-            NotAllowedError: The account may not list.
+        ``regions=None`` looks everywhere.
         """
 
     def terminate(self, instances: Iterable[Instance]) -> None:
-        """Ask for the end of instances. Those that are gone are no error.
-
-        Raises:
-            CloudUnreachable: Unknown whether it was heard.
-            NotAllowedError: The account may not.
-        """
+        """Ask for the end of instances. Those that are gone are no error."""
 
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
-        """Return live spot prices: (zone, instance type) -> US dollars per hour.
-
-        Raises:
-            CloudUnreachable: It cannot tell.
-            NotAllowedError: The account may not ask.
-        """
+        """Return live spot prices: (zone, instance type) -> US dollars per hour."""

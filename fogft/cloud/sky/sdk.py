@@ -6,22 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
+from fogft.cloud.sky.failures import classify
 from fogft.errors import CloudError
 from fogft.model.replica import Placement
 
 
 class RefusedError(CloudError):
-    """SkyPilot answered, and the answer is no.
-
-    Args:
-        kind: Class name of its exception.
-        texts: Its message, then those of its failover history.
-    """
+    """SkyPilot answered, and the answer is no; see `classify`."""
 
     def __init__(self, kind: str, texts: Sequence[str]) -> None:
         super().__init__(texts[0] if texts else kind)
         self.kind = kind
         self.texts = tuple(texts)
+        self.reason = classify(kind, texts)
 
 
 @dataclass(frozen=True)

@@ -42,11 +42,7 @@ _REFUSED_RESOURCES = {
 
 
 def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
-    """Check a pool file's task for fields that a pool decides itself.
-
-    Raises:
-        SpecError: One is there; the message names its key.
-    """
+    """Raise `SpecError` for a field of a pool file's task that a pool decides itself."""
     for key, reason in _REFUSED_TASK.items():
         if key in task and not (key == "num_nodes" and task[key] == 1):
             raise SpecError(f"{key}: cannot be honoured by a pool", reason)
@@ -86,9 +82,6 @@ def build(
         wheel: Folder with fogft's wheel.
         owner: Whose machine it is, for its labels.
         base: Folder that relative paths of the pool file start from.
-
-    Raises:
-        SpecError: A field of the pool file cannot be honoured.
     """
     refuse_what_cannot_be_honoured(order.task)
     setup = str(order.task.get("setup") or ":").rstrip()
@@ -188,17 +181,12 @@ def _filled(value: Any, marks: Mapping[str, str]) -> Any:
     return value
 
 
-_NAME = "sky_task.yaml"
-
-
 def read() -> dict[str, Any]:
     """Return the template. Raises CloudError: the installation is incomplete or damaged."""
     import yaml
 
     try:
-        value = yaml.safe_load(template_files.read_text(_NAME))
-    except (FogftError, yaml.YAMLError) as error:
-        raise CloudError(f"fogft's own `{_NAME}` cannot be read: {error}") from error
-    if not isinstance(value, dict):
-        raise CloudError(f"fogft's own `{_NAME}` is not a task", "install fogft again")
-    return value
+        return dict(yaml.safe_load(template_files.read_text("sky_task.yaml")))
+    except (FogftError, yaml.YAMLError, TypeError, ValueError) as error:
+        what = f"fogft's own `sky_task.yaml` cannot be read: {error}"
+        raise CloudError(what, "install fogft again") from error

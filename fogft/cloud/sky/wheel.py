@@ -22,14 +22,9 @@ _KEPT = ("METADATA", "WHEEL", "entry_points.txt")
 
 
 def make(folder: Path, package: Path = _PACKAGE) -> Path:
-    """Write the wheel into a folder of its own below `folder`, and return that one.
+    """Write the wheel into a folder below `folder`, named after its content, and return that one.
 
-    The folder is named after the wheel's content: it is made once and never changes, so
-    a launch under way keeps what it began with.
-
-    Raises:
-        CloudError: fogft is not properly installed here.
-        StateError: The folder cannot be written.
+    So it never changes, and a launch under way keeps what it began with.
     """
     name, content = pack(package)
     target = folder / hashlib.sha256(content).hexdigest()[:16]
@@ -40,11 +35,7 @@ def make(folder: Path, package: Path = _PACKAGE) -> Path:
 
 
 def pack(package: Path = _PACKAGE) -> tuple[str, bytes]:
-    """Return the wheel's file name and its content.
-
-    Raises:
-        CloudError: fogft is not properly installed here.
-    """
+    """Return the wheel's file name and content. Raises CloudError: fogft is not installed here."""
     try:
         installed = importlib.metadata.distribution("fogft")
     except importlib.metadata.PackageNotFoundError as error:
@@ -90,7 +81,6 @@ def _files_below(folder: Path) -> list[tuple[str, bytes]]:
 
 
 def _wheel_tag(text: str) -> bytes:
-    """Return WHEEL as that of a plain wheel, whatever this installation's was."""
     kept = [line for line in text.splitlines() if line and not line.startswith(("Tag:", "Build:"))]
     return ("\n".join([*kept, "Tag: py3-none-any"]) + "\n").encode()
 

@@ -41,22 +41,14 @@ class Row:
 
 
 class PriceTable:
-    """Offers from a table. Has the `offers` of `fogft.cloud.port.Cloud`, and nothing else of it.
-
-    Raises:
-        SpecError: The file cannot be read or holds something else; with its line.
-    """
+    """Offers from a table. Has the `offers` of `fogft.cloud.port.Cloud`, and nothing else of it."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._rows = list(_rows(file))
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """List of each place the cheapest machine that suits, the cheapest first.
-
-        Raises:
-            SpecError: Nothing in the table suits.
-        """
+        """List of each place the cheapest machine that suits, the cheapest first."""
         best: dict[tuple[str, bool], Offer] = {}
         for where, entry in alternatives(resources):
             spot = use_spot(where, entry)
@@ -67,9 +59,7 @@ class PriceTable:
                 place = Placement(row.cloud, row.region, row.zone, row.instance.name, spot)
                 offer = Offer(place, price, row.source, row.as_of)
                 key = (place.location, spot)
-                known = best.get(key)
-                if known is None or _order(offer) < _order(known):
-                    best[key] = offer
+                best[key] = min(best.get(key, offer), offer, key=_order)
         if not best:
             raise SpecError(
                 f"resources: nothing in `{self._file}` suits them",
