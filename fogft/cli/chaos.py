@@ -132,7 +132,6 @@ def _chaos() -> Chaos:
 
 
 def _machine(pool: str | None, slot: int) -> ReplicaId:
-    """Return the newest machine that the cloud lists in a slot of a pool."""
     from fogft.pool.commands import composition
 
     identity = composition.store_of(pool).identity()

@@ -53,8 +53,6 @@ _COMMANDS = {name: row for names in SECTIONS.values() for name, row in names.ite
 
 
 class _Loaded(Mapping[str, Any]):
-    """The commands by name, each imported when it is looked up."""
-
     def __getitem__(self, name: str) -> Any:
         return _load(name, *_COMMANDS[name])
 

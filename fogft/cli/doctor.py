@@ -45,7 +45,6 @@ def doctor(
 
 
 def _show(finding: Finding) -> None:
-    """Print a finding as one line, and its advice as another."""
     from rich.text import Text
 
     verdict = finding.verdict.value

@@ -6,9 +6,6 @@ keeps its trace.
 
 Every import that costs more than a few milliseconds is made inside the command that
 needs it, so that ``fogft --help`` and completion stay quick (tests/cli/test_laziness).
-
-Owns: the entry point and exit statuses.
-Not here: which commands there are (`commands`) and how text looks (`output`).
 """
 
 from __future__ import annotations

@@ -3,9 +3,6 @@
 What a command answers (a table, JSON, a log) is data. Progress, hints and errors are
 messages. A script may therefore read stdout and ignore stderr. Rich draws tables, trees and
 whatever is redrawn; it is loaded when the first of them is shown.
-
-Owns: streams, colour, width, the shape of an error, and escaping control characters.
-Not here: what is said (the commands).
 """
 
 from __future__ import annotations
@@ -190,7 +187,6 @@ def silence_stdout() -> None:
 
 
 def _drawn(stream: IO[str], *parts: RenderableType) -> str:
-    """Return lines for a stream, with its colours, as wide as they are."""
     # With a height: of a dumb terminal rich else takes both to be small.
     console = _console(stream, width=_UNLIMITED, height=25)
     with console.capture() as captured:

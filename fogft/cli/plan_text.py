@@ -1,8 +1,4 @@
-"""How a plan looks: a table of offers, then what the pool costs and gives; or JSON.
-
-Owns: words and columns.
-Not here: the reasons (`fogft.planning.explain`).
-"""
+"""How a plan looks: a table of offers, then what the pool costs and gives; or JSON."""
 
 from __future__ import annotations
 

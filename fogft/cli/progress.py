@@ -2,9 +2,6 @@
 
 On a terminal, a table that is redrawn; elsewhere one line for each change. All of it goes
 to stderr.
-
-Owns: the words and the waiting.
-Not here: what is done (`fogft.pool.commands`).
 """
 
 from __future__ import annotations
@@ -67,7 +64,6 @@ def _no_room(spec: PoolSpec) -> str:
 
 
 def _show_launches(preview: Preview) -> None:
-    """Show where each replica will go, at what price, and where the price is from."""
     from fogft.cli.plan_text import price_source
 
     rows = [
@@ -120,7 +116,6 @@ def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Ou
 
 @contextmanager
 def _shown() -> Iterator[Callable[[Seen], None]]:
-    """Yield a function that shows a status: redrawn on a terminal, else line by line."""
     if not output.is_terminal(sys.stderr):
         yield PhaseLines(output.say)
         return

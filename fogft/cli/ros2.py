@@ -1,8 +1,6 @@
 """``ros2 fog``: the commands of ``fogft`` for who types ``ros2``. Loaded by ros2cli only.
 
 Each verb hands its words to `fogft.cli.main` unread, so that both ways behave the same.
-
-Owns: the plugin's shape. Not here: any command.
 """
 
 from __future__ import annotations

@@ -87,7 +87,6 @@ HEADER = (
 
 
 def _show(report: Report) -> None:
-    """Print the table, and below it what independent replicas would reach."""
     output.show(output.table(HEADER, map(_cells, report.rows), right=HEADER[1:]))
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "made up"

@@ -61,7 +61,6 @@ def status(
 
 
 def _watch(paths: PoolPaths, *, as_json: bool) -> None:
-    """Show the status each second until interrupted, or until the pool is gone."""
     from fogft.cli import status_text
     from fogft.pool.commands.status import read
 
@@ -83,7 +82,6 @@ def _watch(paths: PoolPaths, *, as_json: bool) -> None:
 
 
 def _remark(seen: Seen) -> None:
-    """Warn on stderr of what a reader of the table might overlook."""
     if seen.status.ended and not seen.manager_alive:
         output.hint(f"start it again with `fogft up {seen.status.file}`; `fogft down` removes it")
     elif not seen.manager_alive:

@@ -1,8 +1,4 @@
-"""How a pool's status looks: a line, tables of replicas and services, who talks through whom.
-
-Owns: words, columns, units and styles.
-Not here: getting the status (`fogft.pool.commands.status`), printing it (`status`, `progress`).
-"""
+"""How a pool's status looks: a line, tables of replicas and services, who talks through whom."""
 
 from __future__ import annotations
 

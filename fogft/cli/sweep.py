@@ -59,7 +59,6 @@ def sweep(
 
 
 def _show(found: Swept) -> None:
-    """List the machines of one cloud on stdout, and say who was asked on stderr."""
     from fogft.cli.status_text import age, price
 
     if found.cloud == "sky":

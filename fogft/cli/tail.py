@@ -61,7 +61,6 @@ class Tail:
 
 
 def _start_of_last(path: Path, count: int) -> tuple[int, int]:
-    """Return where the last `count` lines begin, and the file's inode."""
     try:
         with open(path, "rb") as file:
             stat = os.fstat(file.fileno())

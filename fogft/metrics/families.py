@@ -2,9 +2,6 @@
 
 Nothing is counted through the library: counting on a request's way stays a plain addition. It is
 imported at the first scrape, so that a process that nobody scrapes never loads it.
-
-Owns: making families, labels that all of a process have. Not here: what is measured (`proxies`,
-`fogft.pool.manager.metrics`), serving it (`scrape`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """What became of one service's requests: counters, latencies, and who won.
 
 All methods are called under the dispatcher's lock, but `late`, which has its own.
-
-Owns: the numbers. Not here: what they are counted for (`dispatcher`), showing them.
 """
 
 from __future__ import annotations
@@ -163,5 +161,4 @@ class Outcomes:
 
 
 def _short(key: int) -> str:
-    """Return a replica's ``slot.generation`` from the dispatcher's number for it."""
     return f"{key >> 32}.{key & 0xFFFFFFFF}"

@@ -1,8 +1,4 @@
-"""What the proxies tell Prometheus, made of what they report.
-
-Owns: names and labels of the metrics. Not here: counting (`outcomes`, `responder`), serving it
-(`fogft.metrics.scrape`). docs/metrics.md lists them all.
-"""
+"""What the proxies tell Prometheus, made of what they report."""
 
 from __future__ import annotations
 

@@ -2,8 +2,6 @@
 
 Few threads, short limits: a scraper that is slow or hostile costs one of them for a moment.
 Whatever goes wrong here harms nothing else in the process.
-
-Owns: the port. Not here: what is measured (`metrics.proxies`, `pool.manager.metrics`).
 """
 
 from __future__ import annotations

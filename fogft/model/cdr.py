@@ -6,9 +6,6 @@ walked along the type first: nothing is decoded, and whole runs of numbers are s
 
 Serialised messages are plain CDR, as ROS 2 writes them: four bytes of header that tell the byte
 order, then each field at a multiple of its own size, counted from behind the header.
-
-Owns: that walk. Not here: a type's definition (`fogft.model.type_definition`) and how it is read
-(`fogft.ros.types`); what is done with bytes that are refused (`fogft.proxy`).
 """
 
 from __future__ import annotations

@@ -4,9 +4,6 @@ A certificate's common name says who its holder is: ``role.name.generation.pool`
 instance ``robot.ada.2.0123456789abcdef``; a replica's name is its slot. TLS proves the
 name; this module says what follows from it. A revoked name is revoked for good: who gets
 in again does so under the next generation.
-
-Owns: roles, reading and making common names, and the names of the files of credentials.
-Not here: issuing (`fogft.pool.credentials.authority`).
 """
 
 from __future__ import annotations

@@ -9,9 +9,6 @@ Slots tell the groups apart, so nothing else has to be remembered: group k has t
 from ``k * BLOCK`` on, `CRITICAL` the last block; the upper half of a block, from `STAND_INS` on,
 is for on-demand machines that stand in for spot ones. From `FIRST_BY_HAND` on they are free for
 replicas that people start themselves.
-
-Owns: groups, their slots, and how a number of replicas is shared among them.
-Not here: how many are wanted (`sizing`), where they go (`placement`).
 """
 
 from __future__ import annotations

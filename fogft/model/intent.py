@@ -2,9 +2,6 @@
 
 Each command is one operation that returns a new intent, so that it works whether or not
 a manager lives: the command line writes the result, the manager reads it.
-
-Owns: the operations.
-Not here: how the pool gets there (`planner`).
 """
 
 from __future__ import annotations

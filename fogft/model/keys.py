@@ -6,10 +6,6 @@ the ROS parameters and the proxies' configuration files all come from that.
 
     class HealthSpec:
         suspect_after_s: float = key(Number(3600, "seconds"), "Mark a replica ...", default=2.0)
-
-Owns: the forms that a value may have, and what a dataclass says of its keys.
-Not here: reading them (`fogft.poolfile.reader`), what does not go with what
-(`fogft.poolfile.rules`).
 """
 
 from __future__ import annotations

@@ -3,9 +3,6 @@
 A membership is ordered by (epoch, version): the epoch is the writing manager's lease, so
 what an old manager wrote late never replaces what its successor wrote. Its JSON form
 carries a checksum; a damaged one is an error and changes nothing.
-
-Owns: building a membership from machines, its order and its JSON form.
-Not here: the file (`fogft.pool.folder.store`) and what a proxy does with it (`fogft.proxy`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What the proxies' configuration files hold. Values only; relative paths begin at the file.
-
-Owns: the keys of `proxy.yaml`, `gateway.yaml`, `replica.yaml` and `rendezvous.yaml`.
-Not here: reading them (`fogft.proxy.config`), writing them (`fogft.pool.manager.configuration`).
-"""
+"""What the proxies' configuration files hold. Values only; relative paths begin at the file."""
 
 from __future__ import annotations
 

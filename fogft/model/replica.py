@@ -1,9 +1,6 @@
 """The values that every part speaks of: replica, placement, machine, link report.
 
 Pure data, immutable, compared by value. The words are those of docs/glossary.md.
-
-Owns: what a replica is and what was observed of it.
-Not here: decisions (`planner`, `placement`) and the pool file (`spec`).
 """
 
 from __future__ import annotations

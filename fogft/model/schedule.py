@@ -6,9 +6,6 @@ zones are the standard library's data.
 
     now ──► window that holds now ───────────► replicas, cap
         └─► window that holds now + prelaunch ─► the more replicas, with its cap
-
-Owns: which window holds a moment, and what is to be launched ahead of it.
-Not here: reading it (`fogft.poolfile.placement`) and the pool's own numbers (`sizing`).
 """
 
 from __future__ import annotations

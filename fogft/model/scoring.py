@@ -5,10 +5,6 @@
 The lower the better. In logarithms only ratios count: with equal weights, half the price
 makes up for twice the round trip. So the order of two offers depends on those two alone,
 never on what else is offered, and a margin of hysteresis is a percentage.
-
-Owns: the weights and the score.
-Not here: failure domains, which count before any score (`placement`), and measuring
-(`fogft.pool.manager.distances`).
 """
 
 from __future__ import annotations

@@ -3,9 +3,6 @@
 Whoever goes through gateways holds links to them and to no replica; all others hold links
 to the replicas. A gateway may go through others, so they form trees; a loop is refused
 wherever a topology is read.
-
-Owns: the topology, and whom a holder talks to.
-Not here: the pool file's section (`fogft.poolfile.topology`), links (`fogft.proxy`).
 """
 
 from __future__ import annotations

@@ -6,10 +6,6 @@ right and are not. So the definitions are compared before the first request.
 
 A distribution that has type hashes (Iron and later) tells sameness by them. Where either side
 has none (Humble), or to say what differs, fields are compared one by one.
-
-Owns: definitions as values, the comparison.
-Not here: reading a type's definition (`fogft.ros.types`), who compares
-(`fogft.proxy.robot.client`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Which of a robot's uplinks a request takes. Pure.
-
-Owns: the policies. Not here: links (`fogft.link.uplinks`).
-"""
+"""Which of a robot's uplinks a request takes. Pure."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""What a changed pool file changes, in words. Pure.
-
-Owns: the sentences that `fogft up` shows before it applies a file again.
-Not here: how the change is carried out (`planner`).
-"""
+"""What a changed pool file changes, in words. Pure."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""A process's configuration file: written and read by the table that describes it.
-
-Owns: YAML on disk, paths relative to the file. Not here: what it holds
-(`fogft.model.proxy_config`).
-"""
+"""A process's configuration file: written and read by the table that describes it."""
 
 from __future__ import annotations
 

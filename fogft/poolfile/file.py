@@ -1,8 +1,4 @@
-"""Read a pool file from disk. The only place that knows it is YAML is `yaml_tree`.
-
-Owns: opening the file, its size and its encoding.
-Not here: what may stand in it (`fogft.poolfile.reader`).
-"""
+"""Read a pool file from disk. The only place that knows it is YAML is `yaml_tree`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Which cloud a pool file asks for, and where in the file its resources say so.
-
-Owns: the clouds that `resources` name, and the line that a cloud's complaint is about.
-Not here: the clouds themselves (`fogft.cloud`) and what they sell (`preview`).
-"""
+"""Which cloud a pool file asks for, and where in the file its resources say so."""
 
 from __future__ import annotations
 
@@ -60,7 +56,6 @@ def clouds_named(spec: PoolSpec) -> list[str]:
 
 
 def _named_in(spec: PoolSpec) -> Iterator[tuple[str, str]]:
-    """Yield each cloud that the file names, or that one of its groups names."""
     for index, group in enumerate(spec.groups):
         yield from _named(group.resources, f"fogft.groups[{index}].resources")
     if not spec.groups:
@@ -68,7 +63,6 @@ def _named_in(spec: PoolSpec) -> Iterator[tuple[str, str]]:
 
 
 def _named(resources: Any, key: str) -> Iterator[tuple[str, str]]:
-    """Yield each cloud that is named, with the key that names it."""
     if not isinstance(resources, Mapping):
         return
     for name in ("infra", "cloud"):

@@ -1,8 +1,6 @@
 """The reference in docs/pool-file.md, made from the table of keys.
 
 ``python -m fogft.poolfile.page <docs/pool-file.md`` prints the page brought up to date.
-
-Owns: its Markdown. Not here: what the keys are (`fogft.model`).
 """
 
 from __future__ import annotations

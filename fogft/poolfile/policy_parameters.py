@@ -2,9 +2,6 @@
 
 A value is judged by the pool file's own reader, so a parameter can bring about nothing that a
 pool file could not.
-
-Owns: names and values of the parameters, and how they lie over the pool file's policies.
-Not here: ROS (`fogft.ros.visible`), following a policy (`fogft.proxy.robot.dispatcher`).
 """
 
 from __future__ import annotations

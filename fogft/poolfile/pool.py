@@ -2,10 +2,6 @@
 
 A pool file is a SkyPilot task with a `fogft` section. Ours is checked to the last key; of
 SkyPilot's keys only the names are, and what a pool cannot do. The rest passes untouched.
-
-Owns: rules about the whole pool, and what only this machine can tell.
-Not here: YAML (`yaml_tree`), single maps (`reader`, `rules`), prices and regions (the cloud
-judges `resources`).
 """
 
 from __future__ import annotations
@@ -100,7 +96,6 @@ def pool_spec(root: Node, file: str, checks: Checks = UNCHECKED) -> PoolSpec:
 
 
 def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
-    """Return the pool with its groups, its number and its actions, if they go together."""
     groups = _groups(ours, made)
     # A target finds its own number; the file's is then the fewest.
     if "replicas" not in ours.children:

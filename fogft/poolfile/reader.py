@@ -2,9 +2,6 @@
 
 The same table (`fogft.model.keys`) reads the pool file and the proxies' configuration files. The
 first mistake ends it, as one `SpecError` that begins with ``file:line: key:``.
-
-Owns: how each form of value is read. Not here: what does not go with what (`rules`), the task and
-what only this machine can tell (`pool`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
 """What does not go with what in a pool file. Pure.
 
 Each rule judges one map after its keys were read, and may return another value for it.
-
-Owns: rules within one map. Not here: the forms of single values (`fogft.model.keys`), rules
-about the whole pool (`pool`).
 """
 
 from __future__ import annotations
@@ -76,7 +73,6 @@ def _with_quorum(section: Section, made: ServiceSpec) -> None:
 
 
 def _fallback(section: Section, made: ServiceSpec) -> None:
-    """`on_timeout: fallback` needs a fallback service, and nothing else may have one."""
     key, other = "fallback_service", made.fallback
     example = f"such as `{key}: {{name: {made.name}_onboard}}`"
     if made.on_timeout is not OnTimeout.FALLBACK:

@@ -3,9 +3,6 @@
 `fogft.poolfile.yaml_tree` makes the tree; `reader` says what must be in it. Every
 complaint is one `SpecError` that begins with ``file:line: key:`` and is one line long,
 whatever the file holds; its hint says what would be right.
-
-Owns: values with their lines, types, ranges, unknown keys.
-Not here: YAML, and what any key means.
 """
 
 from __future__ import annotations
@@ -251,7 +248,6 @@ class Section:
 
 
 def _got(node: Node) -> str:
-    """Say what stands there, with its type."""
     value = node.value
     if value is None:
         return "nothing"

@@ -1,7 +1,4 @@
-"""A `workdir` that is a colcon workspace, and the `setup` that builds it.
-
-Owns: recognising one, and the default `setup`. Not here: the build (`templates/workspace.sh`).
-"""
+"""A `workdir` that is a colcon workspace, and the `setup` that builds it."""
 
 from __future__ import annotations
 

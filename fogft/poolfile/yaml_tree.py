@@ -4,9 +4,6 @@ PyYAML's own loader forgets lines, keeps the last of two equal keys, and expands
 without end. So its composer is used, and the nodes are converted here, with limits. What
 comes out can be written as JSON: dates stay the text that was written, and there are no
 other tags. Nothing is ever executed.
-
-Owns: YAML's syntax, its limits, duplicate keys.
-Not here: what the keys mean (`fogft.poolfile.reader`).
 """
 
 from __future__ import annotations
@@ -25,8 +22,6 @@ _CONVERTED = {_TAG + "null", _TAG + "bool", _TAG + "int", _TAG + "float"}
 
 
 class _RefusedError(Exception):
-    """Something in the document, at a line, that is not accepted."""
-
     def __init__(self, line: int, key: str, what: str, hint: str) -> None:
         super().__init__(what)
         self.line = line
@@ -65,8 +60,6 @@ def tree(text: str, file: str) -> Node:
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's composer, with limits on size and depth."""
-
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self._depth = 0
