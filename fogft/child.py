@@ -20,11 +20,7 @@ os.execvp(sys.argv[2], sys.argv[2:])
 
 
 def tied(command: Sequence[str]) -> list[str]:
-    """Return a command that gets SIGKILL when this process ends, whatever ends it.
-
-    The kernel ties the child to the *thread* that starts it: start it from one that lives
-    as long as the process does, the main thread.
-    """
+    """Return a command that gets SIGKILL when the thread that starts it ends: use the main one."""
     return [sys.executable, "-IS", "-c", _PROGRAM, str(os.getpid()), *command]
 
 
@@ -36,12 +32,6 @@ def detached(
     environ: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes]:
     """Start a process in a session of its own, its output appended to a log (0600).
-
-    Args:
-        command: The program and its arguments.
-        log: Made if it is not there.
-        folder: Where it starts; this process's own unless told.
-        environ: Likewise its environment.
 
     Raises:
         OSError: It cannot be started, or the log not be written.

@@ -29,11 +29,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> None:
-    """Replace a file at once, mode 0600; its folder must exist.
-
-    Args:
-        content: Bytes, or text for UTF-8.
-        durable: Whether it must survive a power cut (one fsync).
+    """Replace a file at once, mode 0600; with `durable` it survives a power cut (one fsync).
 
     Raises:
         StateError: It cannot be written; the old file is as it was.

@@ -11,11 +11,7 @@ ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 def start_log(level: str = "info") -> None:
-    """Log to standard error: time, level, event and its keys, one line each.
-
-    Args:
-        level: From which level on our own lines are logged; those of libraries from warnings on.
-    """
+    """Log to standard error, one line each; lines of libraries from warnings on."""
     logging.basicConfig(
         stream=sys.stderr,
         level=logging.WARNING,

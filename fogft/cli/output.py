@@ -41,12 +41,7 @@ def json_data(value: Any) -> None:
 
 
 def show(*parts: RenderableType, stream: IO[str] | None = None) -> None:
-    """Write tables, trees and lines, uncut and without blanks at the ends of lines.
-
-    Args:
-        parts: What to write, one below the other.
-        stream: Where; stdout if not given.
-    """
+    """Write tables, trees and lines below each other, uncut; to stdout if nothing else is said."""
     stream = stream or sys.stdout
     stream.write(_drawn(stream, *parts) + "\n")
     stream.flush()
@@ -59,14 +54,7 @@ def table(
     right: Collection[str] = (),
     titled: bool = True,
 ) -> Table:
-    """Return a table without lines, for `show` or `redrawn`.
-
-    Args:
-        header: The columns' names.
-        rows: As many cells each.
-        right: Names of the columns that are aligned to the right.
-        titled: Whether the header is shown.
-    """
+    """Return a table without lines; the columns in `right` are aligned to the right."""
     from rich.table import Table
 
     made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim",
@@ -86,10 +74,7 @@ def cell(text: str, style: str = "") -> Text:
 
 
 def printable(text: str) -> str:
-    """Return text with all control characters but newlines escaped.
-
-    A probe's detail or a pool file's value comes from elsewhere: it must not move the cursor.
-    """
+    """Return text with control characters but newlines escaped: it must not move the cursor."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
@@ -154,10 +139,7 @@ def width(stream: IO[str]) -> int:
 
 @contextmanager
 def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
-    """Yield a function that shows something on a terminal in place of what it showed before.
-
-    Lines that are too long are cut at their ends: rich would shorten the numbers in a table.
-    """
+    """Yield a function that shows something in place of what it showed before, long lines cut."""
     from rich.live import Live
     from rich.text import Text
 

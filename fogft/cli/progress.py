@@ -84,11 +84,6 @@ def _show_launches(preview: Preview) -> None:
 def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Outcome]:
     """Show a pool's progress until an `up` has an outcome; return the last status and the outcome.
 
-    Args:
-        paths: The pool.
-        awaited: What the `up` is for.
-        timeout_s: The longest to wait.
-
     Raises:
         FogftError: The pool has no manager any more.
     """

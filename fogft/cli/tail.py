@@ -27,12 +27,7 @@ def in_order(logs: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
 
 
 class Tail:
-    """One file that grows. A missing file is an empty one.
-
-    Args:
-        path: The file.
-        last: How many of its last lines to begin with; None for all of it.
-    """
+    """One file that grows, from its `last` lines on (None: from the first). It may be missing."""
 
     def __init__(self, path: Path, last: int | None) -> None:
         self._path = path

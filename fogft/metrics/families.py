@@ -36,11 +36,9 @@ def histogram(
     bounds: Sequence[float],
     counted: Iterable[tuple[Sequence[int], float, Labels]],
 ) -> Metric:
-    """Return histograms of one name.
+    """Return histograms of one name, which ends in its unit.
 
     Args:
-        name: Ends in its unit.
-        help: What it tells.
         bounds: Upper bounds of the buckets, rising; one more is without bound.
         counted: How many values fell into each bucket, the last one included; their sum; labels.
     """
@@ -74,12 +72,7 @@ def _printable(labels: Labels) -> dict[str, str]:
 
 
 class Collector:
-    """What one process tells: its families with the labels that all of them have.
-
-    Args:
-        families: As measured now.
-        labels: Of every sample, such as the pool.
-    """
+    """What one process tells: its families as measured now, each with the process's labels."""
 
     def __init__(self, families: Iterable[Metric], labels: Labels) -> None:
         self._families = families

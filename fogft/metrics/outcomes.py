@@ -41,13 +41,10 @@ class Outcomes:
     """Counts since the start.
 
     Attributes:
-        count: ``received`` requests and ``sent`` copies of them; how they ended
-            (``answered``, ``fallback``, ``silent``, ``empty``, ``turned_away``); calls of the
-            fallback that came to nothing (``fallback_failed``); answers that came too late
-            to be used (``late``); responses that were not ok (``rejected``); responses that
-            ROS did not take (``undelivered``); requests that a gateway's caller took back
-            (``cancelled``). ``request_bytes`` are those of all received requests together,
-            ``response_bytes`` those of the first answers of replicas.
+        count: By `OUTCOMES_COUNTED`. ``sent`` are copies of requests; ``fallback_failed`` calls of
+            the fallback that came to nothing; ``rejected`` responses that were not ok;
+            ``undelivered`` those that ROS did not take. ``request_bytes`` are those of all
+            received requests together, ``response_bytes`` those of the first answers of replicas.
         refused: Refusals by reason.
         trace: How each request ended, until somebody takes it; None where it is not wanted.
     """
@@ -91,12 +88,9 @@ class Outcomes:
         """Trace how a request ended.
 
         Args:
-            request: Its id.
-            outcome: How it ended.
-            took_s: Since it arrived, in seconds.
-            asked: Who was asked for it, and when after its arrival.
+            took_s: Since it arrived.
+            asked: Who was asked for it, and when after its arrival, in seconds.
             refused: Who refused it, and why the last time.
-            replica: Who answered it.
         """
         if self.trace is not None:
             self.trace.append(
@@ -145,8 +139,7 @@ class Outcomes:
     def report(self) -> dict[str, Any]:
         """Return counters and latencies (seconds; quantiles None before the first answer).
 
-        ``buckets`` counts answers by latency, between the bounds of `BUCKETS_S`; ``took_s`` is
-        the sum of those latencies.
+        ``buckets`` counts latencies between the bounds of `BUCKETS_S`; ``took_s`` is their sum.
         """
         ordered = sorted(self._latencies)
         return {

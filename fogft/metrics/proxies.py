@@ -137,11 +137,7 @@ def _by_slot(by_replica: Mapping[str, int]) -> dict[str, int]:
 
 
 def _newest(links: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return one link of each slot.
-
-    A slot has several while its machine is replaced, or behind gateways. The newest generation's is
-    taken, and of those one that is up: two samples of one series are an error.
-    """
+    """Return one link of each slot, of its newest generation: a series has one sample."""
     ranked = sorted(links, key=lambda link: (link["generation"], link["state"] == "up"))
     return list({link["slot"]: link for link in ranked}.values())
 

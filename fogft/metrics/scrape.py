@@ -31,7 +31,7 @@ class Scrape:
 
     Args:
         measure: Returns what there is to tell; called for each request, on another thread.
-        labels: Of every sample: the pool, and of a replica its slot.
+        labels: Of every sample.
     """
 
     def __init__(self, measure: Measure, labels: Labels) -> None:

@@ -94,12 +94,7 @@ class _Kind:
 
 
 class Shape:
-    """The shape of one message type.
-
-    Args:
-        root: Name of the message in `fields`.
-        fields: Message -> its fields, as in `type_definition.Definition`.
-    """
+    """The shape of one message type: the one named `root` in `Definition.fields`."""
 
     def __init__(self, root: str, fields: Mapping[str, Fields]) -> None:
         self._fields = fields

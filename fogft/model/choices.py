@@ -246,14 +246,12 @@ _DAYS_FORM = Special(
 
 @dataclass(frozen=True)
 class WindowSpec:
-    """A time of the week, in the schedule's time zone.
+    """A time of the week, in the schedule's time zone; None for the pool's own number or cap.
 
     Attributes:
         days: 0 for Monday to 6 for Sunday: on which it begins.
         begins_s: Seconds after midnight by the clock on the wall, in [0, 86400).
         ends_s: Likewise, in (0, 86400]; not after `begins_s` means the next day.
-        replicas: How many are wanted within it; None for the pool's own number.
-        max_usd_per_hour: The cap within it; None for the pool's own.
     """
 
     days: frozenset[int] = key(
@@ -293,11 +291,7 @@ class WindowSpec:
 
 @dataclass(frozen=True)
 class ScheduleSpec:
-    """Replicas and cap by the time of the week.
-
-    Attributes:
-        prelaunch_s: Seconds before a window at which its replicas are launched.
-    """
+    """Replicas and cap by the time of the week; launched `prelaunch_s` before a window begins."""
 
     time_zone: str = key(
         Text("a time zone", "write a time zone, such as `time_zone: Europe/Berlin`"),
@@ -312,12 +306,7 @@ class ScheduleSpec:
 
 @dataclass(frozen=True)
 class MigrationSpec:
-    """When a replica moves to a better location.
-
-    Attributes:
-        gain: How much lower the score must be there, as a fraction in (0, 1).
-        stay_s: How long a replica stays, from ready on, before it may move.
-    """
+    """A replica moves for a score lower by the fraction `gain`, `stay_s` after it was ready."""
 
     gain: float = 0.3
     stay_s: float = 3600.0
@@ -395,8 +384,7 @@ class TrafficSpec:
 class FallbackSpec:
     """The service on the robot that answers when the replicas do not.
 
-    Attributes:
-        limit_s: How long its answer is awaited past the deadline.
+    Its answer is awaited until `limit_s` past the deadline.
     """
 
     service: str = key(

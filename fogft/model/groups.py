@@ -102,12 +102,7 @@ def critical_services(spec: PoolSpec) -> tuple[ServiceSpec, ...]:
 
 
 def critical_group(spec: PoolSpec, wanted: int) -> Group:
-    """Return the group of the replicas that carry critical services alone.
-
-    Args:
-        spec: The pool file.
-        wanted: How many replicas the pool has besides, which carry everything.
-    """
+    """Return the group of those that carry critical services alone, beside `wanted` others."""
     key = CRITICAL, wanted
     if key not in spec.derived:
         last = groups_of(spec)[-1]
@@ -194,11 +189,7 @@ def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:
 
 
 def shares(groups: tuple[Group, ...], total: int) -> tuple[int, ...]:
-    """Share a number of replicas among groups.
-
-    The file's own numbers, with what is more or less given to or taken from the last
-    group, then the one before it.
-    """
+    """Share replicas as the file says; what is more or less concerns the last groups first."""
     if len(groups) == 1:
         return (max(0, total),)
     counts = [group.replicas for group in groups]

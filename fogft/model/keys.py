@@ -57,7 +57,6 @@ class Text:
 
     Attributes:
         what: What it must be, such as ``a service name``.
-        hint: What to do where it is not.
         check: Returns the text as it is kept. Raises ValueError with what is wrong.
         suggest: Returns what was probably meant; empty for nothing.
         has_parts: Whether the proxies are told of further ones that no file may name, such as the
@@ -105,8 +104,6 @@ class Map:
     """A map whose keys are a dataclass's.
 
     Attributes:
-        of: The dataclass.
-        hint: How it is written.
         short: Keys that a plain value in place of the map stands for.
         off: Whether `false` in its place means None.
     """
@@ -135,12 +132,9 @@ class Free:
 
 @dataclass(frozen=True)
 class Special:
-    """What no other form describes.
+    """What no other form describes: for people, how it is read, and as a JSON Schema has it.
 
-    Attributes:
-        what: What may stand there, for people.
-        read: Returns the value of what stands there. Raises ValueError; a hint may follow ``; ``.
-        schema: As a JSON Schema has it.
+    `read` raises ValueError; a hint may follow ``; ``.
     """
 
     what: str
@@ -196,11 +190,7 @@ class Key:
 
 
 class Entry(NamedTuple):
-    """One key of a dataclass.
-
-    Attributes:
-        path: The field's name; of a field within another field, both.
-    """
+    """One key of a dataclass; `path` is its field's name, within another field both names."""
 
     path: tuple[str, ...]
     name: str

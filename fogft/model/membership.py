@@ -68,8 +68,7 @@ def members_of(
 def with_by_hand(members: tuple[Member, ...], by_hand: Iterable[ReplicaId]) -> tuple[Member, ...]:
     """Return members with those that people start themselves, whom no cloud lists.
 
-    Where they are is theirs to say: by a record, or by dialling in. Of several generations
-    of a slot the highest is meant; a slot that a machine has is the machine's.
+    Of several generations of a slot the highest is meant; a slot that a machine has is its own.
     """
     taken = {member.id.slot for member in members}
     latest = {id.slot: id for id in sorted(by_hand) if id.slot not in taken}

@@ -92,8 +92,7 @@ def gateway_certificate_name(pool_uid: str, gateway: str, generation: int = 1) -
 def gateway_slot(gateway: str) -> int:
     """Return the slot of a gateway, which is like a replica to those who talk to it.
 
-    Such slots lie above all others. They hold 32 bits of a hash of the name, so that no list of
-    names and numbers has to be kept; the pool file's reader refuses two names that share one.
+    It holds 32 bits of a hash of the name; the pool file's reader refuses two that share one.
     """
     digest = hashlib.sha256(f"gateway {gateway}".encode()).digest()
     return GATEWAY_SLOTS + int.from_bytes(digest[:4], "big")

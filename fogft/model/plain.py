@@ -26,12 +26,7 @@ _READERS: dict[Any, Read] = {}
 
 
 class Misfit(ValueError):
-    """This is no value of a class.
-
-    Attributes:
-        path: The keys and indices that lead to what is wrong.
-        what: What is wrong there.
-    """
+    """This is no value of a class: `path` leads to what is wrong there."""
 
     def __init__(self, path: tuple[str | int, ...], what: str) -> None:
         parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
@@ -57,10 +52,7 @@ Moment = Annotated[float, within(0, 1e12)]  # seconds since the epoch
 def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
     """Return a value as JSON data: classes as maps by the names of their keys, a set sorted.
 
-    Args:
-        value: Of classes, enumerations, lists, maps and what JSON has itself.
-        omit_defaults: Whether fields that have their defaults are left out, as they are of every
-            class with `omits_defaults`.
+    With `omit_defaults`, or for a class that has it, fields that have their defaults are left out.
     """
     again = partial(to_plain, omit_defaults=omit_defaults)
     if isinstance(value, Enum):

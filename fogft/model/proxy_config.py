@@ -134,13 +134,7 @@ class ServerProxyConfig:
 
 @dataclass(frozen=True)
 class RendezvousConfig:
-    """All that `fogft rendezvous` needs to know.
-
-    Attributes:
-        records: File that keeps the records.
-        status: File for what was counted.
-        metrics: Where to answer Prometheus.
-    """
+    """All that `fogft rendezvous` needs to know."""
 
     pool_uid: PoolUid
     credentials: CredentialPaths

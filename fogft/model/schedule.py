@@ -20,12 +20,7 @@ DAY_S = 86_400
 
 
 class Wish(NamedTuple):
-    """What is wanted at a moment.
-
-    Attributes:
-        max_usd_per_hour: None for no cap.
-        ahead: Whether it is for a window that has not begun.
-    """
+    """What is wanted at a moment; `ahead` where it is for a window that has not begun."""
 
     replicas: int
     max_usd_per_hour: float | None
@@ -55,16 +50,10 @@ def window_at(schedule: ScheduleSpec, moment: float) -> WindowSpec | None:
 
 
 def wish(schedule: ScheduleSpec, now: float, usual: Wish) -> Wish:
-    """Return what is wanted now.
+    """Return what is wanted now; `usual` is what is wanted outside of windows.
 
     Within `prelaunch_s` before a window that wants more replicas, its number holds, and
-    the higher of both caps. Every minute of that time is looked at, for a window may be
-    shorter than it.
-
-    Args:
-        schedule: The pool file's.
-        now: Seconds since the epoch.
-        usual: What is wanted outside of windows.
+    the higher of both caps. Every minute of that time is looked at: a window may be shorter.
     """
     current = best = _within(window_at(schedule, now), usual)
     ahead_s = 60.0

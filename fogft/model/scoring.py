@@ -25,11 +25,7 @@ UNKNOWN_RTT_S = 0.150
 
 @dataclass(frozen=True)
 class Weights:
-    """How much a percent of price and of round trip count. 0 for not at all.
-
-    Attributes:
-        latency: 0 and every region is as near as any other.
-    """
+    """How much a percent of price and of round trip count; 0 for not at all."""
 
     price: float = 1.0
     latency: float = key(
@@ -42,11 +38,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Scale:
-    """Weights with what is known of distances.
-
-    Attributes:
-        rtt_s: ``cloud/region`` -> round trip from the robot, in seconds.
-    """
+    """Weights with what is known of distances: seconds from the robot, by ``cloud/region``."""
 
     weights: Weights = field(default_factory=Weights)
     rtt_s: Mapping[str, float] = field(default_factory=dict)

@@ -290,15 +290,13 @@ class PoolSpec:
     """A whole pool file.
 
     Attributes:
-        name: The pool's name: lower-case letters, digits and dashes, at most 40.
         services: Names distinct; the services of actions are among them.
         replicas: How many should be ready. With groups: their sum. With an availability
             target: the fewest.
-        availability: A target from which the number follows; None for none.
         groups: Kinds of machines; none for one kind, the task's `resources`.
-        migration: When a replica moves to a better location; None for never.
         topics: What passes besides services; those of actions are among them.
         task: The SkyPilot task: the file without its `fogft` section.
+        discovered: The services found where the file names none.
     """
 
     name: str = ""
@@ -461,12 +459,7 @@ class PoolSpec:
         return self.hash_with(self.services, self.task.get("resources"))
 
     def hash_with(self, services: tuple[ServiceSpec, ...], resources: Any) -> str:
-        """Return the `replica_hash` of a replica that carries only these services.
-
-        Args:
-            services: What it carries.
-            resources: What its machine must be: the section of the file that holds for it.
-        """
+        """Return the `replica_hash` of a replica with these services and such `resources`."""
         asked: dict[str, Any] = {
             "services": sorted(_run_by_replica(s) for s in services),
             "orphan_after_s": self.orphan_after_s,

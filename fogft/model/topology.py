@@ -59,13 +59,7 @@ class RobotRoute:
 
 @dataclass(frozen=True)
 class Topology:
-    """Who talks through whom.
-
-    Attributes:
-        gateways: All of them, names distinct.
-        routes: The gateways of some robots.
-        through: The gateways of every other robot.
-    """
+    """Who talks through whom: gateways, those of some robots (`routes`), and of all others."""
 
     gateways: tuple[Gateway, ...] = key(
         Maps(

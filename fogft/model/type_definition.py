@@ -52,13 +52,7 @@ def nested(kind: str) -> str:
 
 
 def difference(type_name: str, here: Definition, there: Definition) -> str:
-    """Return how a type differs between here and a replica, in words; empty if it is the same.
-
-    Args:
-        type_name: ``package/srv/Type``.
-        here: As this machine has it.
-        there: As the replica has it.
-    """
+    """Return how a type differs between here and a replica, in words; empty if it is the same."""
     for side, definition in (("here", here), ("on the replica", there)):
         if definition.trouble:
             return f"`{type_name}` cannot be loaded {side}: {definition.trouble}"

@@ -25,10 +25,9 @@ def is_interface(name: str) -> bool:
 def choose(
     policy: UplinkPolicy, usable: Sequence[int], current: int | None
 ) -> tuple[Sequence[int], int | None]:
-    """Return which uplinks a request takes now, and which one is current from now on.
+    """Return which of the usable uplinks a request takes, and which is current from now on.
 
     Args:
-        policy: The service's.
         usable: Uplinks that are up and not on the request already, as listed in the pool file.
         current: The one that `failover` uses; None before the first.
     """

@@ -27,12 +27,7 @@ def document(config: Any, heading: str) -> str:
 
 
 def read(cls: type[T], path: Path, override: Mapping[str, Any] | None = None) -> T:
-    """Return a configuration; paths in it are absolute then.
-
-    Args:
-        cls: Its dataclass.
-        path: The file.
-        override: Keys that replace the file's; those that are None do not.
+    """Return a configuration of a class, its paths absolute; `override` replaces keys of the file.
 
     Raises:
         StateError: It cannot be read, or a key is missing or of the wrong type.

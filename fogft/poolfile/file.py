@@ -15,11 +15,7 @@ MAX_BYTES = 1 << 20
 
 
 def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
-    """Return what a pool file asks for.
-
-    Args:
-        path: The file. Its `workdir`, relative to the file's own folder, must exist.
-        checks: What is asked of this machine.
+    """Return what a pool file asks for. Its `workdir`, relative to its own folder, must exist.
 
     Raises:
         SpecError: The file cannot be read, or its first mistake: ``file:line: key: what``.

@@ -26,10 +26,8 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
     """Return the cloud adapter that a pool file's resources ask for; None where they name no cloud.
 
     Args:
-        spec: The pool file.
+        spec: The pool file, which is read from `source`, the text of `file`.
         names: Each name that it may use -> the adapter that it stands for.
-        source: The file's text.
-        file: Where it is.
 
     Raises:
         SpecError: They name a cloud that there is not, or clouds of two adapters.

@@ -87,9 +87,6 @@ class Policies:
     """The pool file's services, with what was set by parameters over them.
 
     A value that was set holds until the pool file has another value for that key.
-
-    Args:
-        check_field: Says why a type's response has no boolean field of that name.
     """
 
     def __init__(self, check_field: FieldCheck = lambda kind, field: None) -> None:

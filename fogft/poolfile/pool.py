@@ -35,11 +35,9 @@ class Checks:
     Each returns what is wrong, None if nothing is; what to do may follow after ``; ``.
 
     Attributes:
-        types: Of a service or message type: why it cannot be loaded here.
-        fields: Of a service type: why its response has no such boolean field, for `ok_field`.
-        states: Why a service's state cannot travel as its `state` says.
+        types: Of a service or message type: why it cannot be loaded.
+        fields: Of a service type: why its response has no such boolean field.
         tolerances: Of a service type, by field: why responses cannot be compared so.
-        workdir: Why it cannot be used here.
     """
 
     types: Callable[[str], str | None] = _nothing
@@ -54,12 +52,6 @@ UNCHECKED = Checks()
 
 def pool_spec(root: Node, file: str, checks: Checks = UNCHECKED) -> PoolSpec:
     """Return what a pool file asks for.
-
-    Args:
-        root: The file's tree.
-        file: Its name as the user wrote it: begins every message, and its stem is the
-            pool's name where the file gives none.
-        checks: What is asked of this machine.
 
     Raises:
         SpecError: The first mistake found; ``file:line: key: what is wrong``.

@@ -22,11 +22,7 @@ Rule = Callable[[Section, Any], Any]
 
 
 class Reader:
-    """Reads maps.
-
-    Args:
-        rules: Dataclass -> judges a value that was read, and may return another.
-    """
+    """Reads maps; a rule judges the dataclass that was read, and may return another."""
 
     def __init__(self, rules: Mapping[type, Rule]) -> None:
         self._rules = rules

@@ -25,9 +25,7 @@ class Node:
     """A value with its place.
 
     Attributes:
-        value: Text, a number, a truth value or None; a tuple of nodes for a list; a
-            mapping from text to nodes.
-        line: Where the value begins, from 1.
+        value: A list is a tuple of nodes, a map one from text to nodes.
         key_line: Where the key stands that leads to it; `line` if none does.
     """
 
@@ -85,11 +83,6 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 class Section:
     """A map in a pool file, read key by key.
-
-    Args:
-        file: Its name, as the user wrote it.
-        path: The key that leads here, such as ``fogft.services[0]``; empty at the top.
-        node: The map itself.
 
     Raises:
         SpecError: It is not a map.

@@ -12,9 +12,6 @@ from fogft import template_files
 def with_build(task: Mapping[str, Any]) -> dict[str, Any]:
     """Return a task that builds its workspace, where it has one and says nothing of `setup`.
 
-    Args:
-        task: With an absolute `workdir`, where that is a folder of this machine.
-
     Raises:
         FogftError: The installation lacks its templates.
     """
