@@ -145,6 +145,35 @@ class Special:
 Form = Number | Whole | Flag | OneOf | Text | Listed | Table | Map | Maps | Free | Special
 
 
+def words(form: Form) -> str:  # noqa: PLR0911
+    """Return what may stand there, for people."""
+    match form:
+        case Number(most, unit, from_zero):
+            limits = f"{'from' if from_zero else 'above'} 0, at most {most:.10g}"
+            return f"number {limits}{f' {unit}' if unit not in ('', 'one') else ''}"
+        case Whole(least, most, unit):
+            return f"whole number, {least} to {most}{f' {unit}' if unit else ''}"
+        case Flag():
+            return "`true` or `false`"
+        case OneOf(of, hidden):
+            return " or ".join(f"`{member.value}`" for member in of if member not in hidden)
+        case Text(what):
+            return what
+        case Listed(of, most):
+            return f"list of at most {most}, each {of.what}"
+        case Table(of, name):
+            return f"map from {name.what} to a {words(of)}"
+        case Map(_, _, short, off):
+            return "map" + (", or one value" if short else "") + (", or `false`" if off else "")
+        case Maps():
+            return "list of maps"
+        case Free():
+            return "map"
+        case Special(what):
+            return what
+    raise AssertionError(form)
+
+
 def checked(form: Form, value: Any) -> Any:
     """Return a value of a key that the proxies are told, if its form allows it.
 

@@ -6,34 +6,27 @@ from dataclasses import fields
 from enum import Enum
 from typing import Any
 
+from fogft.model import keys
 from fogft.model.groups import groups_of, replica_hash
-from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
+from fogft.model.keys import keys_of
+from fogft.model.spec import PoolSpec
 
 
 def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
     """Return one sentence for each difference, in the file's order; empty when there is none."""
-    found = _task(before, after)
-    found += _services(before, after)
-    found += [
-        _one(key, getattr(before, key), getattr(after, key))
-        for key in ("replicas", "max_surge", "max_usd_per_hour", "max_hours")
-        if getattr(before, key) != getattr(after, key)
-    ]
-    for key in (
-        "availability",
-        "placement",
-        "on_demand",
-        "groups",
-        "schedule",
-        "migration",
-        *("topology", "uplinks", "metrics", "topics", "rmw"),
-    ):
-        found += _section(key, getattr(before, key), getattr(after, key))
-    found += [
-        _one(f"health.{f.name}", getattr(before.health, f.name), getattr(after.health, f.name))
-        for f in fields(HealthSpec)
-        if getattr(before.health, f.name) != getattr(after.health, f.name)
-    ]
+    found = _task(before, after) + _services(before, after)
+    for entry in keys_of(PoolSpec):
+        old, new = getattr(before, entry.path[0]), getattr(after, entry.path[0])
+        if entry.name == "health":
+            found += _fields("health.{}", old, new)
+        elif old == new or entry.name == "services":
+            continue
+        elif isinstance(entry.key.form, (keys.Number, keys.Whole, keys.Text)):
+            found.append(_one(entry.name, old, new))
+        elif old and new:
+            found.append(f"`{entry.name}` changed")
+        else:
+            found.append(f"`{entry.name}` {'added' if new else 'removed'}")
     return found
 
 
@@ -64,22 +57,17 @@ def _services(before: PoolSpec, after: PoolSpec) -> list[str]:
     new = {service.name: service for service in after.services}
     found = [f"service `{name}` added" for name in new if name not in old]
     found += [f"service `{name}` removed" for name in old if name not in new]
-    for name, service in new.items():
-        if name in old:
-            found += [
-                _one(f"service `{name}`: {f.name}", was, is_)
-                for f in fields(ServiceSpec)
-                if (was := getattr(old[name], f.name)) != (is_ := getattr(service, f.name))
-            ]
+    for name in [name for name in new if name in old]:
+        found += _fields(f"service `{name}`: {{}}", old[name], new[name])
     return found
 
 
-def _section(key: str, before: Any, after: Any) -> list[str]:
-    if before == after:
-        return []
-    if before and after:
-        return [f"`{key}` changed"]
-    return [f"`{key}` {'added' if after else 'removed'}"]
+def _fields(what: str, before: Any, after: Any) -> list[str]:
+    return [
+        _one(what.format(f.name), was, is_)
+        for f in fields(before)
+        if (was := getattr(before, f.name)) != (is_ := getattr(after, f.name))
+    ]
 
 
 def _one(what: str, before: Any, after: Any) -> str:

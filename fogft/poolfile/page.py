@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 
 from fogft.model import keys
-from fogft.model.keys import Entry, Form, keys_of
+from fogft.model.keys import Entry, keys_of, words
 from fogft.model.spec import PoolSpec
 from fogft.poolfile.reader import ADVANCED
 
@@ -41,7 +41,7 @@ def _table(title: str, entries: list[Entry]) -> Iterator[str]:
     yield "| key | type | default | meaning |"
     yield "|---|---|---|---|"
     for entry in entries:
-        cells = (f"`{entry.name}`", _words(entry.key.form), _default(entry), entry.key.help)
+        cells = (f"`{entry.name}`", words(entry.key.form), _default(entry), entry.key.help)
         yield f"| {' | '.join(cells)} |"
     yield ""
 
@@ -59,34 +59,6 @@ def _default(entry: Entry) -> str:
     if isinstance(value, (int, float)):
         return f"{value:.10g}"
     return f"`{value}`" if isinstance(value, str) else "see below"
-
-
-def _words(form: Form) -> str:  # noqa: PLR0911
-    match form:
-        case keys.Number(most, unit, from_zero):
-            limits = f"{'from' if from_zero else 'above'} 0, at most {most:.10g}"
-            return f"number {limits}{f' {unit}' if unit not in ('', 'one') else ''}"
-        case keys.Whole(least, most, unit):
-            return f"whole number, {least} to {most}{f' {unit}' if unit else ''}"
-        case keys.Flag():
-            return "`true` or `false`"
-        case keys.OneOf(of, hidden):
-            return " or ".join(f"`{member.value}`" for member in of if member not in hidden)
-        case keys.Text(what):
-            return what
-        case keys.Listed(of, most):
-            return f"list of at most {most}, each {of.what}"
-        case keys.Table(of, name):
-            return f"map from {name.what} to a {_words(of)}"
-        case keys.Map(_, _, short, off):
-            return "map" + (", or one value" if short else "") + (", or `false`" if off else "")
-        case keys.Maps():
-            return "list of maps"
-        case keys.Free():
-            return "map"
-        case keys.Special(what):
-            return what
-    raise AssertionError(form)
 
 
 def brought_up_to_date(page: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from fogft.errors import SpecError
 from fogft.model import keys
-from fogft.model.keys import Entry, Form, keys_of
+from fogft.model.keys import Entry, keys_of
 from fogft.poolfile import removed
 from fogft.poolfile.tree import Node, Section, plain, shown
 
@@ -166,15 +166,7 @@ def _hint(entry: Entry) -> str:
         return form.hint
     if isinstance(form, keys.Listed):
         return form.of.hint
-    return f"add `{entry.name}`: {_words(form)}"
-
-
-def _words(form: Form) -> str:
-    if isinstance(form, keys.OneOf):
-        return " or ".join(f"`{m.value}`" for m in form.of if m not in form.hidden)
-    if isinstance(form, keys.Number):
-        return f"a number of {form.unit}"
-    return "a value"
+    return f"add `{entry.name}`: {keys.words(form)}"
 
 
 def _build(cls: type[T], values: Mapping[tuple[str, ...], Any]) -> T:

@@ -57,20 +57,15 @@ def hints(cls: type) -> Mapping[str, str]:
 def places(cls: type | None) -> dict[str, str]:
     """Return where the keys are at home that do not stand in a map of this kind."""
     here = {entry.name for entry in keys_of(cls) if not entry.key.advanced} if cls else set()
-    homes: list[tuple[list[str], str]] = [(list(TASK_PLACES), "at the top level of the file")]
-    for home, where in (
-        (PoolSpec, "under `fogft`"),
-        (ServiceSpec, "in a service, under `fogft.services`"),
-        (HealthSpec, "under `fogft.health`"),
-        (OnDemandSpec, "under `fogft.on_demand`"),
-    ):
-        homes.insert(
-            0, ([e.name for e in keys_of(home) if e.key.advanced], f"{where}, in `advanced`")
-        )
-        homes.insert(0, ([e.name for e in keys_of(home) if not e.key.advanced], where))
     found: dict[str, str] = {}
-    for names, where in homes:
-        for name in names:
-            if name not in here and name not in ("name", "type", "fallback"):
-                found[name] = where
-    return found
+    for home, where in (
+        (OnDemandSpec, "under `fogft.on_demand`"),
+        (HealthSpec, "under `fogft.health`"),
+        (ServiceSpec, "in a service, under `fogft.services`"),
+        (PoolSpec, "under `fogft`"),
+    ):
+        for entry in keys_of(home):
+            found[entry.name] = f"{where}, in `advanced`" if entry.key.advanced else where
+    found |= dict.fromkeys(TASK_PLACES, "at the top level of the file")
+    elsewhere = found.keys() - here - {"name", "type", "fallback"}
+    return {name: where for name, where in found.items() if name in elsewhere}
