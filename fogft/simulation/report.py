@@ -11,11 +11,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from fogft.errors import FogftError
+from fogft.planning.reliability import system_unavailability
 from fogft.pool.manager.offers import ask
-from fogft.simulation import arithmetic
 from fogft.simulation.comparison import Row, Scenario, compare, replicas_of
 from fogft.simulation.fitting import fit
 from fogft.simulation.meter import DAY_S
+from fogft.simulation.model import moving, staying
 from fogft.simulation.world import World
 
 MAX_POOL_DAYS = 1_000_000
@@ -103,7 +104,5 @@ def _expected(scenario: Scenario, wanted: int) -> dict[str, float] | None:
             model = fit(scenario.recorded)
         except FogftError:
             return None
-    return {
-        "moving": arithmetic.independent(arithmetic.moving(model, timing), wanted),
-        "staying": arithmetic.independent(arithmetic.staying(model, timing), wanted),
-    }
+    alone = {"moving": moving(model, timing), "staying": staying(model, timing)}
+    return {how: 1 - system_unavailability([one] * wanted) for how, one in alone.items()}

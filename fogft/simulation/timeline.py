@@ -45,8 +45,8 @@ class Timeline:
 
 def of_samples(counts: Sequence[int], gap_s: float) -> Timeline:
     """Return the timeline of samples taken every `gap_s`: each holds until the next."""
-    changes = _distinct((index * gap_s, count) for index, count in enumerate(counts))
-    return Timeline(tuple(changes), len(counts) * gap_s)
+    changes = ((index * gap_s, count) for index, count in enumerate(counts))
+    return of_changes(changes, len(counts) * gap_s)
 
 
 def of_changes(changes: Iterable[tuple[float, int]], length_s: float) -> Timeline:

@@ -53,11 +53,6 @@ class Vm:
     machine: Machine | None = None  # as listed; None when that has to be made anew
     report: LinkReport | None = None  # of its link while it answers; likewise
 
-    @property
-    def id(self) -> ReplicaId:
-        """The replica that it carries."""
-        return self.order.id
-
 
 class World:
     """One market with one pool in it. Implements `fogft.cloud.port.Cloud`.
@@ -168,7 +163,7 @@ class World:
         ]
 
     def _lose(self, vm: Vm) -> object:
-        if vm.id not in self.vms or vm.gone_at != NEVER:
+        if vm.order.id not in self.vms or vm.gone_at != NEVER:
             return UNSEEN  # it was ended before
         vm.gone_at, vm.ready = self.now, False
         self.meter.preemptions += self.meter.counts(self.now)
@@ -178,13 +173,13 @@ class World:
         return UNSEEN if self.silences else None
 
     def _fall_silent(self, vm: Vm, is_felt: Callable[[], bool]) -> object:
-        return None if vm.id in self.vms and is_felt() else UNSEEN
+        return None if vm.order.id in self.vms and is_felt() else UNSEEN
 
     def _forget(self, vm: Vm) -> object:
-        return UNSEEN if self.vms.pop(vm.id, None) is None else None
+        return UNSEEN if self.vms.pop(vm.order.id, None) is None else None
 
     def _boot(self, vm: Vm) -> None:
-        if vm.id in self.vms and vm.gone_at == NEVER:
+        if vm.order.id in self.vms and vm.gone_at == NEVER:
             vm.ready, vm.machine = True, None
 
     # -- the cloud port -----------------------------------------------------------------------

@@ -9,8 +9,8 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from fogft.simulation import arithmetic
-from fogft.simulation.model import MarketModel, Timing
+from fogft.planning.reliability import system_unavailability
+from fogft.simulation.model import MarketModel, Timing, staying
 from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
@@ -59,7 +59,7 @@ class Markets(Defaults):
         """Return what independence promises, and what comes."""
         found = []
         for n in REPLICAS[1:]:
-            stays = arithmetic.independent(arithmetic.staying(_MODEL, _TIMING), n)
+            stays = 1 - system_unavailability([staying(_MODEL, _TIMING)] * n)
             for who, field in (("static", "static_down"), ("fogft", "fogft_down")):
                 found.append(
                     Finding(
@@ -78,7 +78,7 @@ class Markets(Defaults):
         """Return everything by N."""
         rows = []
         for n in REPLICAS:
-            independent = arithmetic.independent(arithmetic.staying(_MODEL, _TIMING), n)
+            independent = 1 - system_unavailability([staying(_MODEL, _TIMING)] * n)
             static, moving = (_up(samples, n, f) for f in ("static_down", "fogft_down"))
             rows.append([str(n), f"{100 * independent:.4g}", _percent(static), _percent(moving)])
         head = ["replicas", "static, if independent", "static", "fogft"]
@@ -88,8 +88,8 @@ class Markets(Defaults):
         """Draw availability over N."""
         figure, axes = plotting.figure(1, 1)
         axis = axes[0][0]
-        one = arithmetic.staying(_MODEL, _TIMING)
-        independent = [100 * arithmetic.independent(one, n) for n in REPLICAS]
+        one = staying(_MODEL, _TIMING)
+        independent = [100 * (1 - system_unavailability([one] * n)) for n in REPLICAS]
         plotting.curve(axis, REPLICAS, independent, "#222222", "static, if independent")
         for colour, (label, field) in zip(
             plotting.COLOURS, (("static", "static_down"), ("fogft", "fogft_down")), strict=False

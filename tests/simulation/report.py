@@ -16,13 +16,13 @@ from fogft.cli.simulate import duration, percent
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers_for
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
-from fogft.planning.reliability import replicas_needed
+from fogft.planning.reliability import replicas_needed, system_unavailability
 from fogft.poolfile import file
-from fogft.simulation import arithmetic, plot
+from fogft.simulation import plot
 from fogft.simulation.comparison import SETTLE_S, Row, Scenario, estimate, policies, unlogged
 from fogft.simulation.market import remembered
 from fogft.simulation.meter import HOURS_A_MONTH
-from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.model import MarketModel, Timing, moving, staying
 from fogft.simulation.report import Report, simulate
 from fogft.simulation.world import World
 
@@ -97,15 +97,15 @@ def arithmetic_errors(*, quick: bool = False) -> Iterator[dict[str, Any]]:
             )
             scenario = Scenario(spec, FIND, WITHOUT_NOTICE, model, days=days, seeds=tuple(seeds))
             for policy, one in (
-                (f"static, any of {replicas}", arithmetic.staying(model, WITHOUT_NOTICE)),
-                ("fogft", arithmetic.moving(model, WITHOUT_NOTICE)),
+                (f"static, any of {replicas}", staying(model, WITHOUT_NOTICE)),
+                ("fogft", moving(model, WITHOUT_NOTICE)),
             ):
                 down = [1 - available(scenario, policy, seed) for seed in scenario.seeds]
                 yield {
                     "correlation": rho,
                     "replicas": replicas,
                     "policy": policy.split(",", maxsplit=1)[0],
-                    "independent": 1 - arithmetic.independent(one, replicas),
+                    "independent": system_unavailability([one] * replicas),
                     "simulated": estimate(down).to_json(),
                 }
         print(f"arithmetic checked: correlation {rho:g}", flush=True)
@@ -180,7 +180,7 @@ def cells(row: Row) -> Iterator[str]:
 
 def arithmetic_table(errors: list[dict[str, Any]]) -> Iterator[str]:
     """Yield what arithmetic and what simulation say, side by side."""
-    one = 1 - arithmetic.moving(PAPER, WITHOUT_NOTICE)
+    one = 1 - moving(PAPER, WITHOUT_NOTICE)
     needed = replicas_needed(one, 0.9995)
     yield (
         "Unavailability of spot replicas by `fogft.planning.reliability`, which takes them for "

@@ -9,7 +9,7 @@ import pytest
 from fogft.model.choices import OnDemandSpec, ScheduleSpec, WindowSpec
 from fogft.planning import planner
 from fogft.planning.observed.history import EventKind
-from fogft.simulation import arithmetic
+from fogft.planning.reliability import system_unavailability
 from fogft.simulation.comparison import (
     SETTLE_S,
     Row,
@@ -19,7 +19,7 @@ from fogft.simulation.comparison import (
     unlogged,
 )
 from fogft.simulation.market import Market
-from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.model import MarketModel, Timing, moving, staying
 from fogft.simulation.report import simulate
 from fogft.simulation.timeline import UNLIMITED, of_changes, of_samples
 from fogft.simulation.world import World
@@ -161,8 +161,8 @@ def test_without_correlation_the_product_of_unavailabilities_is_right(replicas):
     rows = [run(wanted, f"static, any of {replicas}", seed=s)[1].outcome() for s in range(6)]
     down = 1 - sum(o.available for o in rows) / len(rows)
     # A refused place is tried again after a minute, half of it lost on average.
-    one = arithmetic.staying(INDEPENDENT, Timing(boot_s=30.0))
-    assert down == pytest.approx(1 - arithmetic.independent(one, replicas), rel=0.15)
+    one = staying(INDEPENDENT, Timing(boot_s=30.0))
+    assert down == pytest.approx(system_unavailability([one] * replicas), rel=0.15)
 
 
 def test_without_correlation_a_replica_that_moves_is_down_as_reckoned():
@@ -171,7 +171,7 @@ def test_without_correlation_a_replica_that_moves_is_down_as_reckoned():
     wanted = scenario(spec(1, migration=None), model=INDEPENDENT, timing=timing, days=60.0)
     rows = [run(wanted, seed=seed)[1].outcome() for seed in range(4)]
     down = 1 - sum(o.available for o in rows) / len(rows)
-    assert down == pytest.approx(arithmetic.moving(INDEPENDENT, timing), rel=0.15)
+    assert down == pytest.approx(moving(INDEPENDENT, timing), rel=0.15)
 
 
 def test_with_correlation_independence_promises_too_much():
@@ -183,8 +183,8 @@ def test_with_correlation_independence_promises_too_much():
     wanted = scenario(spec(2), model=model, timing=timing, days=60.0)
     rows = [run(wanted, "static, any of 2", seed=seed)[1].outcome() for seed in range(6)]
     down = 1 - sum(o.available for o in rows) / len(rows)
-    one = arithmetic.staying(model, Timing(boot_s=30.0))
-    assert down > 1.8 * (1 - arithmetic.independent(one, 2))
+    one = staying(model, Timing(boot_s=30.0))
+    assert down > 1.8 * (system_unavailability([one] * 2))
     assert down == pytest.approx(one * one + 0.4 * one * (1 - one), rel=0.2)
 
 

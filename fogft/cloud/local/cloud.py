@@ -161,7 +161,9 @@ class LocalCloud:
             self._warn_once(folder.path.name, error.message)
             return _damaged(folder, now, error) if folder.locked else None
         if life is Life.DEAD:
-            self._bury_if_free(folder)
+            # Later, if the cloud is busy: a list never waits.
+            with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
+                ending.bury(self.root, folder)
             return None
         try:
             return _listed(folder, folder.record(), folder.state())
@@ -170,11 +172,6 @@ class LocalCloud:
                 return None
             self._warn_once(folder.path.name, error.message)
             return _damaged(folder, now, error) if life is Life.ALIVE else None
-
-    def _bury_if_free(self, folder: MachineFolder) -> None:
-        """Clear a dead machine away; later, if the cloud is busy: a list never waits."""
-        with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
-            ending.bury(self.root, folder)
 
     def _is_new(self, folder: MachineFolder) -> bool:
         """Whether an order's machine has yet to be started. The cloud's lock is held."""

@@ -81,7 +81,7 @@ class Machine:
         self._next_tick = 0.0
         self._log_checked = 0.0
         self._seen_at = time.monotonic()
-        self._link_seen: tuple[int, int, int] | None = None
+        self._link = disk.Watched(folder.path / LINK)
         self._faults = faults.LinkFaults()
         self._relay: Relay | None = None
 
@@ -260,12 +260,9 @@ class Machine:
     def _look_at_link(self) -> None:
         if self._relay is None:
             return
-        path = self._folder.path / LINK
-        found = disk.version(path)
-        if found != self._link_seen:
-            self._link_seen = found
+        if self._link.changed():
             try:
-                self._faults = faults.read_link(path)
+                self._faults = faults.read_link(self._link.path)
                 log.info("link_changed faults=%s", self._faults)
             except StateError as error:
                 log.warning("link_file_ignored reason=%r", error.message)

@@ -18,6 +18,7 @@ from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
 from fogft.errors import SpecError
 from fogft.model.names import VM_CLOUDS
 from fogft.model.replica import Offer, Placement
+from fogft.poolfile.resources import alternatives as each
 from fogft.poolfile.tree import nearest, shown
 
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)
@@ -53,16 +54,12 @@ def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer
 
 def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield each alternative, complete, with the path of its keys."""
-    base = {key: value for key, value in resources.items() if key not in ("any_of", "ordered")}
-    _check_keys("resources", base, ("any_of", "ordered"))
+    _check_keys("resources", resources, ("any_of", "ordered"))
     lists = [key for key in ("any_of", "ordered") if resources.get(key) is not None]
     if len(lists) == 2:
         raise SpecError("resources.ordered: cannot stand beside `any_of`", "keep one of them")
-    if not lists:
-        yield "resources", base
-        return
-    entries = resources[lists[0]]
-    path = f"resources.{lists[0]}"
+    entries = resources[lists[0]] if lists else [{}]
+    path = f"resources.{lists[0]}" if lists else "resources"
     if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
         raise SpecError(f"{path}: must be a list", "write `[{infra: local/us-west-1}]`")
     for index, entry in enumerate(entries):
@@ -71,7 +68,7 @@ def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[st
             what = f"{where}: must be a map, not {shown(entry)}"
             raise SpecError(what, "write `{infra: local/us-west-1}`")
         _check_keys(where, entry, ())
-        yield where, {**base, **entry}
+    yield from each(resources)
 
 
 def _check_keys(where: str, entry: Mapping[str, Any], more: Sequence[str]) -> None:

@@ -35,22 +35,19 @@ JOBS = {
 }  # fmt: skip
 
 
+_SAID_BY_SERVER = ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
+                   "InvalidCloudCredentials")  # fmt: skip
+
+
 def translated(error: BaseException, subject: str) -> CloudError:
     """Return what an exception out of SkyPilot means: `CloudUnreachable` or `RefusedError`."""
     if isinstance(error, CloudError):
         return error
     kind = type(error).__name__
-    words = plain(str(error)) or kind
-    if kind in UNKNOWN or isinstance(error, OSError) or _server_lost(error):
+    if _is_unknown(error):
+        words = plain(str(error)) or kind
         return CloudUnreachable(f"SkyPilot cannot tell about {subject}: {words}", _hint(kind))
     return RefusedError(kind, _texts(error))
-
-
-def _server_lost(error: BaseException) -> bool:
-    """Whether a bare RuntimeError speaks of the API server, as SkyPilot's `get` words it."""
-    return type(error) is RuntimeError and str(error).startswith(
-        ("Failed to get request", "Failed to connect", "SkyPilot API server")
-    )
 
 
 @contextlib.contextmanager
@@ -60,13 +57,18 @@ def as_answer() -> Iterator[None]:
         yield
     except Exception as error:
         kind = type(error).__name__
-        said_by_server = kind in ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
-                                  "InvalidCloudCredentials")  # fmt: skip
-        if not said_by_server and (kind in UNKNOWN or isinstance(error, OSError)):
-            raise
-        if _server_lost(error):
+        if kind not in _SAID_BY_SERVER and _is_unknown(error):
             raise
         raise RefusedError(kind, _texts(error)) from error
+
+
+def _is_unknown(error: BaseException) -> bool:
+    if type(error).__name__ in UNKNOWN or isinstance(error, OSError):
+        return True
+    # A bare RuntimeError may speak of the API server, as SkyPilot's `get` words it.
+    return type(error) is RuntimeError and str(error).startswith(
+        ("Failed to get request", "Failed to connect", "SkyPilot API server")
+    )
 
 
 def _texts(error: BaseException) -> list[str]:

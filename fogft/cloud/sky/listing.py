@@ -19,22 +19,20 @@ NOWHERE = Placement("", "", "", "")
 
 def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -> Machine:
     """Return a machine that the journal knows; the others may say nothing of it."""
-    phase = MachinePhase.PROVISIONING
-    failure: Reason | None = None
-    progress = entry.stage.value
-    if entry.stage is Stage.SETTING_UP:
+    phase, failure, progress = MachinePhase.PROVISIONING, entry.failure, entry.stage.value
+    if entry.stage is Stage.ENDING:
+        # Listed until it is certain that nothing runs, so that a crash in between is repaired.
+        failure = failure or _error("its end was not confirmed")
+    elif entry.stage is not Stage.FAILED and cluster and cluster.state is ClusterState.STOPPED:
+        failure = _error("the machine was stopped")
+    if failure is not None:
+        phase, progress = MachinePhase.FAILED, ""
+    elif entry.stage is Stage.SETTING_UP:
         phase = MachinePhase.RUNNING  # the machine runs; its services do not answer yet
     elif entry.stage is Stage.RUNNING:
         phase, progress = MachinePhase.RUNNING, ""
     elif cluster is not None:
         progress = cluster.progress or progress
-    if entry.stage is Stage.FAILED:
-        phase, failure = MachinePhase.FAILED, entry.failure
-    elif entry.stage is Stage.ENDING:
-        # Listed until it is certain that nothing runs, so that a crash in between is repaired.
-        phase, failure = MachinePhase.FAILED, entry.failure or _error("its end was not confirmed")
-    elif cluster is not None and cluster.state is ClusterState.STOPPED:
-        phase, failure = MachinePhase.FAILED, _error("the machine was stopped")
     placement = entry.placement
     if cluster is not None and cluster.placement is not None:
         placement = _with_zone(placement, cluster.placement)
@@ -48,7 +46,7 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         usd_per_hour=entry.usd_per_hour,
         spec_hash=entry.spec_hash,
         failure=failure,
-        progress=progress if phase is not MachinePhase.FAILED else "",
+        progress=progress,
     )
 
 

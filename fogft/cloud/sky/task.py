@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,17 @@ from fogft.cloud.sky import naming
 from fogft.errors import CloudError, FogftError, SpecError
 from fogft.model.names import NO_VM_CLOUDS
 from fogft.model.replica import Placement
+from fogft.poolfile.resources import alternatives, place
 
 LINK_PORT = 7447
 SETUP_LIMIT_S = 3600
 """How long a machine's set-up may take. Seconds; kept by the machine itself, and by who follows
 its launch."""
 OURS = "~/.fogft"
-_PLACE = ("infra", "cloud", "region", "zone")
-_CHOICES = (*_PLACE, "any_of", "ordered", "instance_type", "use_spot", "accelerators")
+_CHOICES = (
+    *("infra", "cloud", "region", "zone", "any_of", "ordered"),
+    *("instance_type", "use_spot", "accelerators"),
+)
 _REFUSED_TASK = {
     "num_nodes": "a replica is one machine: ask for more under `fogft.replicas`",
     "service": "that section is SkyServe's: the `fogft` section takes its place",
@@ -49,15 +52,15 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
     for target in task.get("file_mounts") or {}:
         if os.path.normpath(str(target)).startswith(OURS):
             raise SpecError(f"file_mounts.{target}: `{OURS}` is fogft's own folder")
-    for where, entry in _entries(task.get("resources") or {}):
+    for where, entry in alternatives(task.get("resources") or {}):
         for key, reason in _REFUSED_RESOURCES.items():
             if key in entry:
                 raise SpecError(f"{where}.{key}: cannot be honoured by a pool", reason)
         for label in entry.get("labels") or {}:
             if str(label).startswith(naming.PREFIX):
                 raise SpecError(f"{where}.labels.{label}: this prefix is fogft's own")
-        cloud = _location(entry)[0]
-        if cloud.lower() in NO_VM_CLOUDS:
+        cloud = place(entry)[0]
+        if cloud in NO_VM_CLOUDS:
             raise SpecError(
                 f"{where}: `{cloud}` has no machines of its own",
                 "name clouds that sell VMs, such as `infra: aws/us-west-2`",
@@ -110,7 +113,7 @@ def build(
 def _resources(order: Launch, owner: str) -> dict[str, Any]:
     asked = order.task.get("resources") or {}
     chosen = next(
-        (entry for _, entry in _entries(asked) if _sells(entry, order.placement)), dict(asked)
+        (entry for _, entry in alternatives(asked) if _sells(entry, order.placement)), dict(asked)
     )
     out = {k: copy.deepcopy(v) for k, v in chosen.items() if k not in _CHOICES}
     instance, _, accelerators = order.placement.instance.partition("+")
@@ -129,37 +132,14 @@ def _resources(order: Launch, owner: str) -> dict[str, Any]:
     return out
 
 
-def _entries(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield every alternative of a `resources` section, each whole, with its key."""
-    base = {k: v for k, v in resources.items() if k not in ("any_of", "ordered")}
-    alternatives = 0
-    for key in ("any_of", "ordered"):
-        for index, entry in enumerate(resources.get(key) or ()):
-            alternatives += 1
-            labels = {**(base.get("labels") or {}), **(entry.get("labels") or {})}
-            whole = {**base, **entry, **({"labels": labels} if labels else {})}
-            yield f"resources.{key}[{index}]", whole
-    if not alternatives:
-        yield "resources", base
-
-
 def _sells(entry: Mapping[str, Any], placement: Placement) -> bool:
     """Whether a placement can have come from this alternative."""
-    parts = zip(_location(entry), (placement.cloud, placement.region, placement.zone), strict=True)
+    parts = zip(place(entry), (placement.cloud, placement.region, placement.zone), strict=True)
     return (
-        all(asked in ("", "*") or asked.lower() == sold.lower() for asked, sold in parts)
+        all(asked in ("", sold.lower()) for asked, sold in parts)
         and entry.get("instance_type") in (None, placement.instance.partition("+")[0])
         and entry.get("use_spot") in (None, placement.spot)
     )
-
-
-def _location(entry: Mapping[str, Any]) -> tuple[str, str, str]:
-    infra = entry.get("infra")
-    parts: Sequence[Any] = (
-        str(infra).split("/", 2) if infra else [entry.get(k) or "" for k in _PLACE[1:]]
-    )
-    cloud, region, zone = [*(str(part) for part in parts), "", ""][:3]
-    return cloud, region, zone
 
 
 def _absolute(source: Any, base: Path) -> Any:

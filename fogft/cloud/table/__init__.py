@@ -23,6 +23,7 @@ from fogft.cloud.local.catalogue import Instance
 from fogft.cloud.local.resources import alternatives, suffices, use_spot
 from fogft.errors import SpecError
 from fogft.model.replica import Offer, Placement
+from fogft.poolfile.resources import place
 from fogft.poolfile.tree import shown
 
 _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
@@ -56,9 +57,9 @@ class PriceTable:
                 price = row.instance.spot_usd_per_hour if spot else row.instance.usd_per_hour
                 if math.isnan(price) or not _is_there(row, entry) or not _suits(where, row, entry):
                     continue
-                place = Placement(row.cloud, row.region, row.zone, row.instance.name, spot)
-                offer = Offer(place, price, row.source, row.as_of)
-                key = (place.location, spot)
+                where_sold = Placement(row.cloud, row.region, row.zone, row.instance.name, spot)
+                offer = Offer(where_sold, price, row.source, row.as_of)
+                key = (where_sold.location, spot)
                 best[key] = min(best.get(key, offer), offer, key=_order)
         if not best:
             raise SpecError(
@@ -73,13 +74,8 @@ def _order(offer: Offer) -> tuple[float, Placement]:
 
 
 def _is_there(row: Row, entry: Mapping[str, Any]) -> bool:
-    infra = entry.get("infra")
-    if infra is not None:
-        parts = [part.strip() for part in str(infra).split("/")]
-    else:
-        parts = [str(entry.get(key) or "*") for key in ("cloud", "region", "zone")]
     has = (row.cloud, row.region, row.zone)
-    return all(asked.lower() in ("*", "", own) for asked, own in zip(parts, has, strict=False))
+    return all(asked in ("", own) for asked, own in zip(place(entry), has, strict=True))
 
 
 def _suits(where: str, row: Row, entry: Mapping[str, Any]) -> bool:
