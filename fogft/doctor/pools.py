@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta, timezone
+from functools import partial
 from pathlib import Path
 
 from fogft import disk
@@ -27,13 +28,13 @@ def pool_file(situation: Situation) -> Iterator[Finding]:
     """The types of a pool file's services can be loaded here."""
     if situation.spec is None:
         return
-    from fogft.ros.types import check_service_type
+    from fogft.ros.types import load_service_type, trouble
 
     for service in situation.spec.services:
         if situation.spec.rmw.robot is Speaks.ZENOH and not service.needs_type:
             yield ok("pool file", f"service `{service.name}` passes through, of whatever type")
             continue
-        problem = check_service_type(service.type)
+        problem = trouble(partial(load_service_type, service.type))
         if problem:
             yield fail(
                 "pool file",

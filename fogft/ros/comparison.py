@@ -8,15 +8,17 @@ Owns: reading and comparing responses of one type. Not here: votes (`fogft.reque
 
 from __future__ import annotations
 
-import importlib
 import math
+import re
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.ros.types import load_service_type
+from fogft.model.type_definition import nested
+from fogft.ros.types import load_service_type, nested_type, trouble
 
-_FLOATS = ("float", "double")
+_FLOAT = re.compile(r"(sequence<)?(float|double)\b.*")  # one, or a list of them
 
 
 class Comparison:
@@ -87,35 +89,18 @@ def _check_float(message_type: Any, type_name: str, path: str) -> None:
     """Raise RosError where a path does not lead to a float."""
     *parents, last = path.split(".")
     for parent in parents:
-        kind = _element(message_type.get_fields_and_field_types().get(parent, ""))
-        if "/" not in kind:
-            raise _no_float(type_name, path)
-        package, _, name = kind.partition("/")
-        message_type = getattr(importlib.import_module(f"{package}.msg"), name)
-    if _element(message_type.get_fields_and_field_types().get(last, "")) not in _FLOATS:
-        raise _no_float(type_name, path)
-
-
-def _element(kind: str) -> str:
-    """Return what a list's elements are; a single value is its own element."""
-    if kind.startswith("sequence<"):
-        return kind.removeprefix("sequence<").rstrip(">").split(",")[0]
-    return kind.split("[", maxsplit=1)[0]
-
-
-def _no_float(type_name: str, path: str) -> RosError:
-    return RosError(
-        f"the response of `{type_name}` has no float field `{path}`",
-        "write the path from the response, such as `plan.poses.pose.position.x`",
-    )
+        kind = nested(message_type.get_fields_and_field_types().get(parent, ""))
+        message_type = nested_type(kind) if kind else None
+        if message_type is None:
+            break
+    fields = message_type.get_fields_and_field_types() if message_type else {}
+    if not _FLOAT.fullmatch(fields.get(last, "")):
+        raise RosError(
+            f"the response of `{type_name}` has no float field `{path}`",
+            "write the path from the response, such as `plan.poses.pose.position.x`",
+        )
 
 
 def check_tolerances(type_name: str, tolerances: Mapping[str, float]) -> str | None:
     """Return why responses cannot be compared so, with what to do; None if they can."""
-    try:
-        Comparison(type_name, tolerances)
-    except RosError as error:
-        return f"{error.message}; {error.hint}" if error.hint else error.message
-    except ImportError as error:
-        return f"ROS 2 is not usable here: {error}; source a ROS 2 installation"
-    return None
+    return trouble(partial(Comparison, type_name, tolerances))

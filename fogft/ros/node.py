@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from fogft.errors import RosError
 from fogft.model import ros_names
@@ -23,11 +23,13 @@ from fogft.ros import topic_ends, transfer
 from fogft.ros.entities import Client, Server
 from fogft.ros.port import OnBurst
 from fogft.ros.topic_ends import Publisher, Reader, Subscription
+from fogft.ros.types import load_message_type, load_service_type
 from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
 
 Entity = Server | Client | Publisher | Subscription
+E = TypeVar("E", Server, Client, Publisher, Subscription)
 
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
 _NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, and proxies
@@ -53,7 +55,7 @@ class SerialisedNode:
         self._entities: tuple[Entity, ...] = ()
         self._changes: list[tuple[Entity, bool, threading.Event]] = []
         self._create_lock = threading.Lock()  # rcl wants one creation at a time
-        self._transfers: dict[str, transfer.Transfer] = {}
+        self._chosen: dict[str, transfer.Ends] = {}
         self._stopping = False
         self._ended = threading.Event()
         self._visible: VisibleNode | None = None
@@ -117,56 +119,42 @@ class SerialisedNode:
         on_request: Callable[[bytes, Any], None],
         on_burst: OnBurst | None = None,
     ) -> Server:
-        """Offer a service. A first request may come before this returns.
+        """Offer a service. A first request may come before this returns."""
 
-        Raises:
-            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
-        """
+        service_type, ends = self._ends(type_name)
 
-        def create(way: transfer.Transfer, service_type: Any) -> Server:
+        def create() -> Server:
             service: Any = self._node.create_service(
                 service_type, name, lambda _, response: response, qos_profile=self._quality
             )
             try:
-                return Server(
-                    service, way.service_end(service), on_request, self._withdraw, on_burst
-                )
+                end = ends.service(service, service_type)
+                return Server(service, end, on_request, self._withdraw, on_burst)
             except BaseException:
                 self._node.destroy_service(service)
                 raise
 
-        server: Server = self._create(name, type_name, create)
-        return server
+        return self._add(name, create)
 
     def client(self, name: str, type_name: str) -> Client:
-        """Make a client of a service.
-
-        Raises:
-            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
-        """
-
+        """Make a client of a service."""
         # ROS 2 Humble cannot count: there, whether one is available must do.
         count: Any = getattr(self._node, "count_services", lambda _: 0)
 
-        def create(way: transfer.Transfer, service_type: Any) -> Client:
+        service_type, ends = self._ends(type_name)
+
+        def create() -> Client:
             client: Any = self._node.create_client(service_type, name, qos_profile=self._quality)
             try:
-                return Client(client, way.client_end(client), self._withdraw, count)
+                return Client(client, ends.client(client, service_type), self._withdraw, count)
             except BaseException:
                 self._node.destroy_client(client)
                 raise
 
-        client: Client = self._create(name, type_name, create)
-        return client
+        return self._add(name, create)
 
     def publisher(self, name: str, type_name: str, quality: Quality) -> Publisher:
-        """Make a publisher of a topic.
-
-        Raises:
-            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
-        """
-        from fogft.ros.types import load_message_type
-
+        """Make a publisher of a topic."""
         message_type = load_message_type(type_name)
 
         def create() -> Publisher:
@@ -177,19 +165,12 @@ class SerialisedNode:
                 self._node.destroy_publisher(made)
                 raise
 
-        publisher: Publisher = self._add(name, create)
-        return publisher
+        return self._add(name, create)
 
     def subscribe(
         self, name: str, type_name: str, quality: Quality, on_message: Callable[[bytes], None]
     ) -> Subscription:
-        """Subscribe to a topic.
-
-        Raises:
-            RosError: The type cannot be loaded, the name is wrong, or the node is closed.
-        """
-        from fogft.ros.types import load_message_type
-
+        """Subscribe to a topic."""
         message_type = load_message_type(type_name)
 
         def create() -> Subscription:
@@ -199,8 +180,7 @@ class SerialisedNode:
             publishers = self._node.get_publishers_info_by_topic
             return Subscription(made, quality, on_message, self._withdraw, publishers)
 
-        subscription: Subscription = self._add(name, create)
-        return subscription
+        return self._add(name, create)
 
     def make_visible(
         self, name: str, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
@@ -241,22 +221,15 @@ class SerialisedNode:
                     found.setdefault(service, kinds[0])
         return found
 
-    def _create(
-        self, name: str, type_name: str, create: Callable[[transfer.Transfer, Any], Any]
-    ) -> Any:
-        from fogft.ros.types import load_service_type
-
+    def _ends(self, type_name: str) -> tuple[Any, transfer.Ends]:
+        """Return a service type, and how its bytes travel, which is found out once."""
         service_type = load_service_type(type_name)
+        with self._create_lock:
+            if type_name not in self._chosen:
+                self._chosen[type_name] = transfer.choose(service_type, type_name)
+            return service_type, self._chosen[type_name]
 
-        def create_so() -> Any:
-            way = self._transfers.get(type_name)
-            if way is None:
-                way = self._transfers[type_name] = transfer.choose(type_name)
-            return create(way, service_type)
-
-        return self._add(name, create_so)
-
-    def _add(self, name: str, create: Callable[[], Any]) -> Any:
+    def _add(self, name: str, create: Callable[[], E]) -> E:
         """Create an entity, and have the take loop attend to it."""
         with self._create_lock:
             if self._stopping or self._ended.is_set():

@@ -11,11 +11,13 @@ Each prints one JSON object on stdout. Exit status 0 when it worked.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from fogft.ros import environment
@@ -23,10 +25,9 @@ from fogft.ros import environment
 _LIMIT_S = 5.0
 
 
-def answer(name: str) -> None:
-    """Offer a service until stdin is closed."""
-    import threading
-
+@contextlib.contextmanager
+def _node(name: str) -> Iterator[tuple[Any, Any]]:
+    """Give a node and its executor, and take them down."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
@@ -35,19 +36,23 @@ def answer(name: str) -> None:
     node = rclpy.create_node(name, context=context, enable_rosout=False)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    print(json.dumps({"offering": name}), flush=True)
-    closed = threading.Event()
+    try:
+        yield node, executor
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
 
-    def until_closed() -> None:
-        sys.stdin.read()
-        closed.set()
 
-    threading.Thread(target=until_closed, daemon=True).start()
-    while not closed.is_set():
-        executor.spin_once(timeout_sec=0.1)
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
+def answer(name: str) -> int:
+    """Offer a service until stdin is closed."""
+    with _node(name) as (_, executor):
+        print(json.dumps({"offering": name}), flush=True)
+        reader = threading.Thread(target=sys.stdin.read, daemon=True)
+        reader.start()
+        while reader.is_alive():
+            executor.spin_once(timeout_sec=0.1)
+    return 0
 
 
 def ask(name: str) -> int:
@@ -56,44 +61,18 @@ def ask(name: str) -> int:
     That is printed before the node is taken down: Fast DDS now and then crashes there, which
     is no answer to the question.
     """
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node(
-        f"{name}_ask", context=context, enable_rosout=False, start_parameter_services=False
-    )
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    try:
-        return _tell(lambda: _call(name, node, executor))
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
+    with contextlib.ExitStack() as until_told:
+        return _tell(lambda: _call(name, *until_told.enter_context(_node(f"{name}_ask"))))
 
 
 def segment() -> dict[str, int]:
     """Make a node; return the size of the shared memory that its middleware maps for it."""
-    import rclpy
-
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node(f"fogft_doctor_{os.getpid()}", context=context, enable_rosout=False)
-    try:
+    with _node(f"fogft_doctor_{os.getpid()}"):
         return {"segment_bytes": environment.largest_segment_bytes()}
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
 
 
 def _call(name: str, node: Any, executor: Any) -> dict[str, float]:
-    """Find the service and call it once.
-
-    Raises:
-        TimeoutError: Discovery did not find it, or it did not answer.
-    """
+    """Find the service and call it once. Raises TimeoutError: not found, or no answer."""
     from rcl_interfaces.srv import ListParameters
 
     client: Any = node.create_client(ListParameters, f"/{name}/list_parameters")
@@ -113,31 +92,27 @@ def _call(name: str, node: Any, executor: Any) -> dict[str, float]:
 def _tell(find: Callable[[], Mapping[str, Any]]) -> int:
     """Print what is found, or the error that stood in its way; return the exit status."""
     try:
-        print(json.dumps(find()), flush=True)
+        found, status = find(), 0
     except Exception as error:
-        return _tell_error(error)
-    return 0
-
-
-def _tell_error(error: Exception) -> int:
-    print(json.dumps({"error": str(error), "kind": type(error).__name__}), flush=True)
-    return 1
+        found, status = {"error": str(error), "kind": type(error).__name__}, 1
+    print(json.dumps(found), flush=True)
+    return status
 
 
 def main(arguments: list[str]) -> int:
     """Run one of the four; it prints its result."""
     environment.prepare(os.environ)
-    try:
-        if arguments[0] == "describe":
+    match arguments:
+        case ["describe"]:
             return _tell(environment.describe)
-        if arguments[0] == "segment":
+        case ["segment"]:
             return _tell(segment)
-        if arguments[0] == "ask":
-            return ask(arguments[1])
-        answer(arguments[1])
-    except Exception as error:
-        return _tell_error(error)
-    return 0
+        case ["ask", name]:
+            return ask(name)
+        case ["answer", name]:
+            return answer(name)
+    print(__doc__, file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

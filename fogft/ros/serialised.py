@@ -182,21 +182,6 @@ class SerialisedClientEnd(_End):
         return self._ticket.value
 
 
-class SerialisedTransfer:
-    """`Transfer` over rcl. Run `self_test` for the type first."""
-
-    def __init__(self, service_type: Any) -> None:
-        self._service_type = service_type
-
-    def service_end(self, service: Any) -> SerialisedServiceEnd:
-        """Return the end of an rclpy service."""
-        return SerialisedServiceEnd(service, self._service_type)
-
-    def client_end(self, client: Any) -> SerialisedClientEnd:
-        """Return the end of an rclpy client."""
-        return SerialisedClientEnd(client, self._service_type)
-
-
 def self_test(service_type: Any) -> None:
     """Send default messages of a service type through this path and through rclpy's; compare.
 

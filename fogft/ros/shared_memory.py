@@ -44,10 +44,8 @@ def sweep() -> list[str]:
     cannot be judged stay.
     """
     with _one_at_a_time() as my_turn:
-        candidates = grouped_names() if my_turn else {}
-        used = names_in_use() if candidates else set()
-        unused = {group for group, names in candidates.items() if used.isdisjoint(names)}
-        return sorted(_remove(unused)) if unused else []
+        unused = _unused() if my_turn else {}
+        return sorted(_remove(set(unused))) if unused else []
 
 
 @contextlib.contextmanager
@@ -78,10 +76,15 @@ def _lock(descriptor: int, deadline: float) -> bool:
 
 def abandoned() -> list[Path]:
     """Return the files that `sweep` would remove now, sorted; remove nothing."""
+    unused = _unused().values()
+    return sorted(FOLDER / n for names in unused if not any(map(_locked, names)) for n in names)
+
+
+def _unused() -> dict[str, list[str]]:
+    """Return the groups that no process of ours maps or holds open."""
     candidates = grouped_names()
     used = names_in_use() if candidates else set()
-    unused = [names for names in candidates.values() if used.isdisjoint(names)]
-    return sorted(FOLDER / n for names in unused if not any(map(_locked, names)) for n in names)
+    return {group: names for group, names in candidates.items() if used.isdisjoint(names)}
 
 
 def grouped_names() -> dict[str, list[str]]:
@@ -89,28 +92,20 @@ def grouped_names() -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     fresh: set[str] = set()
     now = time.time()
-    for entry in _entries():
-        match = _OURS.fullmatch(entry.name)
+    for path in FOLDER.glob("*"):  # none where there is no shared memory at all
+        match = _OURS.fullmatch(path.name)
         if match is None:
             continue
         try:
-            status = entry.stat(follow_symlinks=False)
+            status = path.lstat()
         except FileNotFoundError:
             continue
         group = match["group"]
         touched = max(status.st_mtime, status.st_ctime)
         if status.st_uid != os.getuid() or abs(now - touched) < SETTLED_S:
             fresh.add(group)
-        groups.setdefault(group, []).append(entry.name)
+        groups.setdefault(group, []).append(path.name)
     return {group: names for group, names in groups.items() if group not in fresh}
-
-
-def _entries() -> list[os.DirEntry[str]]:
-    try:
-        with os.scandir(FOLDER) as found:
-            return list(found)
-    except OSError:
-        return []  # not Linux, or no shared memory at all
 
 
 def names_in_use() -> set[str]:
@@ -143,9 +138,8 @@ def _remove(unused: set[str]) -> list[str]:
     held = [group for group in unused if "_port" in group and semaphore(group, "sem_trywait")]
     going: list[str] = []
     try:
-        used = names_in_use()
-        for group, names in grouped_names().items():
-            if group in unused and used.isdisjoint(names) and not any(map(_locked, names)):
+        for group, names in _unused().items():
+            if group in unused and not any(map(_locked, names)):
                 going += names
         removed = [name for name in going if not name.startswith("sem.") and unlink_name(name)]
     finally:

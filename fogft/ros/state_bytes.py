@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import array
 import re
+from functools import partial
 from typing import Any
 
 from fogft.errors import RosError
 from fogft.model.state import StateService, StateSpec
-from fogft.ros.types import load_service_type
+from fogft.ros.types import load_service_type, trouble
 
 _SEQUENCE = re.compile(r"sequence<(octet|uint8|int8|char)(?:, \d+)?>")
 _TEXT = re.compile(r"string(?:<\d+>)?")
@@ -131,10 +132,4 @@ def _no_field(where: StateService, part: str, path: str) -> RosError:
 
 def check_state(spec: StateSpec) -> str | None:
     """Return why a service's state cannot travel so, with what to do; None if it can."""
-    try:
-        StateBytes(spec)
-    except RosError as error:
-        return f"{error.message}; {error.hint}" if error.hint else error.message
-    except ImportError as error:
-        return f"ROS 2 is not usable here: {error}; source a ROS 2 installation"
-    return None
+    return trouble(partial(StateBytes, spec))

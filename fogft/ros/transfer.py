@@ -1,7 +1,7 @@
 """How the bytes of a message get out of and into ROS: the seam below the node.
 
 Two implementations: `serialised` (fast, over rcl), and where that fails its test
-`ConvertedTransfer` (over rclpy's own messages: same bytes, same errors, no ctypes).
+`CONVERTED` (over rclpy's own messages: same bytes, same errors, no ctypes).
 
 Owns: the contract of the two and the choice.
 Not here: the thread, the wait set and the pending requests (`node`).
@@ -10,7 +10,8 @@ Not here: the thread, the wait set and the pending requests (`node`).
 from __future__ import annotations
 
 import logging
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 from fogft.errors import RosError, Unreadable
 
@@ -34,77 +35,6 @@ def from_bytes(payload: bytes, message_type: Any) -> Any:
         raise Unreadable(
             f"{len(payload)} bytes are not a serialised {message_type.__name__}: {error}"
         ) from error
-
-
-class ConvertedServiceEnd:
-    """`ServiceEnd` over rclpy's messages."""
-
-    def __init__(self, service: Any, service_type: Any) -> None:
-        self._handle = service.handle
-        self._type = service_type
-
-    def take(self) -> tuple[bytes, Any] | None:
-        """Return the next serialised request and its request id."""
-        try:
-            request, header = self._handle.service_take_request(self._type.Request)
-        except Exception as error:
-            raise RosError(f"a request cannot be taken: {error}") from error
-        return None if header is None else (to_bytes(request), header.request_id)
-
-    def respond(self, handle: Any, payload: bytes) -> None:
-        """Send a serialised response."""
-        response = from_bytes(payload, self._type.Response)
-        try:
-            self._handle.service_send_response(response, handle)
-        except Exception as error:
-            raise RosError(f"a response cannot be sent: {error}") from error
-
-    def close(self) -> None:
-        """Hold nothing; nothing to free."""
-
-
-class ConvertedClientEnd:
-    """`ClientEnd` over rclpy's messages."""
-
-    def __init__(self, client: Any, service_type: Any) -> None:
-        self._handle = client.handle
-        self._type = service_type
-
-    def take(self) -> tuple[int, bytes] | None:
-        """Return the next response: sequence number and bytes."""
-        try:
-            header, response = self._handle.take_response(self._type.Response)
-        except Exception as error:
-            raise RosError(f"a response cannot be taken: {error}") from error
-        if header is None:
-            return None
-        return header.request_id.sequence_number, to_bytes(response)
-
-    def send(self, payload: bytes) -> int:
-        """Send a serialised request; return its sequence number."""
-        request = from_bytes(payload, self._type.Request)
-        try:
-            return int(self._handle.send_request(request))
-        except Exception as error:
-            raise RosError(f"a request cannot be sent: {error}") from error
-
-    def close(self) -> None:
-        """Hold nothing; nothing to free."""
-
-
-class ConvertedTransfer:
-    """`Transfer` over rclpy's messages."""
-
-    def __init__(self, service_type: Any) -> None:
-        self._service_type = service_type
-
-    def service_end(self, service: Any) -> ConvertedServiceEnd:
-        """Return the end of an rclpy service."""
-        return ConvertedServiceEnd(service, self._service_type)
-
-    def client_end(self, client: Any) -> ConvertedClientEnd:
-        """Return the end of an rclpy client."""
-        return ConvertedClientEnd(client, self._service_type)
 
 
 class ServiceEnd(Protocol):
@@ -149,25 +79,66 @@ class ClientEnd(Protocol):
         """Free what is held. Nothing may be called afterwards."""
 
 
-class Transfer(Protocol):
-    """One way to move bytes, for one service type."""
+class _ConvertedServiceEnd(ServiceEnd):
+    """Bytes of a service by way of rclpy's messages."""
 
-    def service_end(self, service: Any) -> ServiceEnd:
-        """Return the end of an rclpy service."""
+    def __init__(self, service: Any, service_type: Any) -> None:
+        self._handle = service.handle
+        self._type = service_type
 
-    def client_end(self, client: Any) -> ClientEnd:
-        """Return the end of an rclpy client."""
+    def take(self) -> tuple[bytes, Any] | None:
+        try:
+            request, header = self._handle.service_take_request(self._type.Request)
+        except Exception as error:
+            raise RosError(f"a request cannot be taken: {error}") from error
+        return None if header is None else (to_bytes(request), header.request_id)
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        response = from_bytes(payload, self._type.Response)
+        try:
+            self._handle.service_send_response(response, handle)
+        except Exception as error:
+            raise RosError(f"a response cannot be sent: {error}") from error
 
 
-def choose(type_name: str) -> Transfer:
-    """Return the fast way for a type, or the slow one, with a warning, where that fails its test.
+class _ConvertedClientEnd(ClientEnd):
+    """Bytes of a client by way of rclpy's messages."""
 
-    Raises:
-        RosError: The type cannot be loaded.
-    """
-    from fogft.ros import serialised, types
+    def __init__(self, client: Any, service_type: Any) -> None:
+        self._handle = client.handle
+        self._type = service_type
 
-    service_type = types.load_service_type(type_name)
+    def take(self) -> tuple[int, bytes] | None:
+        try:
+            header, response = self._handle.take_response(self._type.Response)
+        except Exception as error:
+            raise RosError(f"a response cannot be taken: {error}") from error
+        if header is None:
+            return None
+        return header.request_id.sequence_number, to_bytes(response)
+
+    def send(self, payload: bytes) -> int:
+        request = from_bytes(payload, self._type.Request)
+        try:
+            return int(self._handle.send_request(request))
+        except Exception as error:
+            raise RosError(f"a request cannot be sent: {error}") from error
+
+
+class Ends(NamedTuple):
+    """One way to move bytes: made of an rclpy service, or client, and its type."""
+
+    service: Callable[[Any, Any], ServiceEnd]
+    client: Callable[[Any, Any], ClientEnd]
+
+
+CONVERTED = Ends(_ConvertedServiceEnd, _ConvertedClientEnd)
+
+
+def choose(service_type: Any, type_name: str) -> Ends:
+    """Return the fast way for a type; the slow one, with a warning, if that fails its test."""
+    from fogft.ros import serialised
+
     try:
         serialised.self_test(service_type)
     except RosError as error:
@@ -176,5 +147,5 @@ def choose(type_name: str) -> Transfer:
             type_name,
             error.message,
         )
-        return ConvertedTransfer(service_type)
-    return serialised.SerialisedTransfer(service_type)
+        return CONVERTED
+    return Ends(serialised.SerialisedServiceEnd, serialised.SerialisedClientEnd)

@@ -16,10 +16,11 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fogft.errors import RosError
+from fogft.errors import RosError, told
 from fogft.model.cdr import NUMBER_BYTES, Shape
 from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
 
@@ -70,10 +71,17 @@ def load_message_type(name: str) -> Any:
 
 def check_type(name: str) -> str | None:
     """Return why a service or message type cannot be loaded, with what to do; None if it can."""
+    return trouble(partial(load_message_type if "/msg/" in name else load_service_type, name))
+
+
+def trouble(make: Callable[[], object]) -> str | None:
+    """Return why something of ROS cannot be made here, with what to do; None if it can."""
     try:
-        (load_message_type if "/msg/" in name else load_service_type)(name)
+        make()
     except RosError as error:
-        return f"{error.message}; {error.hint}" if error.hint else error.message
+        return told(error)
+    except ImportError as error:
+        return f"ROS 2 is not usable here: {error}; source a ROS 2 installation"
     return None
 
 
@@ -127,22 +135,9 @@ def _load_type_support(name: str, *parts: Any) -> None:
             raise RosError(f"the C library of `{name}` cannot be loaded", _SOURCE_HINT)
 
 
-def check_service_type(name: str) -> str | None:
-    """Return why a service type cannot be loaded, with what to do about it; None if it can."""
-    try:
-        load_service_type(name)
-    except RosError as error:
-        return f"{error.message}; {error.hint}" if error.hint else error.message
-    return None
-
-
 def check_ok_field(name: str, field: str) -> str | None:
     """Return why a type's response has no such boolean field, with what to do; None if it has."""
-    try:
-        bool_field(name, field)
-    except RosError as error:
-        return f"{error.message}; {error.hint}" if error.hint else error.message
-    return None
+    return trouble(partial(bool_field, name, field))
 
 
 def installed_service_types() -> list[str]:
@@ -267,10 +262,10 @@ def _add(name: str, message: Any, fields: dict[str, Fields]) -> None:
     for _, kind in fields[name]:
         other = nested(kind)
         if other and other not in fields:
-            _add(other, _nested(other), fields)
+            _add(other, nested_type(other), fields)
 
 
-def _nested(name: str) -> Any:
+def nested_type(name: str) -> Any:
     """Return what ``package/Type`` stands for: a message, or a part of an action."""
     package, _, short = name.partition("/")
     action, _, part = short.rpartition("_")

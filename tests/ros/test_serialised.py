@@ -50,7 +50,7 @@ def through_c(message: Any) -> Any:
 def test_every_type_passes_its_own_test(name: str) -> None:
     service_type = load_service_type(name)
     serialised.self_test(service_type)
-    assert isinstance(transfer.choose(name), serialised.SerialisedTransfer)
+    assert transfer.choose(service_type, name).service is serialised.SerialisedServiceEnd
 
 
 def test_a_default_that_float32_rounds_passes() -> None:
@@ -75,7 +75,7 @@ def test_the_self_test_notices_a_changed_message(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(serialised.CMessage, "write", lambda *_: lie)
     with pytest.raises(RosError, match="came back changed"):
         serialised.self_test(service_type)
-    assert isinstance(transfer.choose(SET_BOOL), transfer.ConvertedTransfer)
+    assert transfer.choose(service_type, SET_BOOL) is transfer.CONVERTED
 
 
 numbers = st.integers(-128, 127)

@@ -51,7 +51,7 @@ def test_the_longest_name_that_we_accept_is_accepted_by_ros():
 def fault(service):
     source = f"run: x\nfogft:\n  services: [{{name: a, {service}}}]\n"
     with pytest.raises(SpecError) as caught:
-        file.parse(source, "p.yaml", Checks(types.check_service_type, types.check_ok_field))
+        file.parse(source, "p.yaml", Checks(types.check_type, types.check_ok_field))
     return caught.value.message, caught.value.hint
 
 

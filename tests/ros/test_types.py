@@ -42,11 +42,14 @@ def test_a_wrong_type_says_what_is_wrong_and_what_to_do(name: str, message: str,
     with pytest.raises(RosError, match=message) as caught:
         types.load_service_type(name)
     assert hint in caught.value.hint
-    assert types.check_service_type(name) == f"{caught.value.message}; {caught.value.hint}"
+    assert (
+        types.trouble(lambda: types.load_service_type(name))
+        == f"{caught.value.message}; {caught.value.hint}"
+    )
 
 
 def test_a_good_type_has_nothing_against_it() -> None:
-    assert types.check_service_type(SET_BOOL) is None
+    assert types.check_type(SET_BOOL) is None
     assert types.load_service_type(SET_BOOL).Request().data is False
 
 
@@ -87,7 +90,7 @@ def test_a_type_without_its_c_library_is_an_error(
 def test_checking_a_type_does_not_start_ros() -> None:
     """The pool file's reader checks types: that must stay cheap."""
     code = (
-        "import sys; from fogft.ros.types import check_service_type as check\n"
+        "import sys; from fogft.ros.types import check_type as check\n"
         f"assert check('{SET_BOOL}') is None\n"
         "assert 'rclpy' not in sys.modules"
     )

@@ -6,6 +6,7 @@ Not here: how it grows (`fogft.planning.observed.services`).
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from fogft import disk
@@ -71,11 +72,11 @@ class Discovery:
 
 
 def _check(name: str, kind: str, *, load: bool) -> str:
-    from fogft.ros.types import check_service_type
+    from fogft.ros.types import load_service_type, trouble
 
     try:
         if ros_names.absolute_service_name(name) != name:
             return "its name is not absolute"
     except ValueError as error:
         return str(error)
-    return (check_service_type(kind) if load else None) or ""
+    return (trouble(partial(load_service_type, kind)) if load else None) or ""
