@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
 from fogft.link.send_options import SendOptions
+from fogft.model.plain import Count, Seconds
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.type_definition import Definition
@@ -33,7 +34,7 @@ class Probe:
     """
 
     robot: str
-    manager_age_s: float | None = None
+    manager_age_s: Seconds | None = None
     describe: bool = False
 
 
@@ -46,15 +47,15 @@ class GatewayView:
             left out: ``lab`` or ``lab/edge``; empty for none.
     """
 
-    slot: int
-    generation: int
+    slot: Count
+    generation: Count
     state: LinkState
     ready: frozenset[str] = frozenset()
     draining: bool = False
     at_risk: bool = False
-    silent_for_s: float = 0.0
-    rtt_s: float | None = None
-    restarts: int = 0
+    silent_for_s: Seconds = 0.0
+    rtt_s: Seconds | None = None
+    restarts: Count = 0
     detail: str = ""
     through: str = ""
 
@@ -92,16 +93,16 @@ class ProbeAnswer:
         accepts: Names of compressions that it reads, or does by itself.
     """
 
-    slot: int
-    generation: int
+    slot: Count
+    generation: Count
     incarnation: str
     ready: frozenset[str] = frozenset()
     draining: bool = False
     at_risk: bool = False
-    restarts: int = 0
-    in_flight: int = 0
+    restarts: Count = 0
+    in_flight: Count = 0
     detail: str = ""
-    work: Mapping[str, float] = field(default_factory=dict)
+    work: Mapping[str, Seconds] = field(default_factory=dict)
     offered: Mapping[str, str] = field(default_factory=dict)
     types: Mapping[str, Definition] = field(default_factory=dict)
     behind: tuple[GatewayView, ...] = ()

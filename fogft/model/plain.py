@@ -46,6 +46,7 @@ def within(least: float, most: float) -> Callable[[float], None]:
 
 Count = Annotated[int, within(0, 2**53)]
 Generation = Annotated[int, within(1, 1 << 31)]
+Seconds = Annotated[float, within(-1e18, 1e18)]
 Moment = Annotated[float, within(0, 1e12)]  # seconds since the epoch
 
 
