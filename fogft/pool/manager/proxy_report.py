@@ -14,9 +14,21 @@ from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
-from fogft.model.replica import LinkReport, LinkState, ReplicaId
+from fogft.model.plain import Seconds, from_plain
+from fogft.model.replica import LinkReport, LinkState
 
 STALE_S = 5.0
+
+
+@dataclass(frozen=True)
+class GatewayLink:
+    """How the robot's link to a gateway does."""
+
+    name: str
+    generation: int
+    state: LinkState
+    rtt_s: Seconds | None = None
+    detail: str = ""
 
 
 @dataclass(frozen=True)
@@ -26,7 +38,6 @@ class ProxyReport:
     Attributes:
         written_at: Seconds since the epoch, by the same machine's clock.
         services: Service name -> its counters, as the proxy wrote them.
-        gateways: Name, state, round trip and detail of the links to gateways.
     """
 
     pid: int
@@ -36,7 +47,7 @@ class ProxyReport:
     links: tuple[LinkReport, ...] = ()
     services: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     uplink_suspected: bool = False
-    gateways: tuple[Mapping[str, Any], ...] = ()
+    gateways: tuple[GatewayLink, ...] = ()
 
     def fresh(self, now: float) -> bool:
         """Whether it still says something about now. A clock that jumped makes it say nothing."""
@@ -62,49 +73,13 @@ def read(path: Path, pool_uid: str) -> ProxyReport | None:
 def parse(raw: Any, pool_uid: str) -> ProxyReport | None:
     """Return a report from its JSON value, or None for anything else."""
     try:
-        return ProxyReport(
-            pid=int(raw["pid"]),
-            written_at=float(raw["written_at"]),
-            robot=str(raw.get("robot", "")),
-            uptime_s=float(raw.get("uptime_s") or 0.0),
-            links=tuple(_link(link, pool_uid) for link in raw["links"]),
-            services={str(k): dict(v) for k, v in dict(raw.get("services") or {}).items()},
-            uplink_suspected=bool(raw.get("uplink_suspected")),
-            gateways=tuple(_gateway(one) for one in raw.get("gateways") or ()),
-        )
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError):
+        links = [_with_id(link, pool_uid) for link in raw["links"]]
+        return from_plain(ProxyReport, {**raw, "links": links})
+    except (KeyError, TypeError, ValueError, AttributeError):
         return None
 
 
-def _gateway(raw: Mapping[str, Any]) -> dict[str, Any]:
-    rtt = raw.get("rtt_s")
-    return {
-        "name": str(raw["name"]),
-        "generation": int(raw["generation"]),
-        "state": LinkState(raw["state"]).value,
-        "rtt_s": None if rtt is None else float(rtt),
-        "detail": str(raw.get("detail") or ""),
-    }
-
-
-def _link(raw: Mapping[str, Any], pool_uid: str) -> LinkReport:
-    heard, rtt = raw.get("heard_age_s"), raw.get("rtt_s")
-    return LinkReport(
-        id=ReplicaId(pool_uid, int(raw["slot"]), int(raw["generation"])),
-        state=LinkState(raw["state"]),
-        ready=frozenset(str(name) for name in raw["ready"]),
-        draining=bool(raw.get("draining")),
-        at_risk=bool(raw.get("at_risk")),
-        disagrees=bool(raw.get("disagrees")),
-        heard_age_s=None if heard is None else float(heard),
-        silent_for_s=float(raw.get("silent_for_s") or 0.0),
-        rtt_s=None if rtt is None else float(rtt),
-        in_flight=int(raw.get("in_flight") or 0),
-        won=int(raw.get("won") or 0),
-        restarts=int(raw.get("restarts") or 0),
-        answered=int(raw.get("answered") or 0),
-        failed=int(raw.get("failed") or 0),
-        detail=str(raw.get("detail") or ""),
-        differs=bool(raw.get("differs")),
-        offered=tuple(sorted((str(k), str(v)) for k, v in (raw.get("offered") or {}).items())),
-    )
+def _with_id(link: Mapping[str, Any], pool_uid: str) -> dict[str, Any]:
+    id = {"pool_uid": pool_uid, "slot": link["slot"], "generation": link["generation"]}
+    offered = sorted(map(list, link.get("offered", {}).items()))
+    return {**link, "id": id, "offered": offered}

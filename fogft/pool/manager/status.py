@@ -256,7 +256,7 @@ def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
     here = tick.membership.topology if tick.membership is not None else tick.spec.topology
     if not here:
         return {}
-    links = [dict(one) for one in report.gateways] if report is not None else []
+    links = [to_plain(one) for one in report.gateways] if report is not None else []
     robot = report.robot if report is not None else ""
     return {
         "robot": robot,
