@@ -129,11 +129,7 @@ class Server:
             log.exception("%s: a request was lost", self.name)
 
     def respond(self, handle: Any, payload: bytes) -> None:
-        """Send the serialised response. Nothing happens once the service is withdrawn.
-
-        Raises:
-            Unreadable: The bytes are no message.
-        """
+        """Send the serialised response. Nothing happens once the service is withdrawn."""
         _check(payload)
         if self._open:
             self._worker.do(partial(self._send, handle, payload))
@@ -208,12 +204,7 @@ class Client:
         return len(self._hashes()) if self._open else 0
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
-        """Send a serialised request; return its ticket.
-
-        Raises:
-            Unreadable: The bytes are no message.
-            RosError: The client is closed, or nobody offers the service.
-        """
+        """Send a serialised request; return its ticket. Raises RosError: nobody offers it."""
         _check(payload)
         hashes = self._hashes()
         with self._lock:

@@ -101,14 +101,7 @@ def tokens_of(domain: int) -> str:
 
 
 def service_key(domain: int, name: str, type_name: str, hash: str) -> str:
-    """Return the key of a service.
-
-    Args:
-        domain: The ROS domain.
-        name: Its absolute name.
-        type_name: ``package/srv/Name``.
-        hash: The type's hash.
-    """
+    """Return the key of a service of a type, ``package/srv/Name``, with a hash."""
     return f"{domain}/{name.strip('/')}/{dds_type(type_name)}/{hash}"
 
 
@@ -127,13 +120,7 @@ def ros_type(dds_name: str) -> str:
 
 
 def request_attachment(sequence: int, sent_ns: int, gid: bytes) -> bytes:
-    """Return what goes with a request.
-
-    Args:
-        sequence: The client's own count.
-        sent_ns: Nanoseconds since 1970.
-        gid: The client's identifier.
-    """
+    """Return what goes with a client's n-th request, sent so many nanoseconds after 1970."""
     return struct.pack("<qqB", sequence, sent_ns, _GID_BYTES) + gid
 
 
@@ -170,11 +157,7 @@ _NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, an
 
 
 class Graph:
-    """The servers and clients of a domain, without those of one session.
-
-    Args:
-        own_session: The session that is left out.
-    """
+    """The servers and clients of a domain, without those of our own session."""
 
     def __init__(self, own_session: str) -> None:
         self._own = own_session

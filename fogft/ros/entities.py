@@ -63,13 +63,7 @@ class Server:
         self._pacer = Pacer(self._send)
 
     def respond(self, handle: Any, payload: bytes) -> None:
-        """Send the serialised response; in a burst, when the client can bear it.
-
-        Nothing happens once the service is withdrawn.
-
-        Raises:
-            RosError: It was sent at once, and it is no such response, or ROS refused it.
-        """
+        """Send the serialised response; in a burst, when the client can bear it."""
         self._pacer.respond(handle, payload)
 
     def _send(self, handle: Any, payload: bytes) -> None:
@@ -164,8 +158,6 @@ class Client:
 
     def available(self) -> bool:
         """Whether discovery has found a server."""
-        if self._end is None:
-            return False
         try:
             return bool(self._client.service_is_ready())
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
@@ -181,11 +173,7 @@ class Client:
             return 0
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
-        """Send a serialised request; return its ticket.
-
-        Raises:
-            RosError: The client is closed, the bytes are no such request, or ROS refused them.
-        """
+        """Send a serialised request; return its ticket."""
         with self._lock:
             if self._end is None:
                 raise RosError(f"the client of `{self._client.srv_name}` is closed")

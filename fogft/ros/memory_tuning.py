@@ -51,38 +51,23 @@ def give_back() -> None:
 
 
 class Trimmer:
-    """Gives memory back when a process holds much more than it did.
-
-    Args:
-        above_bytes: What the process may keep.
-        every_s: Look no more often.
-        own: Returns the process's own memory, in bytes.
-        give: Gives free memory back.
-    """
+    """Gives memory back, now and then, when this process holds much more than it needs."""
 
     def __init__(
         self,
         above_bytes: int = 64 << 20,
         every_s: float = 5.0,
-        *,
         clock: Callable[[], float] = time.monotonic,
-        own: Callable[[], int] = own_bytes,
-        give: Callable[[], None] = give_back,
     ) -> None:
         self._above_bytes = above_bytes
         self._every_s = every_s
         self._clock = clock
-        self._own = own
-        self._give = give
         self._looked_at = clock()
 
-    def look(self) -> bool:
-        """Give memory back if it is time and there is much. Returns whether it did."""
+    def look(self) -> None:
+        """Give memory back if it is time and there is much."""
         now = self._clock()
-        if now - self._looked_at < self._every_s:
-            return False
-        self._looked_at = now
-        if self._own() <= self._above_bytes:
-            return False
-        self._give()
-        return True
+        if now - self._looked_at >= self._every_s:
+            self._looked_at = now
+            if own_bytes() > self._above_bytes:
+                give_back()

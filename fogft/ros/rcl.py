@@ -51,26 +51,19 @@ class _Allocator(Structure):
     )
 
 
+_LENGTHS = (("length", c_size_t), ("capacity", c_size_t), ("allocator", _Allocator))
+
+
 class InputBytes(Structure):
     """``rcutils_uint8_array_t`` over the bytes of a Python object, which it keeps alive."""
 
-    _fields_ = (
-        ("buffer", c_char_p),
-        ("length", c_size_t),
-        ("capacity", c_size_t),
-        ("allocator", _Allocator),
-    )
+    _fields_ = (("buffer", c_char_p), *_LENGTHS)
 
 
 class OutputBytes(Structure):
     """``rcutils_uint8_array_t`` that rmw grows as it needs."""
 
-    _fields_ = (
-        ("buffer", c_void_p),
-        ("length", c_size_t),
-        ("capacity", c_size_t),
-        ("allocator", _Allocator),
-    )
+    _fields_ = (("buffer", c_void_p), *_LENGTHS)
 
 
 class _ErrorString(Structure):

@@ -13,10 +13,9 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.model.topic import Quality
+from fogft.ros.entities import BURST
 
 log = logging.getLogger(__name__)
-
-_BURST = 128  # messages taken before others get their turn
 
 
 def profile(quality: Quality) -> Any:
@@ -65,12 +64,7 @@ class Publisher:
         self._open = True
 
     def publish(self, payload: bytes) -> None:
-        """Publish a serialised message. Nothing happens once it is withdrawn.
-
-        Raises:
-            Unreadable: The bytes are no such message.
-            RosError: ROS refused it.
-        """
+        """Publish a serialised message. Nothing happens once it is withdrawn."""
         self._reader.check(payload)
         try:
             if self._open:
@@ -82,7 +76,7 @@ class Publisher:
     def subscribers(self) -> int:
         """Count the subscriptions that discovery lists."""
         try:
-            return int(self._publisher.get_subscription_count()) if self._open else 0
+            return int(self._publisher.get_subscription_count())
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
             return 0
 
@@ -141,7 +135,7 @@ class Subscription:
 
     def drain(self) -> None:
         """Deliver what has arrived. Take loop only."""
-        for _ in range(_BURST):
+        for _ in range(BURST):
             try:
                 taken = self.handle.take_message(self._subscription.msg_type, True)
             except Exception as error:  # of one message; the take loop goes on

@@ -5,34 +5,23 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from fogft.ros.memory_tuning import Trimmer
+import pytest
+
+from fogft.ros import memory_tuning
 from tests.proxy.fakes import Clock
 
 
-class Scene:
-    def __init__(self, own: int) -> None:
-        self.clock = Clock()
-        self.own = own
-        self.given = 0
-        self.trimmer = Trimmer(100, 5.0, clock=self.clock, own=lambda: self.own, give=self.give)
-
-    def give(self) -> None:
-        self.given += 1
-
-
-def test_a_large_process_gives_back_but_no_more_often_than_it_may():
-    scene = Scene(own=200)
+@pytest.mark.parametrize(("own", "times"), [(200, 3), (100, 0)])
+def test_a_large_process_gives_back_but_no_more_often_than_it_may(own, times, monkeypatch):
+    given = []
+    monkeypatch.setattr(memory_tuning, "own_bytes", lambda: own)
+    monkeypatch.setattr(memory_tuning, "give_back", lambda: given.append(own))
+    clock = Clock()
+    trimmer = memory_tuning.Trimmer(100, 5.0, clock)
     for _ in range(20):
-        scene.trimmer.look()
-        scene.clock.now += 1.0
-    assert scene.given == 3
-
-
-def test_a_small_process_keeps_what_it_has():
-    scene = Scene(own=100)
-    scene.clock.now += 10.0
-    assert not scene.trimmer.look()
-    assert scene.given == 0
+        trimmer.look()
+        clock.now += 1.0
+    assert len(given) == times
 
 
 def test_what_a_burst_left_is_really_given_back():
