@@ -3,7 +3,6 @@
 A provider's public endpoint of a region ends TCP in that region, so the time to connect is
 one round trip. Positions are those of the cities or states that providers name, to a degree.
 
-Owns: endpoints and positions.
 Not here: connecting (`fogft.pool.manager.distances`).
 """
 

@@ -4,7 +4,6 @@ A thread asks the cloud's metadata server (AWS, GCP, Azure: a link-local address
 machine itself reaches) or looks at a file, about once a second, and reports each kind of
 notice once. A metadata server that does not answer is no news: on most machines there is none.
 
-Owns: where each cloud is asked, and how often.
 Not here: reading the answers (`notice_formats`) and what a replica does about it.
 """
 

@@ -86,11 +86,7 @@ class Accounts(Protocol):
         """
 
     def check_task(self, task: Mapping[str, Any]) -> None:
-        """Look for what cannot be honoured on these clouds, before anything is ordered.
-
-        Raises:
-            SpecError: There is something; the message names its key.
-        """
+        """Raise `SpecError` for what cannot be honoured on these clouds, before it is ordered."""
 
     def unverified(self, cloud: str) -> str:
         """Return why what exists in a cloud cannot be checked there; empty when it can."""
@@ -113,8 +109,7 @@ class Auditing(Protocol):
     def audit(self, pool_uid: str = "") -> Audit:
         """Look for what exists of a pool, or of all of this user's pools. Takes seconds.
 
-        Raises:
-            CloudUnreachable: It cannot tell; nothing may be concluded.
+        Raises CloudUnreachable: it cannot tell; nothing may be concluded.
         """
 
 
@@ -125,8 +120,5 @@ class Refreshing(Protocol):
     def refresh(self, id: ReplicaId) -> None:
         """Ask the provider about one machine, so that `machines` is true of it afterwards.
 
-        For a replica that stopped to answer probes. Takes seconds: not from the manager's loop.
-
-        Raises:
-            CloudUnreachable: It cannot tell; nothing has changed.
+        Takes seconds: not from the manager's loop. Raises CloudUnreachable: it cannot tell.
         """

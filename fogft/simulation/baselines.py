@@ -2,8 +2,6 @@
 
 Each sees a notice, a lost machine and a refusal as soon as fogft does, and is not charged for
 what it needs besides its replicas. A machine with a notice is replaced, and serves until it ends.
-
-Owns: replicas that stay where they are, a naive policy, round robin, SkyServe's and SpotHedge's.
 """
 
 from __future__ import annotations

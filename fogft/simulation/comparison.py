@@ -1,6 +1,5 @@
 """Run policies side by side in the same markets, one market a seed.
 
-Owns: which policies, from which offers; means and their intervals; the report's JSON.
 Not here: how it is shown (`fogft.cli`, `plot`).
 """
 

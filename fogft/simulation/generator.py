@@ -4,7 +4,7 @@ A zone is struck now and then, and each strike decides anew whether it has room:
 or by the regime (scarcity or plenty) of its region, its cloud or the world. Zones are alike
 because they follow the same regimes, and because some strikes meet a whole region at once.
 
-Owns: the random processes. Every random number comes from the generator handed in.
+Every random number comes from the generator handed in.
 Not here: the formulas of the rates (`model`).
 """
 

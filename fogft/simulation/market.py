@@ -1,6 +1,5 @@
 """A spot market to simulate in: what is on offer, and when each location takes machines away.
 
-Owns: the events that the market causes, with notices reckoned in.
 Not here: the machines themselves (`world`).
 """
 

@@ -1,7 +1,4 @@
-"""What a simulated pool was worth: how often it answered, and what it cost.
-
-Owns: adding up between events.
-"""
+"""What a simulated pool was worth: how often it answered, and what it cost."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 """The spot market that a generator makes up, in a handful of numbers.
 
-Owns: their meaning, defaults and limits, how they are written, and what arithmetic says of them.
 Not here: making a market of them (`generator`) and finding them in traces (`fitting`).
 """
 

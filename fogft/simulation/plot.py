@@ -1,7 +1,4 @@
-"""Draw a report: cost against unavailability, and how many replicas served over time.
-
-Owns: the picture. Matplotlib is imported here and nowhere else.
-"""
+"""Draw a report: cost against unavailability, and how many replicas served over time."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 """A simulation's result as people and programs read it.
 
-Owns: what belongs into it, and its JSON.
 Not here: running it (`comparison`) and drawing it (`plot`).
 """
 

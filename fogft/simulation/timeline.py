@@ -1,6 +1,5 @@
 """How many spot machines fit into one location, over time.
 
-Owns: the step function, and how it follows from equally spaced samples.
 Not here: where it comes from (`traces`, `generator`) and who is taken away (`market`).
 """
 

@@ -7,7 +7,6 @@ which the samples were taken, by which holes and clock jumps are found.
 Its location is its path below the folder, ``aws/us-west-2/us-west-2b.json``, or the zone
 alone, ``us-west-2b_v100_1.json``: what follows the first underscore is only a remark.
 
-Owns: the format, its mistakes, and matching traces with what a pool may buy.
 Not here: what is made of them (`comparison`).
 """
 
@@ -39,11 +38,7 @@ class Trace:
 
 
 def read(folder: Path) -> list[Trace]:
-    """Read every ``.json`` file in and below a folder.
-
-    Raises:
-        FogftError: There is none, or one is no trace; nothing is skipped.
-    """
+    """Read every ``.json`` file in and below a folder; one that is no trace is an error."""
     if not folder.is_dir():
         raise FogftError(f"{folder}: is not a folder of traces", FORMAT)
     try:

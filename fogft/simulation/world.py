@@ -3,7 +3,6 @@
 Between two events nothing changes, so time jumps from one to the next. A policy is asked
 after each event and when it wanted to be asked; it acts through the cloud port only.
 
-Owns: the queue of events, the lives of machines, what is billed.
 Not here: who decides (`managed`, `baselines`) and what the market does (`market`).
 """
 
@@ -57,7 +56,7 @@ class Vm:
 class World:
     """One market with one pool in it. Implements `fogft.cloud.port.Cloud`.
 
-    `seed` is of boot times and victims; what happens before `settle_s` is not measured.
+    What happens before `settle_s` is not measured.
     """
 
     def __init__(

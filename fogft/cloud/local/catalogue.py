@@ -1,20 +1,7 @@
 """What the local cloud pretends to sell: regions, zones, instances and their prices.
 
 Prices are made up, in the proportions of real ones. ``regions.yaml`` in the cloud's folder
-replaces any of it; every key is optional::
-
-    boot_s: 0.5                  # of every zone that does not say otherwise, as are the
-    notice_s: 5                  # four keys below
-    capacity: 8
-    price_factor: 1.0
-    relay: true
-    instances:                   # instead of the built-in ones
-      cpu4: {cpus: 4, memory_gb: 16, usd_per_hour: 0.19, spot_usd_per_hour: 0.07}
-      gpu:  {cpus: 8, memory_gb: 32, usd_per_hour: 0.7, spot_usd_per_hour: 0.3,
-             accelerators: {L4: 1}}
-    regions:                     # instead of the built-in ones
-      us-west-1: {zones: [a, b], boot_s: 0.3}
-      moon-1: {zones: {dark: {capacity: 1}, bright: {}}, price_factor: 9}
+replaces any of it; docs/design/local-cloud.md shows one.
 """
 
 from __future__ import annotations

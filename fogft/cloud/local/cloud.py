@@ -1,8 +1,6 @@
 """The local cloud: the port, over folders, locks and processes. See docs/design/local-cloud.md.
 
-Owns: launching, listing and ending machines.
-Not here: what a machine does (`machine`), how it ends (`ending`), what is sold
-(`catalogue`, `resources`).
+Not here: what a machine does (`machine`), how it ends (`ending`), what is sold (`catalogue`).
 """
 
 from __future__ import annotations

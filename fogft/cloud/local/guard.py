@@ -29,10 +29,7 @@ def become_subreaper() -> None:
 
 
 def start(end_the_rest: Callable[[], None]) -> int:
-    """Become the machine, with a guard above it; return the guard's process id.
-
-    Call it before there are threads or children. `end_the_rest` runs in the guard.
-    """
+    """Become the machine, before there are threads; return the process id of the guard above it."""
     become_subreaper()
     guard = os.getpid()
     machine = os.fork()

@@ -4,7 +4,6 @@ It ends when it is told to (``end.json``, ``notice.json``, a signal) or when wha
 has ended, and takes everything that ran on it along. One thread: the kernel ties children to
 the thread that started them.
 
-Owns: the order of things in a machine's life.
 Not here: the path to it (`relay`), cleaning up after it (`guard`, `ending`).
 """
 
@@ -63,9 +62,12 @@ def main(arguments: list[str]) -> int:
         return 0  # it was ended before it began
     start_log()
     lock = disk.Lock(folder.path / LOCK)
-    with contextlib.suppress(FileNotFoundError):  # it has just been ended
-        if lock.acquire(wait=False) and folder.end_at() != 0:
-            Machine(folder, folder.record()).run()
+    try:
+        begins = lock.acquire(wait=False) and folder.end_at() != 0
+    except FileNotFoundError:  # it has just been ended
+        return 0
+    if begins:
+        Machine(folder, folder.record()).run()
     return 0
 
 

@@ -3,8 +3,6 @@
 All of them carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in their environment, which
 ``/proc`` shows as it was when they began, whatever session or parent they have since. A
 process that was started with a clean environment is found as a descendant of one that was not.
-
-Owns: /proc and signals. Not here: the folders of machines (`folder`).
 """
 
 from __future__ import annotations

@@ -4,9 +4,6 @@ A path is modelled as networks are: a chunk occupies it for its size over the ra
 before it, and arrives the delay later, in order whatever changes meanwhile. What the other side
 does not take stops the reading, so backpressure is the kernel's own.
 
-A connection that comes before the server listens for the first time waits for it, as a
-machine's does that still boots; later a refused one is reset.
-
 Not here: who sets the faults (`chaos`).
 """
 
@@ -190,7 +187,7 @@ class Relay:
                         side.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
 
     async def _connect(self, client: socket.socket, server: socket.socket) -> None:
-        """Connect to the server; wait for its first time, as long as the client does."""
+        """Connect to the server; wait until it first listens, as for a machine that still boots."""
         for side in (client, server):
             side.setblocking(False)
             side.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,9 +1,6 @@
 """Which of the local cloud's offers meet a task's `resources`. Pure.
 
-Understands what decides where a machine may be and what it is: ``infra`` (or ``cloud``,
-``region``, ``zone``), ``any_of`` and ``ordered``, ``use_spot``, ``instance_type``, ``cpus``,
-``memory``, ``accelerators``. Other keys of SkyPilot's are accepted and do nothing here.
-
+Keys of SkyPilot's that say neither where a machine may be nor what it is do nothing here.
 A pool written for another cloud can be run here: ``aws/us-west-1`` then means the region of
 that name in the local cloud.
 """
@@ -38,8 +35,7 @@ _ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
 def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
     """Return for each zone the cheapest instance that meets the resources, the cheapest first.
 
-    Raises:
-        SpecError: They can never be met here; the message names the key.
+    Raises SpecError, which names the key: they can never be met here.
     """
     best: dict[Placement, Offer] = {}
     for where, entry in alternatives(resources):

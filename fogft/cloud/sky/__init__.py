@@ -13,12 +13,7 @@ if TYPE_CHECKING:
 
 
 def make(folder: Path, base: Path) -> SkyCloud:
-    """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until it is asked.
-
-    Args:
-        folder: Where launches are remembered, for all pools of this user.
-        base: Folder of the pool file: relative paths in it start there.
-    """
+    """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until it is asked."""
     import getpass
     import socket
 

@@ -108,22 +108,17 @@ class Aws:
 
     def regions(self) -> list[str]:
         """Return every region's name."""
-
-        def names(ec2: Any) -> list[str]:
-            return [str(region["RegionName"]) for region in ec2.describe_regions()["Regions"]]
-
-        return self._ask(_HOME, names)
+        answer = self._ask(_HOME, lambda ec2: ec2.describe_regions())
+        return [str(region["RegionName"]) for region in answer["Regions"]]
 
     def _client(self, region: str) -> Any:
-        """Return a region's client."""
         with self._lock:
             if region not in self.clients:
                 if self._session is None:
                     self._session = importlib.import_module("boto3").session.Session()
+                retries = {"max_attempts": 2, "mode": "standard"}
                 config = importlib.import_module("botocore.config").Config(
-                    connect_timeout=5,
-                    read_timeout=10,
-                    retries={"max_attempts": 2, "mode": "standard"},
+                    connect_timeout=5, read_timeout=10, retries=retries
                 )
                 self.clients[region] = self._session.client(
                     "ec2", region_name=region, config=config

@@ -1,6 +1,5 @@
 """Ask the providers which machines exist: SkyPilot may have forgotten some.
 
-Owns: when a provider is asked, and what it said last.
 Not here: the providers' interfaces (`provider`, `aws`).
 """
 

@@ -4,7 +4,6 @@
 refresh from the cloud, and the provider is asked itself where it can be. What SkyPilot has
 forgotten is ended through the provider, by its labels.
 
-Owns: the order of these steps.
 Not here: which replicas shall end (`fogft.planning.planner`).
 """
 

@@ -3,9 +3,6 @@
 SkyPilot reports a refused launch as one exception with a history of others, and passes the
 clouds' own codes on in their texts. The codes decide, not the exception's class: a region
 without spot capacity and an account without quota come in the same class.
-
-Owns: the table of codes.
-Not here: catching exceptions (`sdk`) and what to do next (`fogft.planning.observed.backoff`).
 """
 
 from __future__ import annotations

@@ -5,7 +5,6 @@ So a step can be lost, repeated, or made by another process after a crash. A lau
 fails or hangs is taken down at once, whoever is watching: a machine that was made before the
 failure would cost money until somebody looks.
 
-Owns: the stages of a launch and what each failure is called.
 Not here: threads and waiting (`adapter`), taking down (`ending`).
 """
 

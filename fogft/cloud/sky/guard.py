@@ -4,8 +4,7 @@ SkyPilot sets `autostop` when a machine is wholly set up. Before that a machine 
 dies, SkyPilot's API server with it, would run until somebody looks. SkyPilot hands the commands
 of its setting `aws.post_provision_runcmd` to the machine with the order itself.
 
-Owns: the text of that command, and the limit. On AWS only: SkyPilot has no such setting for others.
-Not here: giving it to SkyPilot (`installed`).
+On AWS only: SkyPilot has no such setting for others.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class Presence:
         return [found[id] for id in sorted(found)]
 
     def refresh(self, id: ReplicaId) -> None:
-        """Ask the cloud about one machine. See `SkyCloud.refresh`."""
+        """See `SkyCloud.refresh`."""
         entry = self.journal.get(id)
         if entry is not None and self.census.vouches(entry.placement.cloud):
             gone = self.census.alive(entry) is None

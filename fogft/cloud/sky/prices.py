@@ -4,7 +4,6 @@ The catalogue is a file that SkyPilot renews every few hours; spot prices move m
 offer says where its price comes from and how old it is. Prices are kept for a while: the
 planner asks every half minute, and the answer must not cost a second each time.
 
-Owns: which price an offer carries, and how long it is kept.
 Not here: the catalogue (`installed`) and the provider's interface (`provider`).
 """
 

@@ -3,7 +3,6 @@
 What the pool file says passes through untouched, but for the few fields that a pool decides
 itself; those are refused, since a field that is ignored is a promise broken in silence.
 
-Owns: the merge, and which fields are refused.
 Not here: the files on disk (`journal`) and what SkyPilot thinks of the result (`sdk`).
 """
 

@@ -22,10 +22,7 @@ _KEPT = ("METADATA", "WHEEL", "entry_points.txt")
 
 
 def make(folder: Path, package: Path = _PACKAGE) -> Path:
-    """Write the wheel into a folder below `folder`, named after its content, and return that one.
-
-    So it never changes, and a launch under way keeps what it began with.
-    """
+    """Write the wheel into a folder below `folder` that is named after its content; return that."""
     name, content = pack(package)
     target = folder / hashlib.sha256(content).hexdigest()[:16]
     if not (target / name).is_file():

@@ -5,7 +5,6 @@ AvailabilityZone, Price, SpotPrice``; with ``Cloud``, ``AsOf`` (YYYY-MM-DD) and 
 where a table spans clouds or is dated. Without ``Cloud`` the file's folder names it, as in
 SkyPilot's own ``catalogs/v8/aws/vms.csv``.
 
-Owns: reading such a table, and what of it suits a task's `resources`.
 Not here: launching, which a table cannot do.
 """
 
