@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from typing import Any
 
 from fogft.errors import FrameError
 from fogft.link import frame
@@ -17,6 +18,7 @@ from fogft.link.frame import NO_STAMP, STAMP_BYTES, RequestHeader
 from fogft.link.port import Answer
 from fogft.model import refusal
 from fogft.model.names import REQUEST_ID_BYTES
+from fogft.requests.load import Load
 
 LIMIT = 64  # entries
 ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload leaves alone: it does not wait, nor make wait
@@ -24,11 +26,11 @@ BYTES_LIMIT = 16 << 10  # of all payloads together
 
 _FIRST = bytes((frame.VERSION | 0x10,))
 _STAMPED = len(_FIRST) + STAMP_BYTES
-_REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdI")  # id, remaining seconds, length
-_ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s?I")  # id, whether it is a refusal, length
+_REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sd?I")  # id, remaining seconds, spare, length
+_ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s{frame.LOAD_BYTES}s?I")  # ..., refusal, length
 
-Requests = Sequence[tuple[bytes, float, bytes]]
-Answers = Sequence[tuple[bytes, bytes, str]]
+Requests = Sequence[tuple[bytes, float, bool, bytes]]
+Answers = Sequence[tuple[bytes, bytes, bytes, str]]
 
 
 def is_batch(header: bytes) -> bool:
@@ -39,7 +41,7 @@ def is_batch(header: bytes) -> bool:
 def encode_requests(
     requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
 ) -> tuple[bytes, bytes]:
-    """Return header and payload for requests: id, remaining seconds and payload of each.
+    """Return header and payload for requests: id, remaining seconds, whether spare, and payload.
 
     Args:
         requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
@@ -47,8 +49,8 @@ def encode_requests(
         seen: The stamp of the last answer that the connection has seen.
     """
     parts = []
-    for id, remaining_s, payload in requests:
-        parts.append(_REQUEST.pack(id, remaining_s, len(payload)))
+    for id, remaining_s, spare, payload in requests:
+        parts.append(_REQUEST.pack(id, remaining_s, spare, len(payload)))
         parts.append(payload)
     return _FIRST + seen + origin, b"".join(parts)
 
@@ -64,21 +66,21 @@ def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, 
     seen = header[1:_STAMPED]
     token, robot = frame.read_origin(header[_STAMPED:])
     found = []
-    for (id, remaining_s, _), part in _entries(_REQUEST, payload):
+    for (id, remaining_s, spare, _), part in _entries(_REQUEST, payload):
         frame.check_remaining(remaining_s)
-        found.append((RequestHeader(id, remaining_s, token, robot, seen), part))
+        found.append((RequestHeader(id, remaining_s, token, robot, seen, spare=spare), part))
     return found
 
 
 def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
-    """Return header and payload for answers: id, payload and refusal of each.
+    """Return header and payload for answers: id, load, payload and refusal of each.
 
     A refusal takes the place of the payload where it is not empty.
     """
     parts = []
-    for id, payload, reason in answers:
+    for id, load, payload, reason in answers:
         said = reason.encode("ascii") if reason else payload
-        parts.append(_ANSWER.pack(id, bool(reason), len(said)))
+        parts.append(_ANSWER.pack(id, load, bool(reason), len(said)))
         parts.append(said)
     return _FIRST + stamp, b"".join(parts)
 
@@ -88,17 +90,19 @@ def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
     if not is_batch(header) or len(header) != _STAMPED:
         raise FrameError("no batch of answers")
     return header[1:], [
-        _refused(id, frame.read_reason(part)) if refused else Answer(id, part)
-        for (id, refused, _), part in _entries(_ANSWER, payload)
+        _answer(id, part, frame.decode_load(load), refused=refused)
+        for (id, load, refused, _), part in _entries(_ANSWER, payload)
     ]
 
 
-def _refused(id: bytes, said: str) -> Answer:
-    kind, detail = refusal.read(said)
-    return Answer(id, refusal=kind, detail=detail)
+def _answer(id: bytes, part: bytes, load: Load | None, *, refused: bool) -> Answer:
+    if not refused:
+        return Answer(id, part, load=load)
+    kind, detail = refusal.read(frame.read_reason(part))
+    return Answer(id, refusal=kind, detail=detail, load=load)
 
 
-def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[bytes, float, int], bytes]]:
+def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[Any, ...], bytes]]:
     """Return each entry's fields, the last of which is its length, and its bytes."""
     found = []
     at, end = 0, len(payload)
@@ -107,7 +111,7 @@ def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[bytes, flo
         if begin > end:
             raise FrameError("a batch that is cut short")
         fields = form.unpack_from(payload, at)
-        at = begin + fields[2]
+        at = begin + fields[-1]
         if at > end:
             raise FrameError("a batch that is cut short")
         found.append((fields, payload[begin:at]))

@@ -18,13 +18,15 @@ from typing import Any, NamedTuple
 from fogft.errors import FrameError
 from fogft.model.keys import LONGEST_S
 from fogft.model.names import REQUEST_ID_BYTES, ROBOT_BYTES_LIMIT
+from fogft.requests.load import Load
 
-VERSION = 4
+VERSION = 5
 # Beside the version, only towards peers that have said that they know them.
 _PACKED = 0x80  # the payload is compressed
 _MAY_PACK = 0x40  # the answer may be
 _READS_PACKED = 0x20  # the answer may be where the replica finds the link to be thin
-_REQUEST_FLAGS = _PACKED | _MAY_PACK | _READS_PACKED
+_SPARE = 0x08  # to be dropped where it would have to wait
+_REQUEST_FLAGS = _PACKED | _MAY_PACK | _READS_PACKED | _SPARE
 TOKEN_BYTES = 8
 STAMP_BYTES = 4
 NO_STAMP = bytes(STAMP_BYTES)  # nothing was seen yet, or nobody asks
@@ -36,7 +38,10 @@ _CANCEL_BYTES_LIMIT = 1 + CANCEL_LIMIT * REQUEST_ID_BYTES
 GREETING_LIMIT = 4096
 
 _REQUEST = struct.Struct(f">B{REQUEST_ID_BYTES}sd{STAMP_BYTES}s")
-_ANSWER = struct.Struct(f">B{STAMP_BYTES}s{REQUEST_ID_BYTES}s")
+_LOAD = struct.Struct(">HBBff")
+LOAD_BYTES = _LOAD.size
+NO_LOAD = bytes(LOAD_BYTES)  # of a replica whose service time is not known
+_ANSWER = struct.Struct(f">B{STAMP_BYTES}s{REQUEST_ID_BYTES}s{LOAD_BYTES}s")
 _TOKEN = struct.Struct(f">B{TOKEN_BYTES}s")
 _GREETING = struct.Struct(f">B{TOKEN_BYTES}sH")
 _ORIGIN_AT = _REQUEST.size
@@ -54,6 +59,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
         packed: The payload is compressed.
         may_pack: The answer may be.
         reads_packed: It may be where the replica itself finds the link to be thin.
+        spare: It is to be dropped where it would have to wait.
     """
 
     request_id: bytes
@@ -64,6 +70,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
     packed: bool = False
     may_pack: bool = False
     reads_packed: bool = False
+    spare: bool = False
 
 
 @dataclass(frozen=True)
@@ -133,9 +140,12 @@ def encode_request(
     packed: bool = False,
     may_pack: bool = False,
     reads_packed: bool = False,
+    spare: bool = False,
 ) -> bytes:
     """Return a request's header; `origin` comes from the function of that name."""
     first = VERSION | _PACKED * packed | _MAY_PACK * may_pack | _READS_PACKED * reads_packed
+    if spare:
+        first |= _SPARE
     return _REQUEST.pack(first, request_id, remaining_s, seen) + origin
 
 
@@ -156,43 +166,70 @@ def decode_request(frame: bytes) -> RequestHeader:
         first & _PACKED != 0,
         first & _MAY_PACK != 0,
         first & _READS_PACKED != 0,
+        first & _SPARE != 0,
     )
 
 
-def encode_answer(stamp: bytes, request_id: bytes, *, packed: bool = False) -> bytes:
-    """Return an answer's header."""
-    return _ANSWER.pack(VERSION | _PACKED * packed, stamp, request_id)
+def encode_load(load: Load | None) -> bytes:
+    """Return what a replica has to do, in `LOAD_BYTES`; what is larger than fits is cut."""
+    if load is None:
+        return NO_LOAD
+    waiting, running, slots, service_s, spent_s = load
+    return _LOAD.pack(
+        min(waiting, 0xFFFF), min(running, 0xFF), min(slots, 0xFF), service_s, spent_s
+    )
 
 
-def decode_answer(frame: bytes) -> tuple[bytes, bytes, bool]:
-    """Return stamp and request id of an answer's header, and whether its payload is compressed.
+def decode_load(frame: bytes) -> Load | None:
+    """Return what a replica has to do; None where it does not say. `frame` has `LOAD_BYTES`.
+
+    Raises:
+        FrameError: A time in it is negative, too long, or no number.
+    """
+    if frame == NO_LOAD:
+        return None
+    load = Load._make(_LOAD.unpack(frame))
+    if not (0 <= load.service_s <= LONGEST_S and 0 <= load.spent_s <= LONGEST_S):
+        raise FrameError(f"a load of {load.service_s} s and {load.spent_s} s")
+    return load
+
+
+def encode_answer(
+    stamp: bytes, request_id: bytes, *, load: bytes = NO_LOAD, packed: bool = False
+) -> bytes:
+    """Return an answer's header; `load` comes from `encode_load`."""
+    return _ANSWER.pack(VERSION | _PACKED * packed, stamp, request_id, load)
+
+
+def decode_answer(frame: bytes) -> tuple[bytes, bytes, Load | None, bool]:
+    """Return stamp, request id and load of an answer's header, and whether it is compressed.
 
     Raises:
         FrameError: It is not one.
     """
     if len(frame) != _ANSWER.size:
         raise FrameError(f"an answer's header of {len(frame)} bytes")
-    first, stamp, request_id = _ANSWER.unpack(frame)
+    first, stamp, request_id, load = _ANSWER.unpack(frame)
     _check_first(first, _PACKED)
-    return stamp, request_id, bool(first & _PACKED)
+    return stamp, request_id, decode_load(load), bool(first & _PACKED)
 
 
-def encode_refusal(stamp: bytes, request_id: bytes, reason: str) -> bytes:
+def encode_refusal(stamp: bytes, request_id: bytes, reason: str, load: bytes = NO_LOAD) -> bytes:
     """Return a refusal; `reason` is one of `model.refusal`, or any short ASCII text."""
-    return _ANSWER.pack(VERSION, stamp, request_id) + reason.encode("ascii")
+    return _ANSWER.pack(VERSION, stamp, request_id, load) + reason.encode("ascii")
 
 
-def decode_refusal(frame: bytes) -> tuple[bytes, bytes, str]:
-    """Return the stamp, the request id and the reason of a refusal.
+def decode_refusal(frame: bytes) -> tuple[bytes, bytes, str, Load | None]:
+    """Return the stamp, the request id, the reason and the load of a refusal.
 
     Raises:
         FrameError: It is not one.
     """
     if len(frame) < _ANSWER.size:
         raise FrameError(f"a refusal of {len(frame)} bytes")
-    version, stamp, request_id = _ANSWER.unpack_from(frame)
+    version, stamp, request_id, load = _ANSWER.unpack_from(frame)
     check_version(version)
-    return stamp, request_id, read_reason(frame[_ANSWER.size :])
+    return stamp, request_id, read_reason(frame[_ANSWER.size :]), decode_load(load)
 
 
 def read_reason(said: bytes) -> str:

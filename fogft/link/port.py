@@ -21,6 +21,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.type_definition import Definition
 from fogft.records.record import SignedRecord
+from fogft.requests.load import Load
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,7 @@ class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thri
     Attributes:
         service: The name given to `Link.offer`.
         detail: What belongs to a refusal of its kind.
+        load: What the replica has to do, if it says so.
     """
 
     request_id: bytes
@@ -122,6 +124,7 @@ class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thri
     refusal: Refusal | None = None
     service: str = ""
     detail: str = ""
+    load: Load | None = None
 
 
 class LinkEvents(Protocol):
@@ -134,10 +137,10 @@ class LinkEvents(Protocol):
         old connection is dropped by the link.
         """
 
-    def late(self, link: Link, service: str, request_id: bytes) -> None:
-        """An answer came to an attempt that was forgotten: the replica worked for nothing.
+    def late(self, link: Link, answer: Answer) -> None:
+        """An attempt has ended that was forgotten: its bytes are for nobody.
 
-        Its bytes are dropped. Of a connection that was given up it may not be told.
+        Of a connection that was given up it may not be told.
         """
 
     def changed(self, link: Link) -> None:
@@ -205,6 +208,7 @@ class Link(Protocol):
         remaining_s: float,
         *,
         more: bool = False,
+        spare: bool = False,
     ) -> bool:
         """Take one attempt, or return False when the window is full or the link not usable.
 
@@ -213,6 +217,7 @@ class Link(Protocol):
 
         Args:
             more: Others follow at once, then `send`: it may wait for them, to leave in one message.
+            spare: The replica drops it where it would have to wait.
         """
 
     def send(self) -> None:
@@ -283,17 +288,22 @@ class Incoming(Protocol):
         """Time that was left when the robot sent it."""
 
     @property
+    def spare(self) -> bool:
+        """Whether it is to be dropped where it would have to wait."""
+
+    @property
     def payload(self) -> bytes:
         """The serialised request (CDR)."""
 
-    def reply(self, payload: bytes, *, more: bool = False) -> None:
+    def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
         """Send the serialised response. Never blocks.
 
         Args:
+            load: What the replica has to do for this service.
             more: Others will soon follow, to leave in one message with it.
         """
 
-    def refuse(self, reason: Refusal, detail: str = "") -> None:
+    def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal. Never blocks."""
 
 

@@ -37,6 +37,7 @@ class _Attempt:
     service: str
     payload: bytes
     deadline: float
+    spare: bool
     on: set[int] = field(default_factory=set)
 
 
@@ -90,9 +91,10 @@ class UplinksLink:
         remaining_s: float,
         *,
         more: bool = False,
+        spare: bool = False,
     ) -> bool:
         """Take one attempt, or return False when no uplink takes it. Never blocks."""
-        attempt = _Attempt(service, payload, time.monotonic() + remaining_s)
+        attempt = _Attempt(service, payload, time.monotonic() + remaining_s, spare)
         with self._lock:
             if self._closed or request_id in self._attempts:
                 return False
@@ -126,7 +128,9 @@ class UplinksLink:
                 return True  # it was answered by another uplink, or is not wanted any more
             attempt.on.add(index)
         left_s = attempt.deadline - time.monotonic()
-        if not self._links[index].offer(attempt.service, request_id, attempt.payload, left_s):
+        if not self._links[index].offer(
+            attempt.service, request_id, attempt.payload, left_s, spare=attempt.spare
+        ):
             with self._lock:
                 attempt.on.discard(index)
             return False
@@ -229,12 +233,12 @@ class UplinksLink:
             self._links[index].forget(request_id)
         self._events.answered(self, answer)
 
-    def late(self, service: str, request_id: bytes) -> None:
+    def late(self, answer: Answer) -> None:
         """Tell of work in vain; a second copy of an answer is none: the replica ran it once."""
         with self._lock:
-            copy = request_id in self._answered
+            copy = answer.request_id in self._answered
         if not copy:
-            self._events.late(self, service, request_id)
+            self._events.late(self, answer)
 
     def changed(self) -> None:
         """Tell that an uplink has changed."""
@@ -252,9 +256,9 @@ class _Events:
         """One attempt on this uplink has ended."""
         self._owner.ended(self._index, answer)
 
-    def late(self, link: Link, service: str, request_id: bytes) -> None:
-        """An answer came to an attempt that was forgotten."""
-        self._owner.late(service, request_id)
+    def late(self, link: Link, answer: Answer) -> None:
+        """An attempt has ended that was forgotten."""
+        self._owner.late(answer)
 
     def changed(self, link: Link) -> None:
         """This uplink's state, or room, has changed."""

@@ -53,6 +53,8 @@ class Refusal(str, Enum):
     CANCELLED = "cancelled"
     # It was run, but the robot had its answer from elsewhere
     LATE = "late"
+    # A spare copy that would have had to wait
+    BUSY = "busy", Effect.BLAMELESS
 
     # Of a stateful service; the detail is the number of the last three
     # It obeys this term, and has not been brought to its state

@@ -71,8 +71,8 @@ class OnTimeout(str, Enum):
 class HedgingMode(str, Enum):
     """How many replicas a request is sent to."""
 
+    AUTO = "auto"  # every one while they are idle, the first to answer when they are busy
     ALL = "all"  # every one, at once
-    ADAPTIVE = "adaptive"  # the best; the next when that takes unusually long
     FAILOVER = "failover"  # one; another when that fails
 
 
@@ -98,7 +98,7 @@ class ServiceSpec:
     """One proxied service.
 
     Attributes:
-        hedging_budget: Extra copies under `adaptive`, as a share of requests.
+        hedging_budget: Late hedges under `auto`, as a share of requests.
         part: Which part of an action it is.
     """
 
@@ -139,10 +139,9 @@ class ServiceSpec:
     )
     hedging: HedgingMode = key(
         OneOf(HedgingMode),
-        "How many replicas get a request: every one at once (`all`), the best one and the next "
-        "when that takes unusually long (`adaptive`), or one and another when that fails "
-        "(`failover`).",
-        default=HedgingMode.ALL,
+        "How many replicas get a request: every one while they are idle and fewer as load rises "
+        "(`auto`), every one always (`all`), or one and another when that fails (`failover`).",
+        default=HedgingMode.AUTO,
         parameter=True,
     )
     hedging_budget: float = 0.1

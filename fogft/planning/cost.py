@@ -77,9 +77,5 @@ def egress_price(cloud: str) -> float:
 
 def _share(service: ServiceSpec, carriers: int) -> float:
     """Return the fraction of requests that one of so many replicas answers."""
-    if service.hedging is HedgingMode.ALL:
-        return 1.0
-    copies = 1.0
-    if service.hedging is HedgingMode.ADAPTIVE:
-        copies += service.hedging_budget
-    return min(1.0, copies / carriers)
+    # Under `auto` a replica that is idle gets a copy of every request: the most that it may be.
+    return 1.0 / carriers if service.hedging is HedgingMode.FAILOVER else 1.0

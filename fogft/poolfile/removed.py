@@ -12,7 +12,7 @@ from fogft.model.choices import (
     ScheduleSpec,
 )
 from fogft.model.keys import keys_of
-from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
+from fogft.model.spec import HealthSpec, HedgingMode, PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
 from fogft.model.topology import Gateway, RobotRoute, Topology
 
@@ -47,6 +47,16 @@ _HINTS: dict[type, dict[str, str]] = {
     Gateway: {"through": "is called `upstream` now; write that"},
     RobotRoute: {"through": "is called `gateways` now; write that"},
 }
+
+
+_VALUES: dict[tuple[type, str], str] = {
+    (HedgingMode, "adaptive"): "is called `auto` now, and is the default; write that"
+}
+
+
+def value_hint(kind: type, text: str) -> str:
+    """Return what is to be said of a value that an enumeration does not have any more."""
+    return _VALUES.get((kind, text), "")
 
 
 def hints(cls: type) -> Mapping[str, str]:

@@ -15,6 +15,7 @@ from enum import Enum
 from typing import Any, TypeVar
 
 from fogft.errors import SpecError
+from fogft.poolfile.removed import value_hint
 
 SMALLEST = 1e-12  # of a number above 0: a smaller one is a slip of the pen
 Choice = TypeVar("Choice", bound=Enum)
@@ -210,7 +211,8 @@ class Section:
         allowed = " or ".join(f"`{value}`" for value in by_value)
         text = self.text(key, f"write {allowed}")
         if text not in by_value:
-            raise self.error(key, f"must be {allowed}, not {shown(text)}", nearest(text, by_value))
+            hint = value_hint(type(members[0]), text) or nearest(text, by_value)
+            raise self.error(key, f"must be {allowed}, not {shown(text)}", hint)
         return by_value[text]
 
     def below(self, key: str, children: Mapping[str, Node]) -> Section:

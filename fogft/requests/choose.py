@@ -4,136 +4,138 @@ A policy is asked when a request comes (`first`) and again while it is open (`mo
 told how each attempt ended. It never sends anything; the dispatcher does as it says, and
 checks nothing but that a replica may be asked.
 
-Owns: `all` and `failover`; the interface of every policy.
-Not here: `adaptive` (`fogft.requests.adaptive`), which answer wins (`fogft.requests.decide`).
+Owns: `all` and `failover`; the interface of every policy; which one a service has.
+Not here: `auto` (`fogft.requests.auto`), which answer wins (`fogft.requests.decide`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
-NEVER = float("inf")
+from fogft.requests.load import NEVER, Load, ReplicaLoad
 
 
-class Choose(Protocol):
+class Choose:
     """Decides which replicas work on a request. Not thread-safe: its owner holds a lock.
 
     Replicas are numbers, `open` maps each that works on a request to the moment it was asked.
+    What a policy does not say here it does not care for.
 
     Attributes:
         moves_on: Whether another replica is asked at once when nobody works on a request.
         look_at: When `more` wants to be asked next, though nothing else has happened.
     """
 
-    moves_on: bool
-    look_at: float
+    moves_on = True
+    look_at = NEVER
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
         """Return which of the able replicas a new request goes to at once."""
+        raise NotImplementedError
 
     def more(
-        self, open: Mapping[int, float], candidates: Sequence[int], now: float
+        self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
         """Return which of those that may be asked, and are not, an open request goes to now."""
+        raise NotImplementedError
 
-    def declined(self, replica: int, *, full: bool) -> None:
+    def is_spare(self, request: bytes, replica: int) -> bool:
+        """Whether an attempt is one that the replica drops unless it has nothing else to do."""
+        return False
+
+    def declined(self, request: bytes, replica: int, *, full: bool) -> None:
         """A replica that was returned was not asked: its window was full, or no need was left."""
 
+    def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
+        """A replica has told its load, with the end of this attempt, which is told next."""
+
     def answered(
-        self, request: bytes, open: Mapping[int, float], replica: int, now: float
+        self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
         """A replica has answered a request; return who shall stop working on it."""
+        return [other for other in open if other != replica] if len(open) > 1 else ()
 
-    def failed(self, request: bytes, replica: int, now: float) -> None:
-        """An attempt ended without an answer that counts."""
-
-    def awaits(self, request: bytes, replica: int) -> bool:
-        """Whether an answer shall come, though another one was first."""
+    def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
+        """An attempt ended without an answer that counts, by the replica's fault or without."""
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """An attempt ended after its request had: with an answer, or without one."""
+        """An attempt ended after its request had: the replica has worked on it, or it has not."""
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
         """A request ended without these: its deadline came, or it was answered otherwise."""
 
+    def came(self, replica: int) -> None:
+        """A replica's link is new, or was opened again."""
+
     def report(self) -> dict[str, Any]:
         """Return what the policy has learned, for people."""
+        return {}
 
 
-class All:
+class All(Choose):
     """Every request goes to every replica at once, and to all that come later. Learns nothing."""
 
     moves_on = False  # all were asked already
-    look_at = NEVER
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
         """Return all of them."""
         return able
 
     def more(
-        self, open: Mapping[int, float], candidates: Sequence[int], now: float
+        self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
         """Return all of them: whoever works on the request may be frozen."""
         return candidates
 
-    def declined(self, replica: int, *, full: bool) -> None:
-        """Learn nothing."""
 
-    def answered(
-        self, request: bytes, open: Mapping[int, float], replica: int, now: float
-    ) -> Iterable[int]:
-        """Return all others."""
-        if len(open) == 1:
-            return ()
-        return [other for other in open if other != replica]
-
-    def failed(self, request: bytes, replica: int, now: float) -> None:
-        """Learn nothing."""
-
-    def awaits(self, request: bytes, replica: int) -> bool:
-        """Await nothing."""
-        return False
-
-    def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """Learn nothing."""
-
-    def stopped(
-        self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
-    ) -> None:
-        """Learn nothing."""
-
-    def report(self) -> dict[str, Any]:
-        """Return nothing."""
-        return {}
-
-
-class Failover:
+class Failover(Choose):
     """One replica gets every request. Another one takes its place when it fails.
 
     It fails when it is no longer able to answer (suspected, not ready, drained), when an
-    attempt of its ends without an answer, and when it lets a deadline pass.
+    attempt of its ends without an answer, and when it lets a deadline pass. A request that takes
+    unusually long, while the one has answered nothing since, goes to another as well, and so do
+    those that come until it answers.
     """
-
-    moves_on = True
-    look_at = NEVER
 
     def __init__(self) -> None:
         self._current: int | None = None
         self._failed = False  # the present one has: the next choice is another, if there is one
+        self._loads: dict[int, ReplicaLoad] = {}
         self.switched = 0
+        self.hedges = 0
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
         """Return the one."""
-        return self._one_of(able)
+        return self._asked(request, self._one_of(able), now)
 
     def more(
-        self, open: Mapping[int, float], candidates: Sequence[int], now: float
+        self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return one when nobody works on the request: the present one, or the next."""
-        return () if open else self._one_of(candidates)
+        """Return one when nobody works on the request, or nobody seems to."""
+        if not candidates:
+            return ()
+        overdue_at = max(
+            (self._of(replica).doubtful_at(begun) for replica, begun in open.items()), default=now
+        )
+        if now < overdue_at:
+            self.look_at = min(self.look_at, overdue_at)
+            return ()
+        doubted = [self._of(replica).doubt(begun, now) for replica, begun in open.items()]
+        if not all(doubted):
+            return ()
+        self.hedges += bool(open)
+        self._failed = self._failed or self._current in open
+        return self._asked(request, self._one_of(candidates), now)
+
+    def _asked(self, request: bytes, chosen: Sequence[int], now: float) -> Sequence[int]:
+        for replica in chosen:
+            known = self._of(replica)
+            known.asked(request, now)
+            self.look_at = min(self.look_at, known.doubtful_at(now))
+        return chosen
 
     def _one_of(self, able: Sequence[int]) -> Sequence[int]:
         old = self._current
@@ -148,26 +150,35 @@ class Failover:
         self.switched += old is not None
         return (self._current,)
 
-    def declined(self, replica: int, *, full: bool) -> None:
+    def _of(self, replica: int) -> ReplicaLoad:
+        known = self._loads.get(replica)
+        if known is None:
+            known = self._loads[replica] = ReplicaLoad()
+        return known
+
+    def declined(self, request: bytes, replica: int, *, full: bool) -> None:
         """Stay: a full window is no failure."""
+        self._of(replica).dropped(request)
 
     def answered(
-        self, request: bytes, open: Mapping[int, float], replica: int, now: float
+        self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
         """Return the others: a failed one may still work on it."""
-        return [other for other in open if other != replica]
+        self._of(replica).answered(request, load, now)
+        return super().answered(request, open, replica, load, now)
 
-    def failed(self, request: bytes, replica: int, now: float) -> None:
+    def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Move on from a replica that failed."""
+        self._of(replica).dropped(request)
         if replica == self._current:
             self._failed = True
 
-    def awaits(self, request: bytes, replica: int) -> bool:
-        """Await nothing."""
-        return False
-
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """Learn nothing."""
+        """Learn that it works again."""
+        if answered:
+            self._of(replica).answered(request, None, now)
+        else:
+            self._of(replica).dropped(request)
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
@@ -176,6 +187,10 @@ class Failover:
         if expired and self._current in open:
             self._failed = True
 
+    def came(self, replica: int) -> None:
+        """Forget what was on the way."""
+        self._of(replica).came()
+
     def report(self) -> dict[str, Any]:
-        """Return how often the replica changed."""
-        return {"switched": self.switched}
+        """Return how often the replica changed, and how often another was asked as well."""
+        return {"switched": self.switched, "hedges": self.hedges}

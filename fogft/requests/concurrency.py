@@ -33,6 +33,8 @@ class ConcurrencyLimit:
 
     Attributes:
         limit: How many may be at work.
+        service_s: What a request took lately, divided by how many were at work, seconds; 0
+            before the first.
     """
 
     def __init__(self, most: int, given: int | None = None) -> None:
@@ -40,11 +42,22 @@ class ConcurrencyLimit:
         self._given = given
         self.limit = most if given is None else given
         self._mean_s: float | None = None
+        self.service_s = 0.0
         # Of the limit in force, while as many as it allows were at work:
         self._samples = 0
         self._sum_s = 0.0
         self._kept: tuple[int, float] | None = None  # during a trial: the limit to compare with
         self._tried: dict[int, float] = {}  # when each limit was last found not to be better
+
+    @property
+    def takes_s(self) -> float:
+        """How long a request was lately at work, seconds; 0 before the first."""
+        return self._mean_s or 0.0
+
+    @property
+    def known(self) -> int:
+        """How many may be at work, where that was given or found out; 0 where it was not."""
+        return self.limit if self._given is not None or self._tried else 0
 
     def finished(self, level: int, took_s: float, now: float) -> None:
         """Learn from an answer.
@@ -56,6 +69,7 @@ class ConcurrencyLimit:
         """
         weight = 1.0 if self._mean_s is None else _WEIGHT
         self._mean_s = (self._mean_s or 0.0) * (1 - weight) + weight * took_s
+        self.service_s = self.service_s * (1 - weight) + weight * took_s / max(1, level)
         if self._given is not None or level != self.limit:
             return
         self._samples += 1

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from typing import Generic, TypeVar
 
 from fogft.model.choices import FallbackSpec
-from fogft.requests.choose import NEVER
+from fogft.requests.load import NEVER
 
 T = TypeVar("T")
 

@@ -14,10 +14,11 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
 from fogft.model.refusal import Effect, Refusal
-from fogft.requests.choose import NEVER, Choose
+from fogft.requests.choose import Choose
 from fogft.requests.decide import Decide, Judgement, Means
 from fogft.requests.fallback import FallbackTimer
 from fogft.requests.first_response import FirstResponse, Pending, Verdict
+from fogft.requests.load import NEVER, Load
 
 
 class Item(Protocol):
@@ -101,7 +102,7 @@ class PendingRequests(Generic[T]):
             (request, replica)
             for request, pending in (short[::-1] if newest_first else short)
             for replica in self.choose.more(
-                pending.open, self._table.candidates(pending, able, now), now
+                request, pending.open, self._table.candidates(pending, able, now), now
             )
         ]
 
@@ -109,22 +110,23 @@ class PendingRequests(Generic[T]):
         """Enter a further attempt; None where it is not wanted any more."""
         pending = self._table.attempt(request, replica, now)
         if pending is None:
-            self.choose.declined(replica, full=False)
+            self.choose.declined(request, replica, full=False)
         return pending
 
-    def passed_over(self, replica: int) -> None:
+    def passed_over(self, request: bytes, replica: int) -> None:
         """A replica was not asked because it has just declined another request."""
-        self.choose.declined(replica, full=False)
+        self.choose.declined(request, replica, full=False)
 
     def declined(self, request: bytes, replica: int) -> None:
         """A replica's link did not take an attempt."""
         self._table.declined(request, replica)
-        self.choose.declined(replica, full=True)
+        self.choose.declined(request, replica, full=True)
 
     def came(self, replicas: Iterable[int]) -> None:
         """These replicas can be asked (again)."""
         for replica in replicas:
             self._table.came(replica)
+            self.choose.came(replica)
 
     def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
         """A replica has begun anew what some requests are about: what it said before is void."""
@@ -139,6 +141,7 @@ class PendingRequests(Generic[T]):
         replica: int,
         payload: bytes,
         reading: Any,
+        load: Load | None,
         now: float,
     ) -> Judged[T]:
         """Take an answer.
@@ -149,12 +152,15 @@ class PendingRequests(Generic[T]):
             replica: Who answered.
             payload: Its bytes.
             reading: What `Decide.read` makes of them.
+            load: What the replica has to do, if it says so.
             now: Seconds.
 
         Returns:
             What it means; the request that it answers, None where it comes too late or is no
             success; who else is to stop working on that; what is to be done where it goes on.
         """
+        if load is not None and request is not None:
+            self.choose.heard(request, replica, load, now)
         pending = None if request is None else self._table.get(request)
         means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
@@ -164,7 +170,7 @@ class PendingRequests(Generic[T]):
             if pending is None:
                 self.choose.late(request, replica, now, answered=True)
                 return means, None, (), Verdict.LATE
-            losers = self.choose.answered(request, pending.open, replica, now)
+            losers = self.choose.answered(request, pending.open, replica, load, now)
             self._closed(request, pending)
             return means, pending, losers, Verdict.WON
         verdict = Verdict.LATE
@@ -175,7 +181,7 @@ class PendingRequests(Generic[T]):
             weaker = means is Means.WEAKER_REJECTION
             kept = pending.rejection if weaker and pending is not None else None
             verdict = self._table.rejected(request, replica, payload if kept is None else kept)
-            self._failed(request, replica, verdict, now, answered=True)
+            self._failed(request, replica, verdict, now, answered=True, fault=False)
             means = Means.REJECTION
         return means, None, (), verdict
 
@@ -188,16 +194,24 @@ class PendingRequests(Generic[T]):
             counts=Effect.BLAMELESS not in refusal.effect,
             bar=Effect.FINAL in refusal.effect,
         )
-        self._failed(request, replica, verdict, now, answered=False)
+        fault = Effect.FAULT in refusal.effect
+        self._failed(request, replica, verdict, now, answered=False, fault=fault)
         return verdict
 
     def _failed(
-        self, request: bytes, replica: int, verdict: Verdict, now: float, *, answered: bool
+        self,
+        request: bytes,
+        replica: int,
+        verdict: Verdict,
+        now: float,
+        *,
+        answered: bool,
+        fault: bool,
     ) -> None:
         if verdict is Verdict.LATE:
             self.choose.late(request, replica, now, answered=answered)
         else:
-            self.choose.failed(request, replica, now)
+            self.choose.failed(request, replica, now, fault=fault)
 
     # -- a request ends -------------------------------------------------------------------
 

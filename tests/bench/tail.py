@@ -36,7 +36,7 @@ def hedging(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
         proxied.wait()
         direct.wait()
         payload = payloads()[FLAG[0]]
-        for number, policy in enumerate(("failover", "adaptive", "all")):
+        for number, policy in enumerate(("failover", "auto", "all")):
             rig.change(hedging=policy)
             before = rig.report()["services"][FLAG[0]]
             source = random.Random(number)

@@ -31,7 +31,7 @@ def of_pool(folder: Path, replicas: int, requests: int, *, delay_s: float = 0.0)
     A service that answers at once (`delay_s`) saves a robot what has not left it by then.
     """
     folder.mkdir()
-    pool = GatewayPool(folder, timeout_s=60.0)
+    pool = GatewayPool(folder, timeout_s=60.0, services=", hedging: all")
     relays: list[CountingRelay] = []
     try:
         for slot in range(replicas):

@@ -292,6 +292,8 @@ def test_the_replica_is_told_what_was_forgotten(
     replica.requests[2].refuse(Refusal.LATE)  # it had been run, which is told of
     world.wait_for(lambda: owner.too_late)
     assert owner.too_late == [(SERVICE, request_id(2))]
+    world.wait_for(lambda: owner.dropped)
+    assert owner.dropped == [(SERVICE, request_id(0))]
     assert owner.answers == []
 
 

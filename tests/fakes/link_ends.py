@@ -15,6 +15,7 @@ from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.robot.probing import Silence
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, doubted_after_s
+from fogft.requests.load import Load
 
 if TYPE_CHECKING:
     from tests.fakes.link import MemoryDialer, MemoryListener
@@ -29,6 +30,7 @@ class _Attempt:
     request_id: bytes
     payload: bytes
     deadline: float
+    spare: bool
 
     @property
     def size(self) -> int:
@@ -99,12 +101,14 @@ class MemoryLink:
         remaining_s: float,
         *,
         more: bool = False,
+        spare: bool = False,
     ) -> bool:
         """Take one attempt, or return False."""
         session = self._session
         if session is None or not self.usable or service not in self._services:
             return False
-        attempt = _Attempt(service, request_id, payload, self._wire.now + remaining_s)
+        deadline = self._wire.now + remaining_s
+        attempt = _Attempt(service, request_id, payload, deadline, spare)
         if not session.window.admit(attempt):
             return False
         session.attempts.append(attempt)
@@ -119,6 +123,7 @@ class MemoryLink:
             self._dialer.robot,
             remaining_s,
             attempt.payload,
+            spare=attempt.spare,
             send=lambda answer: self._wire.post(
                 session, lambda: self._end(session, attempt, answer)
             ),
@@ -134,8 +139,7 @@ class MemoryLink:
                 self._events.changed(self)
             return
         self._forgotten.pop(attempt.request_id, None)
-        if answer.payload is not None or answer.refusal == Refusal.LATE:
-            self._events.late(self, attempt.service, attempt.request_id)
+        self._events.late(self, answer._replace(service=attempt.service))
 
     def send(self) -> None:
         """Do nothing: it was sent."""
@@ -286,6 +290,7 @@ class MemoryIncoming:
         remaining_s: float,
         payload: bytes,
         *,
+        spare: bool,
         send: Callable[[Answer], None],
         listener: MemoryListener,
     ) -> None:
@@ -294,16 +299,18 @@ class MemoryIncoming:
         self.robot = robot
         self.remaining_s = remaining_s
         self.payload = payload
+        self.spare = spare
         self._send: Callable[[Answer], None] | None = send
         self._listener = listener
 
-    def reply(self, payload: bytes, *, more: bool = False) -> None:
+    def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
         """Send the serialised response."""
-        self.answer(Answer(self.request_id, payload=payload), "replies")
+        self.answer(Answer(self.request_id, payload=payload, load=load), "replies")
 
-    def refuse(self, reason: Refusal, detail: str = "") -> None:
+    def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal."""
-        self.answer(Answer(self.request_id, refusal=reason, detail=detail), "refused")
+        answer = Answer(self.request_id, refusal=reason, detail=detail, load=load)
+        self.answer(answer, "refused")
 
     def __del__(self) -> None:
         """Refuse what its owner forgot."""

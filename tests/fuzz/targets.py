@@ -17,7 +17,7 @@ from typing import Any
 
 from fogft.errors import CredentialError, FrameError, StateError
 from fogft.link import batch_frames, compression, frame, probe_frames
-from fogft.link.frame import Greeting
+from fogft.link.frame import NO_LOAD, Greeting
 from fogft.link.port import GatewayView, Probe, ProbeAnswer
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions, NotAdmittedError
 from fogft.model import credentials, membership, refusal
@@ -31,6 +31,7 @@ from fogft.records import record as records
 from fogft.records.record import RecordError, RecordKind, SignedRecord
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import Signer, Verifier
+from fogft.requests.load import Load
 from fogft.rmw_zenoh import naming
 from fogft.topics import frames as topic_frames
 
@@ -39,6 +40,8 @@ ROBOT = f"robot.ada.1.{UID}"
 REPLICA = f"replica.0.1.{UID}"
 MANAGER = f"manager.manager.1.{UID}"
 ID, TOKEN, STAMP = bytes(range(16)), bytes(8), b"seen"
+LOAD = frame.encode_load(Load(3, 1, 2, 0.5, 0.25))
+ANSWERS = [(ID, NO_LOAD, b"x", ""), (ID, LOAD, b"", "lost")]
 
 
 @dataclass(frozen=True)
@@ -234,7 +237,7 @@ def targets() -> dict[str, Target]:
             (
                 b"".join(
                     batch_frames.encode_requests(
-                        [(ID, 1.5, b"x"), (ID, 2.0, b"")], frame.origin("ada", TOKEN)
+                        [(ID, 1.5, False, b"x"), (ID, 2.0, True, b"")], frame.origin("ada", TOKEN)
                     )
                 ),
             ),
@@ -242,9 +245,15 @@ def targets() -> dict[str, Target]:
         "batch of answers": Target(
             lambda data: batch_frames.decode_answers(data[:5], data[5:]),
             framed,
-            (b"".join(batch_frames.encode_answers(STAMP, [(ID, b"x", ""), (ID, b"", "lost")])),),
+            (
+                b"".join(
+                    batch_frames.encode_answers(
+                        STAMP, [(ID, NO_LOAD, b"x", ""), (ID, LOAD, b"", "lost")]
+                    )
+                ),
+            ),
         ),
-        "answer": Target(frame.decode_answer, framed, (frame.encode_answer(STAMP, ID),)),
+        "answer": Target(frame.decode_answer, framed, (frame.encode_answer(STAMP, ID, load=LOAD),)),
         "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(STAMP, ID, "lost"),)),
         "cancel": Target(frame.decode_cancel, framed, (frame.encode_cancel([ID, ID]),)),
         "probe": Target(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import FrameError
 from fogft.link import batch_frames, frame
-from fogft.link.frame import NO_STAMP
+from fogft.link.frame import NO_LOAD, NO_STAMP
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.replica.listener import ZenohListener
@@ -24,6 +24,7 @@ from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
+from fogft.requests.load import Load
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -40,11 +41,14 @@ ids = st.binary(min_size=16, max_size=16)
 payloads = st.binary(max_size=40)
 stamps = st.binary(min_size=4, max_size=4)
 ORIGIN = frame.origin("ada", bytes(8))
+loads = st.sampled_from([NO_LOAD, frame.encode_load(Load(3, 1, 2, 0.5, 0.25))])
 requests = st.lists(
-    st.tuples(ids, st.floats(0, frame.REMAINING_LIMIT_S), payloads), min_size=1, max_size=8
+    st.tuples(ids, st.floats(0, frame.REMAINING_LIMIT_S), st.booleans(), payloads),
+    min_size=1,
+    max_size=8,
 )
 answers = st.lists(
-    st.tuples(ids, payloads, st.sampled_from(["", Refusal.CANCELLED, Refusal.LATE])),
+    st.tuples(ids, loads, payloads, st.sampled_from(["", Refusal.CANCELLED, Refusal.LATE])),
     min_size=1,
     max_size=8,
 )
@@ -52,32 +56,34 @@ answers = st.lists(
 
 @given(requests, stamps)
 def test_requests_come_back_in_their_order(
-    sent: list[tuple[bytes, float, bytes]], seen: bytes
+    sent: list[tuple[bytes, float, bool, bytes]], seen: bytes
 ) -> None:
     header, content = batch_frames.encode_requests(sent, ORIGIN, seen=seen)
     found = batch_frames.decode_requests(header, content)
-    assert [(one.request_id, one.remaining_s, payload) for one, payload in found] == sent
+    came = [(one.request_id, one.remaining_s, one.spare, payload) for one, payload in found]
+    assert came == sent
     assert all((one.token, one.robot, one.seen) == (bytes(8), "ada", seen) for one, _ in found)
     assert not any(one.packed or one.may_pack or one.reads_packed for one, _ in found)
 
 
 @given(answers, stamps)
 def test_answers_come_back_in_their_order(
-    sent: list[tuple[bytes, bytes, str]], stamp: bytes
+    sent: list[tuple[bytes, bytes, bytes, str]], stamp: bytes
 ) -> None:
     """A refusal travels in place of its payload."""
     header, content = batch_frames.encode_answers(stamp, sent)
     came, found = batch_frames.decode_answers(header, content)
     assert came == stamp
     assert [(one.request_id, one.refusal) for one in found] == [
-        (id, why or None) for id, _, why in sent
+        (id, why or None) for id, _, _, why in sent
     ]
-    assert [one.payload for one in found] == [None if why else said for _, said, why in sent]
+    assert [one.payload for one in found] == [None if why else said for _, _, said, why in sent]
+    assert [frame.encode_load(one.load) for one in found] == [load for _, load, _, _ in sent]
 
 
 def test_a_batch_is_no_single_frame_and_the_other_way_round() -> None:
     """So that neither is ever taken for the other."""
-    header, content = batch_frames.encode_requests([(bytes(16), 1.0, b"x")], ORIGIN)
+    header, content = batch_frames.encode_requests([(bytes(16), 1.0, False, b"x")], ORIGIN)
     single = frame.encode_request(bytes(16), 1.0, ORIGIN)
     assert batch_frames.is_batch(header)
     assert not batch_frames.is_batch(single)
@@ -87,18 +93,20 @@ def test_a_batch_is_no_single_frame_and_the_other_way_round() -> None:
     with pytest.raises(FrameError):
         batch_frames.decode_requests(single, content)
     with pytest.raises(FrameError):
-        frame.decode_answer(batch_frames.encode_answers(NO_STAMP, [(bytes(16), b"", "")])[0])
+        frame.decode_answer(
+            batch_frames.encode_answers(NO_STAMP, [(bytes(16), NO_LOAD, b"", "")])[0]
+        )
 
 
 @given(requests, st.data())
 def test_a_batch_that_is_cut_is_refused_as_a_whole(
-    sent: list[tuple[bytes, float, bytes]], data: st.DataObject
+    sent: list[tuple[bytes, float, bool, bytes]], data: st.DataObject
 ) -> None:
     """Unless the cut falls between two requests: then the first ones are whole."""
     header, content = batch_frames.encode_requests(sent, ORIGIN)
     ends = [0]
-    for _, _, payload in sent:
-        ends.append(ends[-1] + 16 + 8 + 4 + len(payload))
+    for *_, payload in sent:
+        ends.append(ends[-1] + 16 + 8 + 1 + 4 + len(payload))
     at = data.draw(st.integers(0, len(content) - 1))
     if at and at in ends:
         assert len(batch_frames.decode_requests(header, content[:at])) == ends.index(at)
@@ -109,14 +117,14 @@ def test_a_batch_that_is_cut_is_refused_as_a_whole(
 
 @pytest.mark.parametrize("remaining_s", [-1.0, float("nan"), float("inf")])
 def test_a_time_that_is_none_is_refused(remaining_s: float) -> None:
-    good = (request_id(1), 1.0, b"x")
-    batch = batch_frames.encode_requests([good, (request_id(2), remaining_s, b"y")], ORIGIN)
+    good = (request_id(1), 1.0, False, b"x")
+    batch = batch_frames.encode_requests([good, (request_id(2), remaining_s, False, b"y")], ORIGIN)
     with pytest.raises(FrameError, match="remaining time"):
         batch_frames.decode_requests(*batch)
 
 
 def test_there_is_a_limit_to_what_a_batch_may_claim() -> None:
-    many = [(request_id(n), b"", "") for n in range(batch_frames.LIMIT + 1)]
+    many = [(request_id(n), NO_LOAD, b"", "") for n in range(batch_frames.LIMIT + 1)]
     with pytest.raises(FrameError, match="more than"):
         batch_frames.decode_answers(*batch_frames.encode_answers(NO_STAMP, many))
     most = batch_frames.encode_answers(NO_STAMP, many[:-1])
@@ -376,7 +384,9 @@ def test_a_batch_of_a_stranger_or_of_garbage_is_not_taken(
     try:
         key = keys(0)[SERVICE]
         hears(session, key)
-        header, content = batch_frames.encode_requests([(request_id(1), 5.0, b"x")] * 3, ORIGIN)
+        header, content = batch_frames.encode_requests(
+            [(request_id(1), 5.0, False, b"x")] * 3, ORIGIN
+        )
         session.put(key, content, attachment=header)
         wait_for(lambda: listener.counters().get("not_admitted") == 1)
         assert listener.counters().get("requests") == 3

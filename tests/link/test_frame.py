@@ -15,6 +15,10 @@ from fogft.errors import FrameError
 from fogft.link import frame, probe_frames
 from fogft.link.port import Probe, ProbeAnswer
 from fogft.model.type_definition import Definition
+from fogft.requests.load import Load
+
+LOAD = Load(3, 1, 2, 0.5, 0.25)
+LOAD_BYTES = frame.encode_load(LOAD)
 
 ids = st.binary(min_size=16, max_size=16)
 tokens = st.binary(min_size=8, max_size=8)
@@ -80,15 +84,30 @@ def test_a_request_header_comes_back(
 def test_an_answer_header_comes_back(stamp: bytes, request_id: bytes) -> None:
     """Decoding undoes encoding."""
     for packed in (False, True):
+        header = frame.encode_answer(stamp, request_id, load=LOAD_BYTES, packed=packed)
+        assert frame.decode_answer(header) == (stamp, request_id, LOAD, packed)
         header = frame.encode_answer(stamp, request_id, packed=packed)
-        assert frame.decode_answer(header) == (stamp, request_id, packed)
+        assert frame.decode_answer(header) == (stamp, request_id, None, packed)
 
 
 @given(stamp=stamps, request_id=ids, reason=reasons)
 def test_a_refusal_comes_back(stamp: bytes, request_id: bytes, reason: str) -> None:
     """Decoding undoes encoding."""
-    sent = frame.encode_refusal(stamp, request_id, reason)
-    assert frame.decode_refusal(sent) == (stamp, request_id, reason)
+    sent = frame.encode_refusal(stamp, request_id, reason, LOAD_BYTES)
+    assert frame.decode_refusal(sent) == (stamp, request_id, reason, LOAD)
+
+
+@pytest.mark.parametrize("wrong_s", [-1.0, float("nan"), float("inf"), 1e9])
+def test_a_load_with_a_time_that_is_none_is_refused(wrong_s):
+    for load in (Load(0, 0, 0, wrong_s, 0.0), Load(0, 0, 0, 0.0, wrong_s)):
+        header = frame.encode_answer(frame.NO_STAMP, bytes(16), load=frame.encode_load(load))
+        with pytest.raises(FrameError, match="a load of"):
+            frame.decode_answer(header)
+
+
+def test_a_load_beyond_what_fits_is_told_as_the_most():
+    told = frame.decode_load(frame.encode_load(Load(10**6, 10**6, 10**6, 0.5, 0.5)))
+    assert told == Load(0xFFFF, 0xFF, 0xFF, 0.5, 0.5)
 
 
 @given(token=tokens, certificate=st.binary(max_size=1500), signature=st.binary(min_size=1))

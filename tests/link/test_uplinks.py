@@ -32,8 +32,8 @@ class Owner:
     def answered(self, link, answer) -> None:
         self.answers.append(answer)
 
-    def late(self, link, service, request_id) -> None:
-        self.too_late.append(request_id)
+    def late(self, link, answer) -> None:
+        self.too_late.append(answer.request_id)
 
     def changed(self, link) -> None:
         self.changes += 1
@@ -85,7 +85,7 @@ def test_all_sends_on_each_and_takes_the_first_answer():
     assert [a.payload for a in scene.owner.answers] == [b"a"]
     assert scene.uplinks[0].forgotten == [ID]
     one = scene.uplinks[0]
-    one.events.late(one, "/s", ID)
+    one.events.late(one, Answer(ID, b"a"))
     assert scene.owner.too_late == []  # the replica ran it once: nothing was in vain
 
 

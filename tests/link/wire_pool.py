@@ -18,6 +18,7 @@ from fogft.link.port import Answer, Link, Peer
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths
+from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Role
@@ -97,16 +98,18 @@ class Owner:
         self.answers: list[tuple[int, Answer]] = []
         self.states: list[tuple[int, LinkState]] = []
         self.changes = 0
-        self.too_late: list[tuple[str, bytes]] = []
+        self.too_late: list[tuple[str, bytes]] = []  # forgotten, and worked on
+        self.dropped: list[tuple[str, bytes]] = []  # forgotten, and not worked on
         self._lock = threading.Lock()
 
     def answered(self, link: Link, answer: Answer) -> None:
         with self._lock:
             self.answers.append((link.peer.id.slot, answer))
 
-    def late(self, link: Link, service: str, request_id: bytes) -> None:
+    def late(self, link: Link, answer: Answer) -> None:
         with self._lock:
-            self.too_late.append((service, request_id))
+            worked = answer.payload is not None or answer.refusal is Refusal.LATE
+            (self.too_late if worked else self.dropped).append((answer.service, answer.request_id))
 
     def changed(self, link: Link) -> None:
         with self._lock:

@@ -379,10 +379,16 @@ MISTAKES = {
         "did you mean `empty`?",
     ),
     "unknown hedging": (
-        pool(services="[{name: a, type: a/srv/A, hedging: adaptiv}]"),
-        "pool.yaml:3: fogft.services[0].hedging: must be `all` or `adaptive` or `failover`, "
-        "not `adaptiv`",
-        "did you mean `adaptive`?",
+        pool(services="[{name: a, type: a/srv/A, hedging: failoer}]"),
+        "pool.yaml:3: fogft.services[0].hedging: must be `auto` or `all` or `failover`, "
+        "not `failoer`",
+        "did you mean `failover`?",
+    ),
+    "hedging of another name now": (
+        pool(services="[{name: a, type: a/srv/A, hedging: adaptive}]"),
+        "pool.yaml:3: fogft.services[0].hedging: must be `auto` or `all` or `failover`, "
+        "not `adaptive`",
+        "is called `auto` now, and is the default; write that",
     ),
     "key that is gone": (
         pool(services="[{name: a, type: a/srv/A, hedging_budget: 0.2}]"),

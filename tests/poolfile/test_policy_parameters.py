@@ -45,7 +45,7 @@ values = st.dictionaries(
     st.one_of(
         st.booleans(),
         st.floats(-1, 200),
-        st.sampled_from(["all", "adaptive", "failover", "silent", "empty", "fallback", "", "ok"]),
+        st.sampled_from(["all", "auto", "failover", "silent", "empty", "fallback", "", "ok"]),
         st.sampled_from([a.value for a in Advertise]),
     ),
 )
@@ -81,7 +81,7 @@ def test_what_holds_is_shown_and_nothing_else_has_changed(service, news):
     [
         ({"timeout_s": 0.0}, "timeout_s: must be above 0"),
         ({"timeout_s": "soon"}, "timeout_s: must be a number"),
-        ({"hedging": "some"}, "hedging: must be `all` or"),
+        ({"hedging": "some"}, "hedging: must be `auto` or"),
         ({"on_timeout": "fallback"}, "fallback_service: is missing"),
         ({"trace": "yes"}, "trace: must be true or false"),
         ({"advertise": "never"}, "advertise: must be"),
@@ -105,7 +105,7 @@ def test_a_service_has_its_parameters_under_its_name():
     assert prefix("/arm/plan") == "arm.plan"
     policies = Policies()
     policies.follow([PLAN])
-    assert policies.parameters()["arm.plan.hedging"] == "all"
+    assert policies.parameters()["arm.plan.hedging"] == "auto"
 
 
 def test_a_value_holds_until_the_file_changes_that_key():

@@ -95,7 +95,7 @@ def test_mistakes_name_line_key_and_remedy(state, key, what, hint):
     assert hint in caught.value.hint
 
 
-@pytest.mark.parametrize("line", ["ok_field: success", "hedging: adaptive"])
+@pytest.mark.parametrize("line", ["ok_field: success", "hedging: failover"])
 def test_what_does_not_go_with_state_is_refused(line):
     with pytest.raises(SpecError, match="does not go with `state`"):
         parse(SHORT, f"      {line}\n")

@@ -9,6 +9,7 @@ from fogft.errors import RosError
 from fogft.link.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
+from fogft.requests.load import Load
 
 UID = "0123456789abcdef"
 
@@ -49,6 +50,7 @@ class FakeLink:
         remaining_s: float,
         *,
         more: bool = False,
+        spare: bool = False,
     ) -> bool:
         if len(self.offered) >= self.room:
             return False
@@ -124,7 +126,10 @@ class FakeIncoming:
         service: str = "/s",
         remaining_s=10.0,
         robot: str = "r",
+        spare: bool = False,
     ) -> None:
+        self.spare = spare
+        self.load: Load | None = None
         self.request_id = request_id
         self.payload = payload
         self.service = service
@@ -132,12 +137,13 @@ class FakeIncoming:
         self.remaining_s = remaining_s
         self.outcome: list[Any] = []
 
-    def reply(self, payload: bytes, *, more: bool = False) -> None:
+    def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
         self.outcome.append(payload)
-        self.more = more
+        self.load, self.more = load, more
 
-    def refuse(self, reason: Refusal, detail: str = "") -> None:
+    def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         self.outcome.append(f"refused {reason}")
+        self.load = load
 
 
 class FakeClient:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import pytest
 
@@ -51,13 +52,13 @@ class Carried:
 
     def __init__(self, world, slot, link, offered) -> None:
         self.service, self.request_id, self.payload, self.remaining_s = offered
-        self.robot, self._world, self._slot, self._link = "r", world, slot, link
+        self.robot, self.spare, self._world, self._slot, self._link = "r", False, world, slot, link
         self.ended = False
 
-    def reply(self, payload: bytes, *, more: bool = False) -> None:
+    def reply(self, payload: bytes, **_: Any) -> None:
         self._end(Answer(self.request_id, payload=payload, service=self.service))
 
-    def refuse(self, reason: Refusal) -> None:
+    def refuse(self, reason: Refusal, **_: Any) -> None:
         self._end(Answer(self.request_id, refusal=reason, service=self.service))
 
     def _end(self, answer: Answer) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.choose import NEVER, All, Failover
+from fogft.requests.choose import All, Failover
+from fogft.requests.load import NEVER
 
 A = b"a" * 16
 
@@ -13,15 +14,15 @@ A = b"a" * 16
 def test_all_go_to_everybody_and_all_but_the_winner_stop():
     policy = All()
     assert policy.first(A, (1, 2, 3), 0.0) == (1, 2, 3)
-    assert policy.more({1: 0.0}, (2, 3), 0.0) == (2, 3)
-    assert list(policy.answered(A, {1: 0.0, 2: 0.0, 3: 0.0}, 2, 1.0)) == [1, 3]
+    assert policy.more(A, {1: 0.0}, (2, 3), 0.0) == (2, 3)
+    assert list(policy.answered(A, {1: 0.0, 2: 0.0, 3: 0.0}, 2, None, 1.0)) == [1, 3]
     assert policy.look_at == NEVER
 
 
 def test_failover_keeps_one():
     policy = Failover()
     assert {tuple(policy.first(A, (3, 1, 2), n)) for n in range(5)} == {(3,)}
-    assert policy.more({3: 0.0}, (1, 2), 9.0) == ()
+    assert policy.more(A, {3: 0.0}, (1, 2), 1.9) == ()
     assert policy.switched == 0
 
 
@@ -36,8 +37,8 @@ def test_failover_switches_when_its_replica_is_suspected():
 def test_failover_gives_a_failed_request_to_the_next():
     policy = Failover()
     policy.first(A, (1, 2), 0.0)
-    policy.failed(A, 1, 0.1)
-    assert policy.more({}, (2,), 0.1) == (2,)
+    policy.failed(A, 1, 0.1, fault=True)
+    assert policy.more(A, {}, (2,), 0.1) == (2,)
     assert policy.first(A, (1, 2), 0.2) == (2,)
 
 
@@ -55,7 +56,7 @@ def test_failover_tries_every_replica_in_turn():
     tried = []
     for n in range(4):
         (replica,) = policy.first(A, (0, 1, 2), n)
-        policy.failed(A, replica, n)
+        policy.failed(A, replica, n, fault=True)
         tried.append(replica)
     assert tried == [0, 1, 2, 0]
 
@@ -63,7 +64,7 @@ def test_failover_tries_every_replica_in_turn():
 def test_the_only_replica_is_asked_again_though_it_failed():
     policy = Failover()
     policy.first(A, (1,), 0.0)
-    policy.failed(A, 1, 0.1)
+    policy.failed(A, 1, 0.1, fault=True)
     assert policy.first(A, (1,), 0.2) == (1,)
 
 
@@ -75,6 +76,23 @@ def test_failover_never_sends_two_copies_and_always_one_where_it_can(steps):
         assert len(chosen) == min(1, len(able))
         assert set(chosen) <= able
         for replica in chosen:
-            assert policy.more({replica: float(n)}, sorted(able - {replica}), n + 0.5) == ()
+            assert policy.more(A, {replica: float(n)}, sorted(able - {replica}), n + 0.5) == ()
             if fails:
-                policy.failed(A, replica, n + 0.5)
+                policy.failed(A, replica, n + 0.5, fault=True)
+            else:
+                policy.answered(A, {replica: float(n)}, replica, None, n + 0.9)
+
+
+def test_failover_asks_another_as_well_when_its_one_is_long_overdue():
+    """A frozen service costs a request some of its usual times, and no deadline."""
+    policy = Failover()
+    for n in range(10):
+        policy.first(A, (1, 2), float(n))
+        policy.answered(A, {1: float(n)}, 1, None, n + 0.1)
+    policy.first(A, (1, 2), 20.0)
+    policy.look_at = NEVER
+    assert policy.more(A, {1: 20.0}, (2,), 20.15) == ()
+    assert 20.15 < policy.look_at < 20.3
+    assert policy.more(A, {1: 20.0}, (2,), 20.3) == (2,)
+    assert policy.first(b"b" * 16, (1, 2), 20.4) == (2,)
+    assert policy.report() == {"switched": 1, "hedges": 1}

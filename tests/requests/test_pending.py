@@ -51,7 +51,7 @@ def made(able: Sequence[int] = (1, 2)) -> tuple[PendingRequests[Item], Spy]:
 
 def answer(requests: PendingRequests[Item], replica: int, payload: bytes, now: float = 1.0):
     reading = requests.decide.read(payload)
-    return requests.answered(A, A, replica, payload, reading, now)
+    return requests.answered(A, A, replica, payload, reading, None, now)
 
 
 def test_the_first_success_ends_a_request_and_names_who_stops():
@@ -87,7 +87,11 @@ def test_what_is_refused_for_good_is_not_asked_there_again(refusal):
 
 def test_an_answer_that_is_about_no_request_changes_nothing():
     requests, spy = made()
-    assert requests.answered(b"x" * 16, None, 1, OK, True, 1.0)[1:] == (None, (), Verdict.LATE)
+    assert requests.answered(b"x" * 16, None, 1, OK, True, None, 1.0)[1:] == (
+        None,
+        (),
+        Verdict.LATE,
+    )
     assert (len(requests), spy.ended) == (1, [])
 
 
@@ -121,7 +125,7 @@ def test_each_request_is_closed_once_and_its_bytes_are_given_back(steps):
         now += 0.5
         if what in ("ok", "no"):
             payload = OK if what == "ok" else NO
-            requests.answered(ids[n], ids[n], replica, payload, payload == OK, now)
+            requests.answered(ids[n], ids[n], replica, payload, payload == OK, None, now)
         elif what == "refuse":
             requests.refused(ids[n], replica, Refusal.CRASHED, now)
         elif what == "decline":

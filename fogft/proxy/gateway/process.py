@@ -35,7 +35,7 @@ from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.process import make_dialer
 from fogft.records.signing import Signer, common_name
-from fogft.requests.choose import NEVER
+from fogft.requests.load import NEVER
 
 log = logging.getLogger(__name__)
 

@@ -25,6 +25,7 @@ from fogft.model.refusal import Refusal
 from fogft.proxy.replica.interruption import Interruptions
 from fogft.proxy.replica.known_requests import KnownRequests, Remembered
 from fogft.proxy.replica.service_queue import Job, ServiceQueue
+from fogft.requests.load import Load
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -147,13 +148,14 @@ class Responder:
         elif answer is not None:
             incoming.reply(answer)
         elif reason is not None:
-            self._refuse(incoming, reason)
+            queue = self._queues.get(incoming.service)
+            self._refuse(incoming, reason, None if queue is None else queue.load(0.0))
         else:
             self._pass_on(incoming.service)
 
     def _accept(self, incoming: Incoming, now: float) -> Job | None:
         """Take a request; return it where it is to be passed on at once."""
-        job = Job(now + incoming.remaining_s, incoming)
+        job = Job(now, incoming)
         queue = self._queues[job.service]
         self._known.add(job)
         if queue.open:
@@ -179,11 +181,12 @@ class Responder:
         if not self._is_ready(service) or service not in self._clients:
             return Refusal.NOT_READY, None
         queue = self._queue(service)
+        if incoming.spare and not queue.has_free_slot:
+            return Refusal.BUSY, None
         deadline = now + remaining_s
-        if not queue.open and queue.hopeless(incoming.robot, deadline, remaining_s):
-            return Refusal.OVERLOADED, None
+        hopeless = not queue.open and queue.hopeless(incoming.robot, deadline, remaining_s)
         held_bytes = self._known.held_bytes + len(incoming.payload)
-        if held_bytes > self._held_bytes_limit and self._known.held:
+        if hopeless or (held_bytes > self._held_bytes_limit and self._known.held):
             return Refusal.OVERLOADED, None
         if self._known.held < self._max_in_flight:
             return None, None
@@ -270,12 +273,13 @@ class Responder:
                 elif not job.unwanted:
                     self._known.keep(job, payload)
             more = queue.at_work > 1
+            load = queue.load(now - job.arrived, ended=1)
         try:
             for incoming in waiting:
                 if job.unwanted:  # its bytes would be dropped at the other end
-                    self._refuse(incoming, Refusal.LATE)
+                    self._refuse(incoming, Refusal.LATE, load)
                 else:
-                    incoming.reply(payload, more=more)
+                    incoming.reply(payload, load=load, more=more)
         finally:
             self._over(job, queue, now, wasted=not waiting or job.unwanted)
 
@@ -301,16 +305,19 @@ class Responder:
             waiting, job.waiting = job.waiting, None
             queue = self._queues[job.service]
             queue.remove(job)
+            load = queue.load(
+                self._clock() - job.arrived, ended=job.passed_on and reason is not Refusal.EXPIRED
+            )
             if reason is not Refusal.EXPIRED:
                 queue.free(job)
             elif job.passed_on:
                 queue.overdue(job, self._clock())
         for incoming in waiting:
-            self._refuse(incoming, reason)
+            self._refuse(incoming, reason, load)
 
-    def _refuse(self, incoming: Incoming, reason: Refusal) -> None:
+    def _refuse(self, incoming: Incoming, reason: Refusal, load: Load | None = None) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1
-        incoming.refuse(reason)
+        incoming.refuse(reason, load=load)
 
     def crashed(self, service: str | None = None) -> None:
         """A service, or all with the user's command, has died: refuse what is held for it."""

@@ -15,6 +15,7 @@ from fogft.link.port import Incoming
 from fogft.model.spec import ServiceSpec
 from fogft.requests.admission import AdmissionQueue
 from fogft.requests.concurrency import ConcurrencyLimit
+from fogft.requests.load import Load
 
 # Job whose deadline has passed is still in the service's hands and takes its room. After so
 # long its response is taken for lost.
@@ -25,15 +26,16 @@ class Job:
     """A request that was accepted: who waits for it, and its answer once there is one."""
 
     __slots__ = (
-        *("answer", "begun", "deadline", "id", "level", "passed_on", "payload", "robot"),
+        *("answer", "arrived", "begun", "deadline", "id", "level", "passed_on", "payload", "robot"),
         *("service", "size", "ticket", "unwanted", "waiting"),
     )
 
-    def __init__(self, deadline: float, first: Incoming) -> None:
+    def __init__(self, arrived: float, first: Incoming) -> None:
         self.id = first.request_id
         self.service = first.service
         self.robot = first.robot
-        self.deadline = deadline
+        self.arrived = arrived
+        self.deadline = arrived + first.remaining_s
         self.payload = first.payload
         self.size = len(first.payload)
         self.passed_on = False
@@ -72,6 +74,23 @@ class ServiceQueue:
         """Whether a job that comes now is passed on at once: nothing waits, and there is room."""
         return self.at_work < self.limit.limit and not len(self._waiting)
 
+    @property
+    def has_free_slot(self) -> bool:
+        """Whether nothing waits, and the service can surely begin with one more at once."""
+        return not len(self._waiting) and self.at_work < max(1, self.limit.known)
+
+    def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
+        """Return what there is to do; None while it is not known how long the service takes.
+
+        Args:
+            spent_s: How long the request was here that is answered with it.
+            ended: How many of those at work have just ended.
+        """
+        if not self.limit.service_s:
+            return None
+        waiting, running = len(self._waiting), self.at_work - ended
+        return Load(waiting, running, self.limit.known, self.limit.service_s, spent_s)
+
     def hopeless(self, robot: str, deadline: float, remaining_s: float) -> bool:
         """Whether a request would wait past its deadline, as far as is known."""
         waiting = len(self._waiting)
@@ -86,12 +105,13 @@ class ServiceQueue:
     def take(self, now: float) -> Job | None:
         """Return what is to be passed on next; None when nothing waits, or nothing more may be.
 
-        What it returns may be past its deadline: then it was not begun and takes no room.
+        What it returns may be past its deadline, or about to be while others wait that are not:
+        then it was not begun and takes no room.
         """
         if self.at_work >= self.limit.limit:
             return None
         job = self._waiting.take()
-        if job is not None and job.deadline > now:
+        if job is not None and job.deadline > now + (self.limit.takes_s if self._waiting else 0.0):
             self.begin(job, now)
         return job
 

@@ -30,7 +30,7 @@ from fogft.proxy.robot.sending import key_of
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
 from fogft.proxy.robot.type_check import Define, TypeCheck
 from fogft.records.record import SignedRecord
-from fogft.requests.choose import NEVER
+from fogft.requests.load import NEVER
 from fogft.ros.port import RosNode, RosTopics
 
 log = logging.getLogger(__name__)
@@ -139,10 +139,10 @@ class ClientProxy:
     def _here(self, spec: ServiceSpec) -> ServiceSpec:
         """Return a service's policy as it is here: a request goes to one gateway, not to all.
 
-        The gateway sends it to all replicas. Another gateway is asked where the first is late.
+        The gateway sends it to replicas. Another gateway is asked where the first is late.
         """
-        if self._through_gateways and spec.hedging is HedgingMode.ALL:
-            return replace(spec, hedging=HedgingMode.ADAPTIVE)
+        if self._through_gateways:
+            return replace(spec, hedging=HedgingMode.FAILOVER)
         return spec
 
     # -- membership -----------------------------------------------------------------------
@@ -226,11 +226,11 @@ class ClientProxy:
         """Wake `run_once`: routes are worked out there, not on a link's thread."""
         self._change()
 
-    def late(self, link: Link, service: str, request_id: bytes) -> None:
-        """Pass on that an answer came which nobody awaits."""
-        found = self._services.get(service)
+    def late(self, link: Link, answer: Answer) -> None:
+        """Pass on the end of an attempt that nobody awaits."""
+        found = self._services.get(answer.service)
         if found is not None:
-            found.dispatcher.late(link, request_id)
+            found.dispatcher.late(link, answer)
 
     def _change(self) -> None:
         self._changed = True

@@ -18,9 +18,9 @@ from fogft.log_limits import worth_logging
 from fogft.metrics.outcomes import Outcome
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.request import Ledger, Request
-from fogft.requests.choose import NEVER
 from fogft.requests.fallback import FallbackTimer
 from fogft.requests.first_response import Pending
+from fogft.requests.load import NEVER
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)

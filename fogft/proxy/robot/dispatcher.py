@@ -37,7 +37,7 @@ from fogft.proxy.robot.delivery import Delivery, Respond
 from fogft.proxy.robot.replication import Replication
 from fogft.proxy.robot.request import Ledger, Request
 from fogft.proxy.robot.sending import Sender, key_of
-from fogft.requests.adaptive import policy
+from fogft.requests.auto import policy
 from fogft.requests.decide import Accepts, Decide, FirstSuccess, Means
 from fogft.requests.first_response import Verdict
 from fogft.requests.pending import PendingRequests
@@ -197,7 +197,7 @@ class Dispatcher:
         with self._lock:
             request = attempt if replication is None else replication.request_of(attempt)
             means, pending, losers, verdict = self._requests.answered(
-                attempt, request, replica, payload, reading, now
+                attempt, request, replica, payload, reading, answer.load, now
             )
         if pending is not None and request is not None:
             self._delivery.give(pending, payload)  # first: what is counted can wait
@@ -237,15 +237,27 @@ class Dispatcher:
             log.error("response_malformed service=%s replica=%s count=%d reason=%r",
                       self.spec.name, id.short, count, fault)  # fmt: skip
 
-    def late(self, link: Link, request: bytes) -> None:
-        """Count an answer to a request that its link was told to forget."""
-        self.outcomes.late()
+    def late(self, link: Link, answer: Answer) -> None:
+        """Learn from the end of an attempt that its link was told to forget; its bytes stay unread.
+
+        The replica has worked on it for nothing, or has dropped it.
+        """
+        worked = answer.payload is not None or answer.refusal is Refusal.LATE
+        now, replica, choose = self._clock(), key_of(link), self._requests.choose
+        with self._lock:
+            if answer.load is not None:
+                choose.heard(answer.request_id, replica, answer.load, now)
+            choose.late(answer.request_id, replica, now, answered=worked)
+        if worked:
+            self.outcomes.late()
 
     def _refused(self, id: ReplicaId, replica: int, answer: Answer, refusal: Refusal) -> None:
         """A replica has refused an attempt, or its link has lost it."""
         attempt, replication = answer.request_id, self._replication
         with self._lock:
             request = attempt if replication is None else replication.request_of(attempt)
+            if answer.load is not None:
+                self._requests.choose.heard(attempt, replica, answer.load, self._clock())
             pending = self._requests.get(request)
             self._decide.refused(attempt, replica, refusal, answer.detail, pending)
         self._failed(id, replica, request, refusal)

@@ -16,7 +16,7 @@ from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
 from fogft.proxy.robot.replication import Replication
 from fogft.proxy.robot.request import Ledger
-from fogft.requests.choose import NEVER
+from fogft.requests.load import NEVER
 
 
 class Sender:
@@ -53,9 +53,12 @@ class Sender:
         timeout_s: float,
     ) -> None:  # fmt: skip
         """Offer a new request to those that were chosen for it."""
-        name = self._ledger.spec.name
+        name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
         for replica in chosen:
-            if not links[replica].offer(name, request, payload, timeout_s, more=self._in_burst):
+            spare = is_spare(request, replica)
+            if not links[replica].offer(
+                name, request, payload, timeout_s, more=self._in_burst, spare=spare
+            ):
                 self._declined(request, replica, is_copy=True)
         if len(chosen) > 1 and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
@@ -102,7 +105,7 @@ class Sender:
         with self._ledger.lock:
             requests = self._ledger.requests
             if skip:
-                requests.passed_over(replica)
+                requests.passed_over(request, replica)
                 return False
             pending = requests.attempt(request, replica, now)
             if pending is None:
@@ -146,13 +149,13 @@ class Sender:
                 self._replication.declined(id, replica, self._ledger.clock())
 
     def forget(self, request: bytes, replicas: Iterable[int]) -> None:
-        """Tell replicas that a request has ended, but those that shall go on with it."""
+        """Tell replicas that a request has ended."""
         requests = self._ledger.requests
         if requests.decide.hears_out(request):
             return
         for replica in replicas:
             link = self.links.get(replica)
-            if link is not None and not requests.choose.awaits(request, replica):
+            if link is not None:
                 link.forget(request)
 
 

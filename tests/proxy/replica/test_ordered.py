@@ -43,12 +43,12 @@ class Incoming:
     def __init__(self, scene, link, request_id, payload, robot="r"):
         self.scene, self.link = scene, link
         self.request_id, self.payload, self.robot = request_id, payload, robot
-        self.service, self.remaining_s = "/s", 60.0
+        self.service, self.remaining_s, self.spare = "/s", 60.0, False
 
-    def reply(self, payload):
+    def reply(self, payload, **_):
         self.scene.answers.append((self.link, Answer(self.request_id, payload=payload)))
 
-    def refuse(self, reason, detail=""):
+    def refuse(self, reason, detail="", **_):
         answer = Answer(self.request_id, refusal=reason, detail=detail)
         self.scene.answers.append((self.link, answer))
 

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.interruption import EMPTY_REQUEST
 from fogft.proxy.replica.responder import Remembered, Responder
+from fogft.requests.load import Load
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
 
 A = b"a" * 16
 NOTHING = Remembered(0, 0, 0, 0)
-B = b"b" * 16
+B, C, D = b"b" * 16, b"c" * 16, b"d" * 16
 
 
 class Scene:
@@ -55,13 +56,74 @@ def test_an_answer_leaves_before_it_is_counted_and_makes_room_after():
     scene = Scene(limits={"/s": 1})
     first, second = scene.ask(A), scene.ask(B)
     ran_s: list[float] = []
-    first.reply = lambda payload, more: ran_s.append(scene.responder.ran_s)
+    first.reply = lambda payload, **_: ran_s.append(scene.responder.ran_s)
     scene.clock.now += 1.0
     scene.answer(0)
     assert (ran_s, scene.responder.ran_s) == ([0.0], 1.0)
     scene.answer(1)
     assert second.outcome == [b"r"]
     assert scene.responder.in_flight == 0
+
+
+def test_a_spare_copy_is_dropped_where_it_would_have_to_wait_and_that_is_told():
+    """A service of which nothing is known is taken to do one thing at a time."""
+    scene = Scene()
+    scene.ask(A)
+    spare = FakeIncoming(B, spare=True)
+    scene.responder.request(spare)
+    assert spare.outcome == ["refused busy"]
+    scene.clock.now += 0.5
+    scene.answer(0)
+    spare = FakeIncoming(B, spare=True)
+    scene.responder.request(spare)
+    scene.answer(1)
+    assert spare.outcome == [b"r"]
+
+
+def test_a_spare_copy_of_what_is_at_work_joins_it():
+    scene = Scene()
+    first = scene.ask(A)
+    copy = FakeIncoming(A, spare=True)
+    scene.responder.request(copy)
+    scene.answer(0)
+    assert (first.outcome, copy.outcome) == ([b"r"], [b"r"])
+
+
+def test_each_end_tells_the_load_without_what_has_just_ended():
+    """What waits and runs, the limit where it is known, the time that one takes and took."""
+    scene = Scene(limits={"/s": 2})
+    alone = scene.ask(D)
+    scene.clock.now += 0.5
+    scene.answer(0)
+    assert alone.load is None  # nothing was known when it left
+    first, second, third = scene.ask(A), scene.ask(B), scene.ask(C)
+    scene.clock.now += 0.5
+    scene.answer(1)
+    assert first.load == Load(waiting=1, running=1, slots=2, service_s=0.5, spent_s=0.5)
+    scene.responder.cancel([C])  # it has begun, so it goes on
+    scene.clock.now += 0.5
+    scene.answer(2)
+    assert second.load == Load(0, 1, 2, pytest.approx(0.5), 1.0)
+    scene.answer(3)
+    assert third.outcome == ["refused late"]
+    assert third.load == Load(0, 0, 2, pytest.approx(0.5, abs=0.05), 1.0)
+
+
+def test_what_would_miss_its_deadline_is_not_begun_while_others_would_not():
+    """Over capacity, work for those that come too late would cost the answers of the others."""
+    scene = Scene(limits={"/s": 1})
+    scene.ask(A)
+    scene.clock.now += 1.0
+    scene.answer(0)  # it takes a second
+    scene.ask(B)
+    hurried = FakeIncoming(C, remaining_s=1.5)
+    scene.responder.request(hurried)
+    patient = scene.ask(D)
+    scene.clock.now += 1.0
+    scene.answer(1)
+    assert hurried.outcome == ["refused expired"]
+    scene.answer(2)
+    assert patient.outcome == [b"r"]
 
 
 def test_a_copy_joins_the_work_in_progress():
@@ -77,7 +139,7 @@ def test_a_reply_that_cannot_be_sent_keeps_no_room():
     scene = Scene(limits={"/s": 1})
     first, second = scene.ask(A), scene.ask(B)
 
-    def fail(payload: bytes, *, more: bool = False) -> None:
+    def fail(payload: bytes, **_: object) -> None:
         raise RuntimeError("can't start new thread")
 
     first.reply = fail

@@ -12,10 +12,13 @@ from fogft.link.port import Answer, Link, LinkStatus, Peer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
+from fogft.proxy.replica.responder import Responder
 from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.requests.load import Load
 
 UID = "0123456789abcdef"
 TICK_S = 0.02
+TELL_S = 0.01  # until a replica is told what is not wanted any more
 
 ServiceTime = Callable[[random.Random], float]
 
@@ -30,24 +33,81 @@ def lognormal(median_s: float, sigma: float, stalls: float = 0.0, stall_s: float
     return sample
 
 
-class SimulatedLink:
-    """A replica that works on all its requests at once, or on one after the other."""
+class SimulatedService:
+    """A service that works on all its requests at once, or on one after the other."""
 
-    def __init__(
-        self, world: World, slot: int, service_time: ServiceTime, *, serial: bool = False
-    ) -> None:
-        self.peer = Peer(ReplicaId(UID, slot, 1), f"h{slot}:1", f"replica.{slot}")
+    def __init__(self, world: World, service_time: ServiceTime, seed: int, *, serial: bool) -> None:
         self.world = world
         self.service_time = service_time
         self.serial = serial
-        self.source = random.Random(slot)
+        self.source = random.Random(seed)
+        self.free_at = 0.0
+        self.hangs_until = 0.0
+        self.ran = 0
+
+    def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
+        self.ran += 1
+        now = max(self.world.now, self.hangs_until)
+        end = (max(now, self.free_at) if self.serial else now) + self.service_time(self.source)
+        self.free_at = end
+        self.world.at(end, lambda: self._end(payload, on_response))
+        return self.ran
+
+    def _end(self, payload: bytes, on_response: Callable[[bytes], None]) -> None:
+        if self.world.now < self.hangs_until:  # it hung while it was at this
+            self.world.at(self.hangs_until, lambda: on_response(payload))
+        else:
+            on_response(payload)
+
+    def forget(self, ticket: int) -> None:
+        pass
+
+
+class SimulatedIncoming:
+    """A request at a replica, whose answer travels back."""
+
+    def __init__(self, link: SimulatedLink, id: bytes, payload: bytes, *, spare: bool) -> None:
+        self.service, self.robot, self.remaining_s = "/s", link.world.robot, link.world.timeout_s
+        self.request_id, self.payload, self.spare = id, payload, spare
+        self._link: SimulatedLink | None = link
+
+    def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
+        self._answer(Answer(self.request_id, payload, service="/s", load=load))
+
+    def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
+        self._answer(Answer(self.request_id, refusal=reason, service="/s", load=load))
+
+    def _answer(self, answer: Answer) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.comes_back(answer)
+
+
+class SimulatedLink:
+    """A link to a replica: the real responder before a simulated service."""
+
+    def __init__(self, world: World, replica: SimulatedReplica, slot: int, rtt_s: float) -> None:
+        self.peer = Peer(ReplicaId(UID, slot, 1), f"h{slot}:1", f"replica.{slot}")
+        self.world = world
+        self.replica = replica
+        self.rtt_s = rtt_s
         self.ready = frozenset({"/s"})
         self.usable, self.draining = True, False
-        self.free_at = 0.0
-        self.frozen = False
-        self.open: dict[bytes, int] = {}
+        self.open: set[bytes] = set()
+        self.forgotten: set[bytes] = set()
         self.offers = 0
-        self._attempts = count()
+
+    @property
+    def frozen(self) -> bool:
+        return self.replica.frozen
+
+    @frozen.setter
+    def frozen(self, value: bool) -> None:
+        self.replica.frozen = value
+
+    @property
+    def source(self) -> random.Random:
+        return self.replica.service.source
 
     def offer(
         self,
@@ -57,38 +117,56 @@ class SimulatedLink:
         remaining_s: float,
         *,
         more: bool = False,
+        spare: bool = False,
     ) -> bool:
         if not self.usable or request_id in self.open:
             return False
         self.offers += 1
-        attempt = self.open[request_id] = next(self._attempts)
-        begin = max(self.world.now, self.free_at) if self.serial else self.world.now
-        end = begin + self.service_time(self.source)
-        self.free_at = end
-        if not self.frozen:
-            self.world.at(end, lambda: self._end(request_id, attempt, payload))
-        self.world.at(self.world.now + remaining_s, lambda: self._end(request_id, attempt, None))
+        self.open.add(request_id)
+        incoming = SimulatedIncoming(self, request_id, payload, spare=spare)
+        incoming.remaining_s = remaining_s
+        self.world.at(self.world.now + self.rtt_s / 2, lambda: self._arrives(incoming))
+        lost = Answer(request_id, refusal=Refusal.LOST, service="/s")
+        self.world.at(self.world.now + remaining_s, lambda: self._end(lost))
         return True
+
+    def _arrives(self, incoming: SimulatedIncoming) -> None:
+        if self.usable and not self.frozen:
+            self.replica.responder.request(incoming)
+
+    def comes_back(self, answer: Answer) -> None:
+        if self.usable and not self.frozen:
+            self.world.at(self.world.now + self.rtt_s / 2, lambda: self._end(answer))
+
+    def _end(self, answer: Answer) -> None:
+        if answer.request_id in self.open:
+            self.open.discard(answer.request_id)
+            self.world.dispatcher.answered(self, answer)
+        elif answer.request_id in self.forgotten:
+            self.forgotten.discard(answer.request_id)
+            self.world.dispatcher.late(self, answer)
 
     def send(self) -> None:
         pass
 
-    def _end(self, request: bytes, attempt: int, payload: bytes | None) -> None:
-        if self.open.get(request) == attempt:
-            del self.open[request]
-            refusal = None if payload is not None else Refusal.LOST
-            answer = Answer(request, payload=payload, refusal=refusal, service="/s")
-            self.world.dispatcher.answered(self, answer)
-
     def lose(self) -> None:
         """The link is suspect: what is open on it is lost."""
         self.usable = False
-        for request, attempt in list(self.open.items()):
-            self._end(request, attempt, None)
+        self.forgotten.clear()
+        for request in list(self.open):
+            self._end(Answer(request, refusal=Refusal.LOST, service="/s"))
         self.world.route()
 
     def forget(self, request_id: bytes) -> None:
-        self.open.pop(request_id, None)
+        if request_id in self.open:
+            self.open.discard(request_id)
+            self.forgotten.add(request_id)
+            told = self.world.now + TELL_S + self.rtt_s / 2
+            self.world.at(told, lambda: self._cancel(request_id))
+
+    def _cancel(self, request_id: bytes) -> None:
+        if request_id in self.forgotten and self.usable and not self.frozen:
+            self.replica.responder.cancel([request_id])
 
     def flush(self) -> None:
         pass
@@ -100,13 +178,68 @@ class SimulatedLink:
         self.usable = False
 
 
-class World:
-    """Time, replicas, and one service's dispatcher. Responses are kept with their moments."""
+class SimulatedReplica:
+    """A service with the real responder before it; several robots may have links to it."""
 
-    def __init__(self, hedging: HedgingMode, *, timeout_s: float = 10.0, budget: float = 0.1):
+    def __init__(
+        self, world: World, service_time: ServiceTime, seed: int, *, serial: bool = False
+    ) -> None:
+        self.world = world
+        self.service = SimulatedService(world, service_time, seed, serial=serial)
+        self.responder = Responder(lambda name: True, clock=lambda: world.now)
+        self.responder.use({"/s": self.service})
+        self.frozen = False
+        self._tick()
+
+    def _tick(self) -> None:
+        if not self.frozen:
+            self.responder.tick()
+        self.world.at(self.world.now + 0.1, self._tick)
+
+
+class Timeline:
+    """Simulated time, and what happens in it."""
+
+    def __init__(self) -> None:
         self.now = 1000.0
+        self.ids = random.Random(5)
+        self.robots = 0
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._order = count()
+
+    def at(self, when: float, what: Callable[[], None]) -> None:
+        heapq.heappush(self._events, (when, next(self._order), what))
+
+    def run(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self._events and self._events[0][0] <= end:
+            self.now, _, what = heapq.heappop(self._events)
+            what()
+        self.now = end
+
+
+class World:
+    """Time, replicas, and one robot's dispatcher. Responses are kept with their moments.
+
+    Args:
+        hedging: The policy.
+        timeout_s: Of each request.
+        budget: Of late hedges.
+        beside: Another robot's world, whose time and replicas this one shares.
+    """
+
+    def __init__(
+        self,
+        hedging: HedgingMode,
+        *,
+        timeout_s: float = 10.0,
+        budget: float = 0.1,
+        beside: World | None = None,
+    ) -> None:
+        self.time = Timeline() if beside is None else beside.time
+        self.time.robots += 1
+        self.robot = f"robot{self.time.robots}"
+        self.timeout_s = timeout_s
         self.links: list[SimulatedLink] = []
         self.asked: dict[int, float] = {}
         self.answers: list[tuple[int, float, bytes]] = []
@@ -121,9 +254,20 @@ class World:
         )
         self._tick_at = self.now
         self._tick()
+        for link in () if beside is None else beside.links:
+            self.links.append(SimulatedLink(self, link.replica, len(self.links), link.rtt_s))
+        self.route()
 
-    def replica(self, service_time: ServiceTime, **options: bool) -> SimulatedLink:
-        link = SimulatedLink(self, len(self.links), service_time, **options)
+    @property
+    def now(self) -> float:
+        return self.time.now
+
+    def replica(
+        self, service_time: ServiceTime, *, serial: bool = False, rtt_s: float = 0.002
+    ) -> SimulatedLink:
+        slot = len(self.links)
+        replica = SimulatedReplica(self, service_time, slot, serial=serial)
+        link = SimulatedLink(self, replica, slot, rtt_s)
         self.links.append(link)
         self.route()
         return link
@@ -137,7 +281,7 @@ class World:
         self.dispatcher.adopt(self.spec)
 
     def at(self, when: float, what: Callable[[], None]) -> None:
-        heapq.heappush(self._events, (when, next(self._order), what))
+        self.time.at(when, what)
 
     def _wake(self) -> None:
         self._plan_tick(self.now)
@@ -152,16 +296,13 @@ class World:
     def ask(self) -> int:
         number = len(self.asked)
         self.asked[number] = self.now
-        self.dispatcher.submit(b"%d" % number, number)
+        id = self.time.ids.randbytes(16)  # which the policy takes its chances by
+        self.dispatcher.forward(id, b"%d" % number, number, self.timeout_s)
         return number
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
-        end = self.now + seconds
-        while self._events and self._events[0][0] <= end:
-            self.now, _, what = heapq.heappop(self._events)
-            what()
-        self.now = end
+        self.time.run(seconds)
 
     def calls(self, requests: int, pause_s: float = 0.01) -> None:
         """Ask one after the other, as a caller that waits for each answer does."""

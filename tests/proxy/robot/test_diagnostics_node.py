@@ -76,10 +76,10 @@ def test_health_policies_log_and_metrics_are_seen_and_set(parts):
         levels = {name: status.level for name, status in person.statuses.items()}
         assert levels["fogft p: replica 0.1"] == b"\x00"
 
-        assert person.get("/fogft_p", "plan.timeout_s", "plan.hedging") == [45.0, "all"]
+        assert person.get("/fogft_p", "plan.timeout_s", "plan.hedging") == [45.0, "auto"]
         refused = person.set("/fogft_p", plan__hedging="some")
         assert not refused.successful
-        assert "`all` or `adaptive`" in refused.reason
+        assert "`auto` or `all`" in refused.reason
         assert not person.set("/fogft_p", plan__ok_field="plan").successful  # no boolean
         assert person.set("/fogft_p", plan__hedging="failover").successful
         person.wait(

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from fogft.errors import RosError
 from fogft.model.cdr import Shape
 from fogft.model.refusal import Refusal
-from fogft.model.spec import OnTimeout, ServiceSpec
+from fogft.model.spec import HedgingMode, OnTimeout, ServiceSpec
 from fogft.proxy.robot.dispatcher import MALFORMED_LIMIT, Dispatcher
 from fogft.proxy.robot.sending import key_of
 from tests.proxy.fakes import Clock, FakeLink
+
+ALL = HedgingMode.ALL
 
 
 class Scene:
@@ -32,7 +34,7 @@ class Scene:
             spec["ok_field"] = "ok"
             options["ok_of"] = {"ok": is_ok}.__getitem__
         self.dispatcher = Dispatcher(
-            ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, **spec),
+            ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, **{"hedging": ALL, **spec}),
             lambda handle, payload: self.responses.append((handle, payload)),
             clock=self.clock,
             **options,

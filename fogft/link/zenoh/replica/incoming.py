@@ -13,6 +13,7 @@ from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model.refusal import Refusal
+from fogft.requests.load import Load
 
 
 class ZenohIncoming:
@@ -60,19 +61,24 @@ class ZenohIncoming:
         return self._header.remaining_s
 
     @property
+    def spare(self) -> bool:
+        """Whether it is to be dropped where it would have to wait."""
+        return self._header.spare
+
+    @property
     def payload(self) -> bytes:
         """The serialised request (CDR)."""
         return self._payload
 
-    def reply(self, payload: bytes, *, more: bool = False) -> None:
+    def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
         """Send the serialised response. Never blocks. With `more`, others will soon follow."""
-        self._send(payload, "", more=more)
+        self._send(payload, "", load, more=more)
 
-    def refuse(self, reason: Refusal, detail: str = "") -> None:
+    def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal. Never blocks."""
-        self._send(b"", reason.text(detail), more=True)
+        self._send(b"", reason.text(detail), load, more=True)
 
-    def _send(self, payload: bytes, refusal: str, *, more: bool) -> None:
+    def _send(self, payload: bytes, refusal: str, load: Load | None, *, more: bool) -> None:
         try:
             stream = self._streams.pop()
         except IndexError:
@@ -80,7 +86,7 @@ class ZenohIncoming:
         self._payload = b""
         header = self._header
         packs = header.may_pack or (header.reads_packed and self._thin(header.token))
-        reply = Reply(stream, header.request_id, payload, refusal, may_pack=packs)
+        reply = Reply(stream, header.request_id, payload, refusal, load=load, may_pack=packs)
         self._queues.put(header.token, header.robot, reply, more=more)
 
     def __del__(self) -> None:

@@ -26,6 +26,7 @@ from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
 from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.model.refusal import Refusal
+from fogft.requests.load import Load
 
 log = logging.getLogger(__name__)
 
@@ -35,10 +36,11 @@ class Reply:
 
     Attributes:
         stream: Whose query it is a reply to.
+        load: What the replica has to do, as `frame.encode_load` writes it.
         may_pack: It may be compressed: its robot's link was seen to be thin.
     """
 
-    __slots__ = ("may_pack", "payload", "refusal", "request_id", "stream")
+    __slots__ = ("load", "may_pack", "payload", "refusal", "request_id", "stream")
 
     def __init__(
         self,
@@ -47,9 +49,11 @@ class Reply:
         payload: bytes,
         refusal: str,
         *,
+        load: Load | None = None,
         may_pack: bool = False,
     ) -> None:
         self.stream = stream
+        self.load = frame.encode_load(load)
         self.request_id = request_id
         self.payload = payload
         self.refusal = refusal
@@ -73,10 +77,12 @@ class Reply:
         """
         query = self.stream.query
         if self.refusal:
-            query.reply_err(frame.encode_refusal(stamp, self.request_id, self.refusal))
+            query.reply_err(frame.encode_refusal(stamp, self.request_id, self.refusal, self.load))
             return
         packed = Compression().pack(self.payload, THIN_BYTES_PER_S) if self.may_pack else None
-        header = frame.encode_answer(stamp, self.request_id, packed=packed is not None)
+        header = frame.encode_answer(
+            stamp, self.request_id, load=self.load, packed=packed is not None
+        )
         payload = self.payload if packed is None else packed
         self.payload = b""
         query.reply(query.key_expr, payload, attachment=header)
@@ -92,7 +98,7 @@ def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
         replies[0].send(stamp)
         return
     header, content = batch_frames.encode_answers(
-        stamp, [(reply.request_id, reply.payload, reply.refusal) for reply in replies]
+        stamp, [(reply.request_id, reply.load, reply.payload, reply.refusal) for reply in replies]
     )
     query = replies[0].stream.query
     query.reply(query.key_expr, content, attachment=header)

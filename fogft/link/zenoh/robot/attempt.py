@@ -22,7 +22,9 @@ from fogft.model.refusal import Refusal
 class OpenAttempt:
     """A request on its way through one connection."""
 
-    __slots__ = ("deadline", "mark", "offered", "payload", "request_id", "service", "size")
+    __slots__ = (
+        *("deadline", "mark", "offered", "payload", "request_id", "service", "size", "spare"),
+    )
 
     def __init__(
         self,
@@ -32,8 +34,10 @@ class OpenAttempt:
         *,
         offered: float,
         remaining_s: float,
+        spare: bool = False,
     ) -> None:
         self.service = service
+        self.spare = spare
         self.request_id = request_id
         self.payload: bytes | None = payload  # None once it was sent, or is not wanted
         self.size = len(payload)
@@ -51,22 +55,23 @@ def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:
     ok = reply.ok
     if ok is None:
         err = reply.err
-        stamp, id, said = frame.decode_refusal(b"" if err is None else err.payload.to_bytes())
+        content = b"" if err is None else err.payload.to_bytes()
+        stamp, id, said, load = frame.decode_refusal(content)
         kind, detail = refusal.read(said)
-        return stamp, (Answer(id, refusal=kind, detail=detail),)
+        return stamp, (Answer(id, refusal=kind, detail=detail, load=load),)
     attachment = ok.attachment
     if attachment is None:
         raise FrameError("an answer without a header")
     header, payload = attachment.to_bytes(), ok.payload.to_bytes()
     if batch_frames.is_batch(header):
         return batch_frames.decode_answers(header, payload)
-    stamp, id, packed = frame.decode_answer(header)
+    stamp, id, load, packed = frame.decode_answer(header)
     if packed:
         try:
             payload = unpack(payload)
         except ValueError:
             return stamp, (Answer(id, None, Refusal.MALFORMED),)
-    return stamp, (Answer(id, payload),)
+    return stamp, (Answer(id, payload, load=load),)
 
 
 LIMIT = 8192  # the window holds 512; a replica that never answers what was forgotten holds no more

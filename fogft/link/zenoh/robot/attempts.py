@@ -71,14 +71,14 @@ class Callbacks:
 
     Attributes:
         answered: An attempt has ended; once for each.
-        late: A request that was forgotten (service, id) was answered.
+        late: An attempt has ended that was forgotten.
         room: A window that was full has room again.
         large: Something large is sent, and `Attempts.watched` was not set.
         lost: The connection is of no more use. Perhaps more than once.
     """
 
     answered: Callable[[Answer], None]
-    late: Callable[[str, bytes], None]
+    late: Callable[[Answer], None]
     room: Callable[[], None]
     large: Callable[[], None]
     lost: Callable[[], None]
@@ -158,12 +158,15 @@ class Attempts:
         remaining_s: float,
         *,
         more: bool = False,
+        spare: bool = False,
     ) -> bool:
         """Take an attempt, or return False. Never blocks. With `more`, `send` must follow."""
         if service not in self._services or self._queue.qsize() >= _QUEUE_LIMIT:
             return False
         now = time.monotonic()
-        attempt = OpenAttempt(service, request_id, payload, offered=now, remaining_s=remaining_s)
+        attempt = OpenAttempt(
+            service, request_id, payload, offered=now, remaining_s=remaining_s, spare=spare
+        )
         if not self._deadline.may_arrive(attempt, remaining_s, now, self._before):
             return False
         if not self.window.admit(attempt) and not self._displace(attempt):
@@ -191,7 +194,7 @@ class Attempts:
             self._publish(attempt, payload, max(remaining_s, 0.0))
         except Exception as error:  # whatever it is, the attempt must end
             self._outlet.lose(f"sending failed: {error}")
-            self._end(attempt, None, Refusal.LOST)
+            self._end(attempt, Refusal.LOST)
 
     def send(self) -> None:
         """Send what was offered with `more`. Never blocks: it was small, and reserved."""
@@ -208,7 +211,8 @@ class Attempts:
             payload = attempt.payload  # read once, as in `_send`
             attempt.payload = None
             if payload is not None and self.window.holds(attempt):
-                parts.append((attempt.request_id, max(attempt.deadline - now, 0.0), payload))
+                remaining_s = max(attempt.deadline - now, 0.0)
+                parts.append((attempt.request_id, remaining_s, attempt.spare, payload))
                 self._unanswered.add(attempt)
         if not parts:
             return
@@ -218,7 +222,7 @@ class Attempts:
         except Exception as error:  # whatever it is, the attempts must end
             self._outlet.lose(f"sending failed: {error}")
             for attempt in attempts:
-                self._end(attempt, None, Refusal.LOST)
+                self._end(attempt, Refusal.LOST)
 
     def _before(self, service: str) -> list[OpenAttempt]:
         """Return what leaves before an attempt that comes now."""
@@ -240,7 +244,7 @@ class Attempts:
         stale = self._queue.stalest(attempt)
         if stale is None:
             return False
-        self._end(stale, None, Refusal.SUPERSEDED)
+        self._end(stale, Refusal.SUPERSEDED)
         return self.window.admit(attempt)
 
     def forget(self, request_id: bytes) -> None:
@@ -265,17 +269,13 @@ class Attempts:
             self._telling = True
             self._queue.put(_TELL)
 
-    def _end(
-        self,
-        attempt: OpenAttempt,
-        payload: bytes | None,
-        refusal: Refusal | None = None,
-        detail: str = "",
-    ) -> None:
+    def _end(self, attempt: OpenAttempt, refusal: Refusal) -> None:
+        self._close(attempt, Answer(attempt.request_id, refusal=refusal))
+
+    def _close(self, attempt: OpenAttempt, answer: Answer) -> None:
         if self.window.remove(attempt):
             attempt.payload = None
-            service = attempt.service
-            self._answered(Answer(attempt.request_id, payload, refusal, service, detail))
+            self._answered(answer._replace(service=attempt.service))
             if self.window.regained_room():
                 self._room()
 
@@ -308,7 +308,7 @@ class Attempts:
             self._send(attempt)
         except Exception as error:  # whatever it is, the attempt must end
             self._outlet.lose(f"sending failed: {error}")
-            self._end(attempt, None, Refusal.LOST)
+            self._end(attempt, Refusal.LOST)
 
     def _send(self, attempt: OpenAttempt) -> None:
         payload = attempt.payload  # read once: `forget` may take it away at any moment
@@ -316,10 +316,10 @@ class Attempts:
             return  # forgotten while it waited
         remaining_s = attempt.deadline - time.monotonic()
         if remaining_s <= 0:
-            self._end(attempt, None, Refusal.LOST)
+            self._end(attempt, Refusal.LOST)
             return
         if not self._deadline.may_arrive(attempt, remaining_s, time.monotonic()):
-            self._end(attempt, None, Refusal.TOO_SLOW)
+            self._end(attempt, Refusal.TOO_SLOW)
             return
         attempt.payload = None
         large = attempt.size >= LARGE_BYTES
@@ -359,6 +359,7 @@ class Attempts:
             packed=packed is not None,
             may_pack=compression is not None and self._flow.thin,
             reads_packed=self.packs_answers and compression is not None,
+            spare=attempt.spare,
         )
         content = payload if packed is None else packed
         self._outlet.publish(attempt.service, content, header)
@@ -378,12 +379,11 @@ class Attempts:
         if answer.payload is not None:
             self._credit.heard(attempt.mark)  # requests of one connection arrive in order
         if self.window.holds(attempt):
-            self._end(attempt, answer.payload, answer.refusal, answer.detail)
+            self._close(attempt, answer)
             return
         if self._cancellations is not None:  # it was forgotten, or has ended
             self._cancellations.answered(answer.request_id)
-        if answer.payload is not None or answer.refusal is Refusal.LATE:
-            self._late(attempt.service, answer.request_id)
+        self._late(answer._replace(service=attempt.service))
 
     # -- the link's thread ----------------------------------------------------------------
 
@@ -409,7 +409,7 @@ class Attempts:
         now = time.monotonic()
         for attempt in self.window.attempts():
             if attempt.deadline <= now:
-                self._end(attempt, None, Refusal.LOST)
+                self._end(attempt, Refusal.LOST)
 
     def close(self) -> None:
         """Take nothing more: what is open is lost. Returns at once; `end` must follow."""

@@ -255,7 +255,7 @@ class Connection:
 
     def _probe_refused(self, content: bytes) -> None:
         try:
-            _, _, said = frame.decode_refusal(content)
+            _, _, said, _ = frame.decode_refusal(content)
         except FrameError:
             return  # Zenoh's own: it timed out, and the link's thread counts the silence
         words = _REFUSED.get(refusal.read(said)[0], f"the replica refuses our probes: {said}")

@@ -128,11 +128,12 @@ class ZenohLink:
         remaining_s: float,
         *,
         more: bool = False,
+        spare: bool = False,
     ) -> bool:
         """Take one attempt, or return False. Never blocks. With `more`, `send` must follow."""
         live = self._live
         return live is not None and live.attempts.offer(
-            service, request_id, payload, remaining_s, more=more
+            service, request_id, payload, remaining_s, more=more, spare=spare
         )
 
     def send(self) -> None:
@@ -453,9 +454,9 @@ class ZenohLink:
         except Exception:  # in Zenoh's thread nobody else would tell of it
             log.exception("answer_not_taken request=%s", answer.request_id.hex())
 
-    def _late(self, service: str, request_id: bytes) -> None:
+    def _late(self, answer: Answer) -> None:
         if not self._closed:
-            self._events.late(self, service, request_id)
+            self._events.late(self, answer)
 
     def _changed(self) -> None:
         try:

@@ -1,0 +1,292 @@
+"""Hedging that follows the load: every replica while they are idle, one when they are full. Pure.
+
+* **The first copy** goes where it is expected to be answered first: round trip, and one service
+  time for it and each request before it. A replica that is doubted, or that fails, comes last.
+* **Spare copies** go at once to every other replica that is believed to be free, so the first
+  answer wins and the loss of a replica is not even seen. A replica drops a spare copy that would
+  have to wait. While spares make other requests wait for longer than they save, fewer requests get
+  them; as the wait goes, all of them do again.
+* **A late hedge**: an attempt that takes longer than 95 % of that replica's recent answers is
+  hedged at a free replica, if the budget has a token.
+* **Doubt**: a replica with such an attempt, that has ended nothing since that began, is doubted
+  until it does. What it has goes to another one at once, which costs no token; so does what
+  nobody works on (refused, link suspect, replica gone).
+
+Laws: a request always has a copy that is no spare; late hedges <= capacity + share * requests.
+
+Owns: the choice, the budget, and how many requests get spare copies.
+Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from fogft.model.spec import HedgingMode, Part, ServiceSpec
+from fogft.requests.choose import All, Choose, Failover
+from fogft.requests.load import NEVER, Load, ReplicaLoad
+
+BUDGET_CAPACITY = 10.0
+TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
+_DOUBTED_TRIAL_EVERY_S = 1.0
+FEWEST_SPARES = 0.01
+_CUT = 0.5
+_RECOVERED_AFTER = 1000.0  # service times without a wait, until every request has spares again
+_MEMORY = 0.98  # of what spares saved and cost, from one request to the next
+_RETRY_S = 0.02
+
+
+class TokenBucket:
+    """Tokens for extra copies: a share of what was asked for, and a little to begin with.
+
+    Tokens come with requests, not with time: a service that is asked once a minute and one that is
+    asked a thousand times a second both send the same share of extra copies.
+
+    Law: after n requests at most ``capacity + share * n`` copies were taken.
+
+    Args:
+        share: Tokens that each request brings, above 0 and at most 1.
+        capacity: The most that are kept, and how many there are at first.
+    """
+
+    def __init__(self, share: float, capacity: float) -> None:
+        self._share = share
+        self._capacity = capacity
+        self._tokens = capacity
+
+    @property
+    def tokens(self) -> float:
+        """What is there now."""
+        return self._tokens
+
+    def request(self) -> None:
+        """Count a request."""
+        self._tokens = min(self._capacity, self._tokens + self._share)
+
+    def take(self) -> bool:
+        """Take a token, if there is one."""
+        if self._tokens < 1.0:
+            return False
+        self._tokens -= 1.0
+        return True
+
+
+class Spares:
+    """Which requests get spare copies: all, unless these cost more waiting than they save.
+
+    Attributes:
+        share: Of requests that get them.
+    """
+
+    def __init__(self) -> None:
+        self.share = 1.0
+        self._saved_s = 0.0
+        self._cost_s = 0.0
+        self._at: float | None = None
+        self.open: dict[tuple[bytes, int], float] = {}  # when each was sent that has not ended
+
+    def request(self, service_s: float, now: float) -> None:
+        """A request comes: let the share recover, and the past fade."""
+        self._saved_s *= _MEMORY
+        self._cost_s *= _MEMORY
+        if self._at is not None and self.share < 1.0:
+            passed = (now - self._at) / max(service_s, 1e-4) / _RECOVERED_AFTER
+            self.share = min(1.0, self.share + passed)
+        self._at = now
+
+    def chosen(self, request: bytes) -> bool:
+        """Whether a request gets spares. By its id, which is random."""
+        return int.from_bytes(request[:2], "big") < self.share * 65536
+
+    def saved(self, seconds: float) -> None:
+        """A spare was first, by so much."""
+        self._saved_s += seconds
+
+    def made_wait(self, seconds: float) -> None:
+        """A request has to wait for a spare, for about so long."""
+        self._cost_s += seconds
+        if self._cost_s > self._saved_s:
+            self.share = max(FEWEST_SPARES, self.share * _CUT)
+
+
+class Auto(Choose):
+    """The policy `auto`; see `choose.Choose`.
+
+    Args:
+        budget: Late hedges that are allowed, as a share of requests.
+    """
+
+    def __init__(self, budget: float = 0.1) -> None:
+        self.look_at = NEVER
+        self._budget = TokenBucket(budget, BUDGET_CAPACITY)
+        self._spares = Spares()
+        self._replicas: dict[int, ReplicaLoad] = {}
+        # When a spare was first, by the copy that it beat, until that has ended.
+        self._beaten: dict[tuple[bytes, int], float] = {}
+        self.hedges = 0
+
+    # -- choices --------------------------------------------------------------------------
+
+    def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
+        """Return who will answer first, and those besides that have nothing to do."""
+        self._budget.request()
+        if not able:
+            return ()
+        best = self._best(request, able, now)
+        known = self._replicas[best]
+        self._spares.request(known.service_s(), now)
+        if self._spares.open and not known.free(now):
+            self._spares.made_wait(known.service_s())
+        others = able if self._spares.chosen(request) else self._stale(able, now)
+        spares = [other for other in others if other != best and self._takes_spare(other, now)]
+        for spare in spares:
+            self._spares.open[request, spare] = now
+            self._replicas[spare].asked(request, now)
+        known.asked(request, now)
+        self._look(now + known.delay_s())
+        return [best, *spares]
+
+    def _takes_spare(self, replica: int, now: float) -> bool:
+        known = self._replicas[replica]
+        return known.free(now) or (known.doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S)
+
+    def _stale(self, able: Sequence[int], now: float) -> list[int]:
+        """Return those of which nothing was heard for long: one spare copy shows how they do."""
+        due = now - TRIAL_EVERY_S
+        return [r for r in able if self._of(r).asked_at <= due or self._replicas[r].doubted]
+
+    def more(
+        self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
+    ) -> Sequence[int]:
+        """Return the next best when those at work take unusually long, or there are none."""
+        if not candidates:
+            return ()
+        if open:
+            due = max(begun + self._of(replica).delay_s() for replica, begun in open.items())
+            if now < due:
+                self._look(due)
+                return ()
+            doubted = [self._of(replica).doubt(begun, now) for replica, begun in open.items()]
+            free = [c for c in candidates if self._of(c).free(now)]
+            if not all(doubted):  # somebody works on it: only a free one may help, and few times
+                if not free or not self._budget.take():
+                    self._look(now + _RETRY_S)
+                    return ()
+                candidates = free
+                self.hedges += 1
+            elif all(self._of(c).doubted for c in candidates):
+                return ()
+        best = self._best(request, candidates, now)
+        known = self._replicas[best]
+        known.asked(request, now)
+        self._look(now + known.delay_s())
+        return (best,)
+
+    def _best(self, request: bytes, able: Sequence[int], now: float) -> int:
+        """Return who is expected to answer first; among equals any, by the request's random id."""
+        chance = request[-1] if request else 0
+        known = [self._of(replica) for replica in able]
+        times_s = sorted(one.service_s() for one in known)
+        typical_s = times_s[len(times_s) // 2]
+        return min(
+            (one.avoided(now), one.expected_s(now, typical_s), (i * 167 ^ chance) & 0xFF, replica)
+            for i, (replica, one) in enumerate(zip(able, known, strict=True))
+        )[-1]
+
+    def is_spare(self, request: bytes, replica: int) -> bool:
+        """Whether the replica is to drop it unless it has nothing else to do."""
+        return (request, replica) in self._spares.open
+
+    def _of(self, replica: int) -> ReplicaLoad:
+        known = self._replicas.get(replica)
+        if known is None:
+            known = self._replicas[replica] = ReplicaLoad()
+        return known
+
+    def _look(self, at: float) -> None:
+        self.look_at = min(self.look_at, at)
+
+    # -- what became of them --------------------------------------------------------------
+
+    def declined(self, request: bytes, replica: int, *, full: bool) -> None:
+        """It was not asked. With a full window it is left alone, so that others are tried."""
+        self._spares.open.pop((request, replica), None)
+        known = self._of(replica)
+        known.dropped(request)
+        known.doubted = known.doubted or full
+
+    def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
+        """Take a replica's word."""
+        self._of(replica).heard(request, load, now)
+
+    def answered(
+        self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
+    ) -> Iterable[int]:
+        """Learn from the winner; the others stop, and are learned from when they end."""
+        self._of(replica).answered(request, load, now)
+        if self._spares.open.pop((request, replica), None) is not None:
+            for other in open:
+                if not self.is_spare(request, other):
+                    self._beaten[request, other] = now
+        return super().answered(request, open, replica, load, now)
+
+    def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
+        """An attempt ended without an answer."""
+        self._spares.open.pop((request, replica), None)
+        if fault:
+            self._of(replica).failed(request, now)
+        else:
+            self._of(replica).dropped(request)
+
+    def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
+        """Learn from a copy that was not the first."""
+        self._spares.open.pop((request, replica), None)
+        beaten = self._beaten.pop((request, replica), now)
+        if answered:
+            self._spares.saved(now - beaten)
+            self._of(replica).answered(request, None, now)
+        else:
+            self._of(replica).dropped(request)
+
+    def stopped(
+        self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
+    ) -> None:
+        """Learn that these would have taken longer than until now."""
+        for replica, begun in open.items():
+            known = self._of(replica)
+            known.overtaken(begun, now)
+            if expired:
+                known.doubt(begun, now)
+
+    def came(self, replica: int) -> None:
+        """Its link is new: forget what was on the way there."""
+        self._of(replica).came()
+        for copies in (self._spares.open, self._beaten):
+            for key in [key for key in copies if key[1] == replica]:
+                del copies[key]
+
+    def report(self) -> dict[str, Any]:
+        """Return counts, the budget, and each replica's estimate by ``slot.generation``."""
+        return {
+            "hedges": self.hedges,
+            "spare_share": self._spares.share,
+            "tokens": self._budget.tokens,
+            "replicas": {
+                f"{replica >> 32}.{replica & 0xFFFFFFFF}": {
+                    "service_s": known.service_s(),
+                    "delay_s": known.delay_s(),
+                    "doubted": known.doubted,
+                }
+                for replica, known in sorted(self._replicas.items())
+            },
+        }
+
+
+def policy(spec: ServiceSpec) -> Choose:
+    """Return what chooses for a service, as its `hedging` says."""
+    if spec.hedging is HedgingMode.FAILOVER:
+        return Failover()
+    # Where every answer counts, or every replica applies every request, all are asked.
+    counts_all = spec.quorum > 1 or spec.state is not None or spec.part is not Part.NONE
+    return All() if counts_all or spec.hedging is HedgingMode.ALL else Auto(spec.hedging_budget)

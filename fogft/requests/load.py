@@ -1,0 +1,199 @@
+"""How busy a replica is, by its own words and by what one robot has sent there. Pure.
+
+A replica says with each answer and refusal how much it has to do (`Load`). Between two of them
+the robot counts what it sent itself. Several robots need no coordination: each sees the others
+in the replica's words.
+
+Owns: what is known of one replica. Not here: who is asked (`auto`, `choose`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from fogft.requests.latency import Latencies
+
+LATE_SHARE = 0.95
+SHORTEST_DELAY_S = 0.001
+UNKNOWN_DELAY_S = 0.1
+# With fewer samples the 95 % quantile is but the longest one, which must do.
+_SAMPLES_NEEDED = 5
+# What a replica said of other robots' requests holds for so long.
+_WORD_HOLDS_S = 1.0
+_RTT_GAIN = 0.1
+_ALIKE = 2.0
+_DOUBT_AFTER = 2.0
+_UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
+# A replica that fails is left alone: at first so long, then doubling, while another is able.
+_AVOIDED_S = 0.1
+_AVOIDED_LIMIT_S = 5.0
+NEVER = float("inf")
+
+
+class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
+    """What a replica says of one service with each answer and refusal.
+
+    Attributes:
+        waiting: Requests that wait for their turn.
+        running: Requests that the service has now.
+        slots: How many it works on at once; 0 where that is not known yet.
+        service_s: What it lately took for a request, divided by how many it had at once.
+        spent_s: How long the request of this answer was at the replica.
+    """
+
+    waiting: int
+    running: int
+    slots: int
+    service_s: float
+    spent_s: float
+
+
+class ReplicaLoad:
+    """What one robot knows of how busy a replica is. Not thread-safe: its owner holds a lock.
+
+    Attributes:
+        latencies: Of its answers, as the robot saw them.
+        doubted: An attempt is overdue, and it has ended none since that one began.
+        ended_at: When it last ended an attempt, with an answer or too late for one.
+        asked_at: When it was last asked.
+    """
+
+    __slots__ = (
+        *("_at_work", "_avoided_s", "_avoided_until", "_others", "_others_until", "_rtt_s"),
+        *("_service_s", "_slots", "asked_at", "doubted", "ended_at", "latencies"),
+    )
+
+    def __init__(self) -> None:
+        self.latencies = Latencies()
+        self.doubted = False
+        self.ended_at = -NEVER
+        self.asked_at = -NEVER
+        self._at_work: dict[bytes, float] = {}  # our attempts that it has not ended, oldest first
+        self._slots = 0
+        self._service_s = 0.0
+        self._rtt_s: float | None = None
+        self._others = 0  # requests of other robots
+        self._others_until = -NEVER
+        self._avoided_s = 0.0
+        self._avoided_until = -NEVER
+
+    # -- what is believed -----------------------------------------------------------------
+
+    def ahead(self, now: float) -> int:
+        """Return how many requests are believed to be there."""
+        return len(self._at_work) + (self._others if now < self._others_until else 0)
+
+    def free(self, now: float) -> bool:
+        """Whether a request that comes now is believed to begin at once."""
+        return not self.doubted and self.ahead(now) < max(1, self._slots)
+
+    def avoided(self, now: float) -> bool:
+        """Whether others are to be asked, where there are any: it is doubted, or has failed."""
+        return self.doubted or now < self._avoided_until
+
+    def expected_s(self, now: float, typical_s: float) -> float:
+        """Return how long an answer to a request that is sent now is believed to take.
+
+        Round trip, and one service time for it and for each request before it. 0 for a replica of
+        which nothing is known: it is tried.
+
+        Args:
+            now: Seconds.
+            typical_s: The service time of most replicas. One that is not twice as slow or as quick
+                is taken for equal: of services whose times vary, a few answers say no more.
+        """
+        service_s = self.service_s()
+        if typical_s / _ALIKE < service_s < typical_s * _ALIKE:
+            service_s = typical_s
+        return (self._rtt_s or 0.0) + service_s * (1 + self.ahead(now))
+
+    def service_s(self) -> float:
+        """Return how long it works on a request, as far as is known."""
+        if self._rtt_s is None:
+            return self.latencies.mean_below_s(LATE_SHARE) or 0.0
+        return self._service_s
+
+    def delay_s(self) -> float:
+        """Return after how long an attempt takes unusually long."""
+        if self.latencies.samples < _SAMPLES_NEEDED:
+            return UNKNOWN_DELAY_S
+        return max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
+
+    def doubtful_at(self, begun: float) -> float:
+        """Return when an attempt that began then is long overdue.
+
+        Not as soon as it takes unusually long: one in twenty does, and what is sent elsewhere for
+        it is work. Of one that has answered little nothing is unusual for seconds.
+        """
+        if self.latencies.samples < _SAMPLES_NEEDED:
+            return begun + _UNKNOWN_DOUBT_S
+        return begun + _DOUBT_AFTER * self.delay_s()
+
+    # -- what happens ---------------------------------------------------------------------
+
+    def asked(self, request: bytes, now: float) -> None:
+        """Note an attempt that is about to be sent."""
+        self._at_work[request] = now
+        self.asked_at = now
+
+    def heard(self, request: bytes, load: Load, now: float) -> None:
+        """Take its word, said with the end of an attempt, which it does not count any more.
+
+        What was sent within the last round trip it had not seen then.
+        """
+        since = now - (self._rtt_s or 0.0)
+        seen = [id for id, begun in self._at_work.items() if begun <= since and id != request]
+        there = load.waiting + load.running
+        self._others, self._others_until = max(0, there - len(seen)), now + _WORD_HOLDS_S
+        self._slots = load.slots
+        self._service_s = load.service_s
+        for lost in seen[: max(0, len(seen) - there)]:  # their ends were
+            del self._at_work[lost]
+
+    def answered(self, request: bytes, load: Load | None, now: float) -> float | None:
+        """Note that it has ended an attempt; return when that began, if it was open."""
+        begun = self._at_work.pop(request, None)
+        self.ended_at = now
+        self.doubted = False
+        self._avoided_s = 0.0
+        if begun is None:
+            return None
+        took_s = now - begun
+        self.latencies.add(took_s, now)
+        if load is not None:
+            rtt_s = max(0.0, took_s - load.spent_s)
+            known = self._rtt_s
+            if known is None or rtt_s < known:
+                self._rtt_s = rtt_s
+            else:
+                self._rtt_s = known + _RTT_GAIN * (rtt_s - known)
+        return begun
+
+    def dropped(self, request: bytes) -> None:
+        """Note that an attempt has ended, and that it never worked on it."""
+        self._at_work.pop(request, None)
+
+    def failed(self, request: bytes, now: float) -> None:
+        """Note that an attempt failed by its fault: one that fails at once is not quick."""
+        self._at_work.pop(request, None)
+        self._avoided_s = min(_AVOIDED_LIMIT_S, max(_AVOIDED_S, 2 * self._avoided_s))
+        self._avoided_until = now + self._avoided_s
+
+    def overtaken(self, begun: float, now: float) -> None:
+        """Learn from an attempt that was stopped: it would have taken longer than this.
+
+        Only if that is unusually long already; else it says nothing.
+        """
+        if now - begun >= self.delay_s():
+            self.latencies.add(now - begun, now)
+
+    def doubt(self, begun: float, now: float) -> bool:
+        """Doubt it where an attempt is long overdue and it has ended none since; whether it is."""
+        if self.ended_at < begun and now >= self.doubtful_at(begun):
+            self.doubted = True
+        return self.doubted
+
+    def came(self) -> None:
+        """Its link is new: nothing is on the way, and what was doubted is over."""
+        self._at_work.clear()
+        self.doubted = False

@@ -1,0 +1,285 @@
+"""What is known of a replica's load, the budget, and whom `auto` asks when."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.requests.auto import BUDGET_CAPACITY, FEWEST_SPARES, Auto, Spares, TokenBucket
+from fogft.requests.latency import Latencies
+from fogft.requests.load import NEVER, Load, ReplicaLoad
+
+A, B = b"a" * 16, b"b" * 16
+
+
+def idle(service_s: float, spent_s: float | None = None) -> Load:
+    """What a replica says that has nothing more to do."""
+    return Load(0, 0, 0, service_s, service_s if spent_s is None else spent_s)
+
+
+@given(st.lists(st.booleans(), max_size=300), st.floats(0.01, 1.0), st.floats(0, 20))
+def test_the_budget_is_never_exceeded(takes, share, capacity):
+    """After n requests at most capacity + share * n tokens were taken."""
+    bucket = TokenBucket(share, capacity)
+    taken = 0
+    for n, take in enumerate(takes, start=1):
+        bucket.request()
+        taken += take and bucket.take()
+        assert taken <= capacity + share * n + 1e-6
+
+
+@given(st.lists(st.floats(0.0002, 1000), min_size=1, max_size=200), st.floats(0.5, 0.99))
+def test_a_quantile_is_right_to_a_bucket(values, share):
+    """Without decay it lies at the sample's own quantile, to within 10 %."""
+    found = Latencies(half_life=1e9)
+    for value in values:
+        found.add(value, 0.0)
+    ordered = sorted(values)
+    quantile = found.quantile_s(share)
+    assert quantile is not None
+    below = ordered[max(0, int(share * len(values) - 1e-9) - 1)]
+    above = ordered[min(len(values) - 1, int(share * len(values) + 1e-9))]
+    assert below / 1.11 <= quantile <= above * 1.11
+
+
+def test_old_latencies_fade_with_samples_and_with_time():
+    by_samples, by_time = Latencies(half_life=20), Latencies(half_life_s=10)
+    for n in range(100):
+        by_samples.add(1.0, 0.0)
+        by_time.add(1.0, n / 100)
+    for _ in range(100):
+        by_samples.add(0.1, 0.0)
+    for n in range(5):
+        by_time.add(0.1, 100.0 + n)
+    for found in (by_samples, by_time):
+        median = found.quantile_s(0.5)
+        assert median == pytest.approx(0.1, rel=0.11)
+
+
+def test_weights_do_not_overflow():
+    found = Latencies(half_life=1, half_life_s=0.1)
+    for n in range(5000):
+        found.add(0.2, n * 60.0)
+    assert found.quantile_s(0.95) == pytest.approx(0.2, rel=0.11)
+    assert found.mean_below_s(0.95) == pytest.approx(0.2, rel=0.2)
+
+
+# -- one replica ------------------------------------------------------------------------------
+
+
+def test_the_round_trip_is_what_the_replica_did_not_spend():
+    known = ReplicaLoad()
+    known.asked(A, 10.0)
+    known.heard(A, idle(0.02), 10.05)
+    known.answered(A, idle(0.02), 10.05)
+    assert known.expected_s(10.1, 0.02) == pytest.approx(0.05)
+    assert known.free(10.1)
+
+
+def test_each_request_before_it_costs_a_service_time_ours_and_those_of_others():
+    known = ReplicaLoad()
+    known.asked(A, 10.0)
+    known.heard(A, Load(2, 1, 0, 0.02, 0.02), 10.02)  # three of other robots
+    known.answered(A, Load(2, 1, 0, 0.02, 0.02), 10.02)
+    known.asked(B, 10.03)
+    assert known.ahead(10.03) == 4
+    assert known.expected_s(10.03, 0.02) == pytest.approx(0.02 * 5)
+    assert not known.free(10.03)
+    assert known.ahead(12.0) == 1  # its word holds for a second
+
+
+def test_its_word_corrects_what_was_lost_on_the_way():
+    """Ours that it does not have any more are forgotten, but not what it cannot have seen yet."""
+    known = ReplicaLoad()
+    for request, at in ((A, 10.0), (B, 10.1), (b"c" * 16, 10.2)):
+        known.asked(request, at)
+    known.heard(B, Load(0, 0, 0, 0.02, 0.02), 10.15)
+    known.answered(B, Load(0, 0, 0, 0.02, 0.02), 10.15)
+    assert known.ahead(10.2) == 1
+
+
+def test_one_that_fails_is_avoided_for_longer_each_time_until_it_answers():
+    known = ReplicaLoad()
+    waits = []
+    for n in range(8):
+        known.asked(A, 10.0 * n)
+        known.failed(A, 10.0 * n)
+        after = (s / 10 for s in range(1, 60) if not known.avoided(10.0 * n + s / 10))
+        waits.append(next(after))
+    assert waits == sorted(waits)
+    assert 5.0 <= waits[-1] < 5.2
+    known.asked(A, 100.0)
+    known.answered(A, None, 100.1)
+    known.asked(A, 101.0)
+    known.failed(A, 101.0)
+    assert not known.avoided(101.2)
+
+
+def test_it_is_doubted_when_long_overdue_unless_it_ended_another_meanwhile():
+    known = ReplicaLoad()
+    for n in range(10):
+        known.asked(A, float(n))
+        known.answered(A, None, n + 0.1)
+    assert not known.doubt(20.0, 20.15)
+    assert known.doubt(20.0, 20.3)
+    known.asked(A, 30.0)
+    known.answered(A, None, 30.1)
+    assert not known.avoided(30.1)
+    assert not known.doubt(30.0, 31.0)
+
+
+# -- spare copies -----------------------------------------------------------------------------
+
+
+def test_spares_that_cost_more_than_they_save_become_few_and_come_back():
+    spares = Spares()
+    for n in range(40):
+        spares.request(0.02, n * 0.05)
+        spares.made_wait(0.02)
+    assert spares.share == pytest.approx(FEWEST_SPARES, rel=0.5)
+    spares.request(0.02, 100.0)
+    assert spares.share == 1.0
+
+
+def test_spares_that_save_more_than_they_cost_stay():
+    spares = Spares()
+    for n in range(40):
+        spares.request(0.02, n * 0.05)
+        spares.saved(0.1)
+        spares.made_wait(0.02)
+    assert spares.share == 1.0
+
+
+# -- the policy -------------------------------------------------------------------------------
+
+
+def learned(**service_s: float) -> Auto:
+    """Return a policy that knows replicas by what they take: ``r1=0.1`` is replica 1."""
+    policy = Auto()
+    for name, took_s in service_s.items():
+        replica = int(name[1:])
+        for n in range(30):
+            begun, ended = n * 1.0, n + took_s
+            policy.first(A, (replica,), begun)
+            policy.heard(A, replica, idle(took_s), ended)
+            policy.answered(A, {replica: begun}, replica, idle(took_s), ended)
+    return policy
+
+
+def test_idle_replicas_all_get_a_request_at_once_and_one_copy_is_no_spare():
+    policy = learned(r1=0.3, r2=0.1, r3=0.4)
+    assert policy.first(B, (1, 2, 3), 31.0) == [2, 1, 3]
+    assert [policy.is_spare(B, replica) for replica in (2, 1, 3)] == [False, True, True]
+    assert set(policy.answered(B, {1: 31.0, 2: 31.0, 3: 31.0}, 2, None, 31.1)) == {1, 3}
+
+
+def test_while_replicas_are_busy_a_request_goes_to_one():
+    policy = learned(r1=0.1, r2=0.1)
+    assert len(policy.first(A, (1, 2), 31.0)) == 2
+    assert len(policy.first(B, (1, 2), 31.01)) == 1
+
+
+def test_a_loser_is_busy_until_it_says_that_it_has_ended():
+    policy = learned(r1=0.1, r2=0.1)
+    first, other = policy.first(A, (1, 2), 31.0)
+    policy.answered(A, {1: 31.0, 2: 31.0}, first, idle(0.1), 31.1)
+    assert policy.first(B, (1, 2), 31.11) == [first]
+    policy.answered(B, {first: 31.11}, first, idle(0.1), 31.2)
+    policy.late(A, other, 31.25, answered=True)
+    assert set(policy.first(A, (1, 2), 31.3)) == {1, 2}
+
+
+def test_a_late_hedge_goes_to_a_free_replica_after_the_learned_delay_and_takes_a_token():
+    policy = learned(r1=0.1, r2=0.1)
+    policy.look_at = NEVER
+    policy.first(A, (1,), 31.0)
+    assert 31.09 < policy.look_at < 31.12
+    assert policy.more(A, {1: 31.0}, (2,), 31.05) == ()
+    before = policy.report()["tokens"]
+    assert policy.more(A, {1: 31.0}, (2,), 31.13) == (2,)
+    assert policy.report()["tokens"] == before - 1
+
+
+def test_a_late_hedge_never_goes_to_a_busy_replica():
+    policy = learned(r1=0.1, r2=0.1)
+    policy.first(A, (1,), 31.0)
+    policy.first(B, (2,), 31.1)
+    assert policy.more(A, {1: 31.0}, (2,), 31.13) == ()
+
+
+def test_what_a_doubted_replica_has_goes_to_another_though_that_is_busy_and_costs_no_token():
+    """Frozen: its probes go unanswered for two seconds, in which it must not keep requests."""
+    policy = learned(r1=0.1, r2=0.1)
+    policy.first(A, (1,), 31.0)
+    policy.first(B, (2,), 31.25)
+    before = policy.report()["tokens"]
+    assert policy.more(A, {1: 31.0}, (2,), 31.3) == (2,)
+    assert policy.report()["tokens"] == before
+    assert policy.first(B, (1, 2), 31.4)[0] == 2
+
+
+def test_when_nobody_works_on_a_request_the_next_is_asked_at_once_without_a_token():
+    """The first was suspect, or refused it: a copy is replaced, not added."""
+    policy = learned(r1=0.1, r2=0.2)
+    policy.first(A, (1,), 31.0)
+    policy.failed(A, 1, 31.001, fault=False)
+    before = policy.report()["tokens"]
+    assert policy.more(A, {}, (2,), 31.001) == (2,)
+    assert policy.report()["tokens"] == before
+
+
+def test_one_that_fails_at_once_draws_nothing():
+    policy = learned(r1=0.01, r2=0.3)
+    policy.first(A, (1,), 31.0)
+    policy.failed(A, 1, 31.001, fault=True)
+    assert policy.first(B, (1, 2), 31.002)[0] == 2
+
+
+def test_a_full_window_turns_it_to_another():
+    policy = learned(r1=0.1, r2=0.2)
+    policy.first(A, (1,), 31.0)
+    policy.declined(A, 1, full=True)
+    assert policy.more(A, {}, (1, 2), 31.0) == (2,)
+
+
+def test_a_burst_does_not_queue_at_one_replica():
+    policy = learned(r1=0.1, r2=0.15)
+    chosen = [policy.first(bytes([n]) * 16, (1, 2), 31.0)[0] for n in range(6)]
+    assert set(chosen) == {1, 2}
+
+
+def test_a_link_that_was_opened_again_has_nothing_on_the_way():
+    policy = learned(r1=0.1, r2=0.1)
+    policy.first(A, (1, 2), 31.0)
+    policy.came(1)
+    policy.came(2)
+    assert len(policy.first(B, (1, 2), 31.01)) == 2
+    assert not policy.is_spare(A, 2)
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2), st.booleans()), max_size=200))
+def test_whatever_happens_late_hedges_stay_within_the_budget(steps):
+    """Law: late hedges <= capacity + share * requests; and a request always has a first copy."""
+    policy, now, open_by = Auto(budget=0.1), 100.0, dict[bytes, dict[int, float]]()
+    for n, (kind, replica, flag) in enumerate(steps):
+        now += 0.05
+        request = n.to_bytes(16, "big")
+        if kind <= 1:
+            chosen = policy.first(request, (0, 1, 2), now)
+            assert chosen
+            assert not policy.is_spare(request, chosen[0])
+            open_by[request] = dict.fromkeys(chosen, now)
+        for known, open in list(open_by.items())[-3:]:
+            if kind == 2 and replica in open:
+                policy.answered(known, open, replica, idle(0.05) if flag else None, now)
+                del open_by[known]
+            elif kind == 3 and replica in open:
+                del open[replica]
+                policy.failed(known, replica, now, fault=flag)
+            elif kind == 4:
+                others = [r for r in range(3) if r not in open]
+                open.update(dict.fromkeys(policy.more(known, open, others, now), now))
+            elif kind == 5:
+                policy.late(known, replica, now, answered=flag)
+    assert policy.hedges <= BUDGET_CAPACITY + 0.1 * len(steps)
