@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
+import zipfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -178,6 +180,8 @@ def vm(tmp_path: Path) -> Path:
     fogft = tmp_path / ".fogft/venv/bin/fogft"
     fogft.write_text('#!/bin/sh\necho "fogft $*"\n')
     fogft.chmod(0o755)
+    (tmp_path / ".fogft/venv/bin/python").symlink_to(sys.executable)
+    (tmp_path / ".fogft/venv/bin/activate").touch()
     (tmp_path / ".fogft/replica").mkdir(mode=0o755)
     (tmp_path / ".fogft/replica/replica.key").write_text("secret")
     return tmp_path
@@ -201,6 +205,79 @@ def test_setup_runs_the_users_part_and_hides_the_key(vm: Path):
     assert done.returncode == 0, done.stderr
     assert (vm / "ran").exists()
     assert (vm / ".fogft/replica/replica.key").stat().st_mode & 0o077 == 0
+
+
+def wheel_of(folder: Path, name: str, version: str, requires: str = "", extra: str = "") -> None:
+    """Write a wheel of one module, and of one program of its name that shows what it finds."""
+    info = f"{name}-{version}.dist-info"
+    metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\nProvides-Extra: ros\n"
+    metadata += f"Requires-Dist: {requires}\n" if requires else ""
+    metadata += f'Requires-Dist: {extra}; extra == "ros"\n' if extra else ""
+    files = {
+        f"{name}.py": f"version = {version!r}\n\ndef main():\n    import userlib\n"
+        "    print('the proxy finds', userlib.version)\n",
+        f"{info}/METADATA": metadata,
+        f"{info}/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        f"{info}/entry_points.txt": f"[console_scripts]\n{name} = {name}:main\n",
+        f"{info}/RECORD": "",
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as archive:
+        for path, text in files.items():
+            archive.writestr(path, text)
+
+
+@pytest.fixture
+def new_vm(tmp_path: Path) -> Path:
+    """A home as on a VM that was just made, with SkyPilot's environment and an index of wheels."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "sky-user-env"],
+                   check=True)  # fmt: skip
+    for version in ("1.0", "2.0"):
+        wheel_of(tmp_path / "index", "userlib", version)
+    wheel_of(tmp_path / "index", "rclpy", "7.1")
+    return tmp_path
+
+
+def on_skypilot(home: Path, script: str) -> subprocess.CompletedProcess[str]:
+    """Run a script as SkyPilot does: with its own environment active."""
+    script = with_ros_at(home / "no-ros", script)
+    index = {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(home / "index")}
+    return shell(home, f". ~/sky-user-env/bin/activate\n{script}", **index)
+
+
+def test_what_setup_installs_with_pip_is_there_for_run_and_for_the_server_proxy(new_vm: Path):
+    """And it keeps its version, where fogft would do with a newer one."""
+    wheel_of(new_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1", extra="rclpy")
+    asked = {"setup": "set -e\npip install -q userlib==1.0\npython3 -c 'import userlib'"}
+    done = on_skypilot(new_vm, built(asked)["setup"])
+    assert done.returncode == 0, done.stdout + done.stderr
+    run = built(asked)["run"]
+    seen = "python3 -c 'import rclpy, userlib; print(\"run finds\", userlib.version)'\nexec ~/"
+    done = on_skypilot(new_vm, run.replace("exec ~/", seen))
+    assert done.stdout.splitlines() == ["run finds 1.0", "the proxy finds 1.0"], done.stderr
+
+
+def test_a_version_that_does_not_go_with_fogft_is_told(new_vm: Path):
+    wheel_of(new_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=2")
+    done = on_skypilot(new_vm, built({"setup": "pip install -q userlib==1.0"})["setup"])
+    assert done.returncode != 0
+    assert "what `setup` has installed does not go with what fogft needs" in done.stdout
+    assert "userlib==1.0" in done.stdout
+    assert not (new_vm / ".fogft/venv/bin/fogft").exists()
+
+
+def test_a_machine_without_a_python_of_today_is_told(new_vm: Path):
+    old = new_vm / "bin/python3"
+    old.parent.mkdir()
+    old.write_text("#!/bin/sh\nexit 1\n")
+    old.chmod(0o755)
+    (new_vm / ".fogft").mkdir()
+    script = with_ros_at(new_vm / "no-ros", built({})["setup"])
+    for word in ("/usr/bin/python3 ", "python3.13", "python3.12", "python3.11", "python3.10"):
+        script = script.replace(word, "python3 ")
+    done = shell(new_vm, script, PATH=f"{old.parent}:/usr/bin:/bin")
+    assert done.returncode != 0
+    assert "there is no Python 3.10 to 3.13" in done.stdout
 
 
 def test_a_failing_setup_of_the_pool_file_fails_the_whole(vm: Path):
@@ -264,7 +341,11 @@ def bare_vm(vm: Path) -> Path:
     (vm / ".fogft/wheel/fogft-0.1.0-py3-none-any.whl").touch()
     (vm / ".local/bin").mkdir(parents=True)
     uv = vm / ".local/bin/uv"
-    uv.write_text('#!/bin/sh\necho "uv $*" >> ~/uv-calls\n')
+    uv.write_text(
+        '#!/bin/sh\necho "uv $*" >> ~/uv-calls\nmkdir -p ~/.fogft/venv/bin\n'
+        'echo "PATH=$HOME/.fogft/venv/bin:$PATH" > ~/.fogft/venv/bin/activate\n'
+        f"ln -sf {sys.executable} ~/.fogft/venv/bin/python\n"
+    )
     uv.chmod(0o755)
     return vm
 
@@ -279,7 +360,7 @@ def test_plain_ubuntu_gets_ros_with_the_wheel(bare_vm: Path, tmp_path: Path):
     done = shell(bare_vm, with_ros_at(tmp_path / "no-ros", built({})["setup"]))
     assert done.returncode == 0, done.stderr
     made, installed = (bare_vm / "uv-calls").read_text().splitlines()
-    assert made.startswith("uv venv --quiet --system-site-packages ")
+    assert made.startswith("uv venv --quiet --seed --system-site-packages ")
     assert installed.endswith("/.fogft/wheel/fogft-0.1.0-py3-none-any.whl[ros]")
 
 

@@ -48,11 +48,13 @@ in_image su - ubuntu -c 'HOME=/tmp/warm skypilot-runtime/bin/python -W ignore - 
 # fogft's own dependencies, as wheels and in uv's cache: a VM's set-up installs them for real,
 # by the template's own commands, but has no index to ask.
 "$venv/bin/python" "$here/dependencies.py" "$checkout/pyproject.toml" >"$image/requirements.txt"
+printf '%s\n' pip setuptools wheel iniconfig==2.0.0 >>"$image/requirements.txt"  # for `setup`
 /usr/bin/python3 -m venv "$image/pip"
 PIP_CACHE_DIR=${PIP_CACHE_DIR:-$venv/.pip-cache} "$image/pip/bin/pip" wheel -q --use-pep517 -w "$image/root/opt/wheelhouse" -r "$image/requirements.txt"
 rm -rf "$image/pip"
 printf 'offline = true\n[pip]\nno-index = true\nfind-links = ["/opt/wheelhouse"]\n' \
   >"$image/root/etc/uv/uv.toml"
+printf '[global]\nno-index = true\nfind-links = /opt/wheelhouse\n' >"$image/root/etc/pip.conf"
 in_image su - ubuntu -c "
   set -e
   ~/.local/bin/uv venv -q /tmp/warm --python /usr/bin/python3

@@ -56,6 +56,7 @@ chroot "$root/container" env -i HOME=/root PATH=/usr/sbin:/usr/bin:/sbin:/bin LA
   HOME=/tmp/warm ~/skypilot-runtime/bin/python -W ignore - && rm -rf /tmp/warm
 ' <"$here/warm.py"
 printf 'offline = true\n[pip]\nno-index = true\nfind-links = ["/opt/wheelhouse"]\n' >"$box/etc/uv/uv.toml"
+cp "$image/layer/etc/pip.conf" "$box/etc/pip.conf"
 : >"$box/etc/resolv.conf"
 umount -R -l "$root/container/proc" "$root/container/dev"
 rm -rf "$box"/var/cache/apt/archives/*.deb

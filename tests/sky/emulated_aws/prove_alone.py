@@ -59,7 +59,11 @@ setup: |
   export ROS_DISTRO=proof PYTHONPATH=$packages
   export LD_LIBRARY_PATH=$(printf "%s:" $packages/ros_*.libs)$ros/lib
   SETUP
-run: exec python3 plan_service.py
+  pip install iniconfig
+run: |
+  set -e
+  python3 -c "import iniconfig, rclpy"
+  exec python3 plan_service.py
 fogft:
   replicas: 1
   dial_in: {DOOR}

@@ -29,11 +29,16 @@ resources:
 workdir: .
 envs: {GREETING: hello}
 secrets: {TOKEN: t0p-secret}
-setup: test -f /.dockerenv && echo "$GREETING $TOKEN" > ~/setup-ran
+setup: |
+  set -e
+  test -f /.dockerenv
+  pip install iniconfig
+  echo "$GREETING $TOKEN" > ~/setup-ran
 run: |
   set -e
   test -f /.dockerenv
   grep -qx "hello t0p-secret" ~/setup-ran
+  python3 -c "import iniconfig"
   exec python3 plan_service.py
 fogft:
   replicas: 1

@@ -43,8 +43,13 @@ resources:
 workdir: .
 envs: {{GREETING: hello}}
 secrets: {{TOKEN: t0p-secret}}
-setup: echo "setup of $GREETING with $TOKEN" >> ~/setup-ran
+setup: |
+  set -e
+  pip install iniconfig
+  echo "setup of $GREETING with $TOKEN" >> ~/setup-ran
 run: |
+  set -e
+  python3 -c "import iniconfig"
   echo "$GREETING $TOKEN" > ~/run-found
   exec python3 plan_service.py
 fogft:
