@@ -14,7 +14,7 @@ from fogft.cli.options import DEFAULT_FILE, PoolArgument, PoolFile
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
-    from fogft.pool.commands.status import Seen
+    from fogft.pool.commands.current import Seen
 
 LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs

@@ -18,9 +18,9 @@ from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from fogft.model.spec import PoolSpec
+    from fogft.pool.commands.current import Seen
     from fogft.pool.commands.outcome import Awaited, Outcome
     from fogft.pool.commands.preview import Preview
-    from fogft.pool.commands.status import Seen
     from fogft.pool.folder.paths import PoolPaths
 
 LOOK_EVERY_S = 0.2

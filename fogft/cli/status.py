@@ -15,15 +15,15 @@ from fogft.cli.options import PoolArgument, PoolOption
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from fogft.pool.commands.status import Seen
+    from fogft.pool.commands.current import Seen
     from fogft.pool.folder.paths import PoolPaths
 
 REDRAW_EVERY_S = 1.0
-STALE_AFTER_S = 15.0
+CHECK_LIMIT_S = 3.0  # links are probed once a second
 FOLLOW_EVERY_S = 0.2
 
 
-def status(
+def status(  # noqa: PLR0917 - Typer reads the command line from them
     pool: PoolArgument = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON; with --watch, one object per line.")
@@ -32,13 +32,20 @@ def status(
     refresh: Annotated[
         bool, typer.Option("--refresh", "-r", help="Have the manager observe the pool first.")
     ] = False,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Probe each link first; exit 1 if a request would not be answered.",
+        ),
+    ] = False,
     schema: Annotated[
         bool, typer.Option("--schema", help="Print the JSON Schema of --json, and stop.")
     ] = False,
 ) -> None:
     """Show a pool: its replicas, their links, and the outcome of requests.
 
-    This is what the manager last saw, and how long ago.
+    Each part comes from whoever knows it; what nobody knows now is `?`.
     """
     if schema:
         from fogft.pool.commands.status_schema import status_schema
@@ -47,10 +54,12 @@ def status(
         return
     from fogft.cli import status_text
     from fogft.pool.commands import composition
-    from fogft.pool.commands.status import read, refreshed
+    from fogft.pool.commands.status import checked, read, refreshed
 
     paths = composition.paths_of(pool)
     seen = refreshed(composition.store_of(pool)) if refresh else read(paths, time.time())
+    if check:
+        seen = checked(paths, CHECK_LIMIT_S)
     if watch:
         _watch(paths, as_json=as_json)
     elif as_json:
@@ -58,6 +67,8 @@ def status(
     else:
         output.show(status_text.rendered(seen, width=output.width(sys.stdout)))
     _remark(seen)
+    if check and not seen.answers:
+        raise typer.Exit(1)
 
 
 def _watch(paths: PoolPaths, *, as_json: bool) -> None:
@@ -85,9 +96,10 @@ def _remark(seen: Seen) -> None:
     if seen.status.ended and not seen.manager_alive:
         output.hint(f"start it again with `fogft up {seen.status.file}`; `fogft down` removes it")
     elif not seen.manager_alive:
-        output.warn("no manager runs: requests continue, but lost replicas are not replaced")
+        goes_on = "requests continue, but lost replicas are not replaced"
+        output.warn(f"no manager runs: {goes_on if seen.answers else 'nothing is replaced'}")
         output.hint(f"start it with `fogft up {seen.status.file}`, or end it with `fogft down`")
-    elif seen.age_s is not None and seen.age_s > STALE_AFTER_S:
+    elif seen.age_s is not None and seen.stale:
         output.warn(f"the manager has not observed the pool for {seen.age_s:.0f} s")
         output.hint("see `fogft logs`")
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.text import Text
     from rich.tree import Tree
 
-    from fogft.pool.commands.status import Seen
+    from fogft.pool.commands.current import Seen
     from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
 
 PHASES = {"provisioning": "yellow", "starting": "yellow", "ready": "green", "draining": "magenta"}
@@ -24,6 +24,7 @@ SERVICE_COLUMNS = (
     *("SERVICE", "READY", "REQUESTS", "ANSWERED", "FALLBACK", "UNANSWERED", "LATE"),
     *("WAITING", "P50", "P99"),
 )
+UNKNOWN = "?"
 NUMBERS = ("$/H", "RTT", "WON", "AGE", *SERVICE_COLUMNS[1:])
 
 
@@ -33,8 +34,8 @@ def rendered(seen: Seen, *, width: int) -> Group:
     rows = [*status.replicas, *status.by_hand]
     parts: list[Sequence[RenderableType]] = [
         [headline(seen)],
-        replicas(rows, REPLICA_COLUMNS, width=width),
-        [services(status.services)] if status.services else [],
+        replicas(rows, REPLICA_COLUMNS, width=width, links_known=seen.links_known),
+        [services(status.services, links_known=seen.links_known)] if status.services else [],
         topology(status.topology),
         notes(status),
     ]
@@ -60,6 +61,9 @@ def headline(seen: Seen) -> Text:
         return _joined([pool, cell(f"ended {status.ended}")])
     ready, target = status.ready, status.target
     enough = "green" if ready >= target > 0 else "yellow" if ready else "bold red"
+    usd_per_hour = UNKNOWN if seen.stale else price(status.usd_per_hour)
+    hangs = status.proxy_alive and not seen.links_known
+    links_age_s = seen.report_age_s if hangs else None
     alarms = {
         "NO MANAGER": not seen.manager_alive,
         "NO CLIENT PROXY": not status.proxy_alive,
@@ -69,12 +73,25 @@ def headline(seen: Seen) -> Text:
     return _joined(
         [
             pool,
-            cell(f"{ready} of {target} ready", enough),
-            cell(f"{price(status.usd_per_hour)}/h on {status.cloud}"),
+            *_answering(seen),
+            cell(f"{ready if seen.links_known else UNKNOWN} of {target} ready", enough),
+            cell(f"{usd_per_hour}/h on {status.cloud}"),
             cell("not observed yet" if seen.age_s is None else f"seen {age(seen.age_s)} ago"),
+            *([] if links_age_s is None else [cell(f"links seen {age(links_age_s)} ago")]),
             *(cell(text, "bold red") for text, sounds in alarms.items() if sounds),
         ]
     )
+
+
+def _answering(seen: Seen) -> list[Text]:
+    """Return whether a request would be answered now; nothing of a pool that is still new."""
+    if seen.answers:
+        return [cell("answering", "green")]
+    if seen.answers is None:
+        return [] if seen.links_known or seen.age_s is None else [cell("answering?", "yellow")]
+    some = len(seen.unanswered) < len(seen.status.services)
+    named = f": {', '.join(seen.unanswered)}" if some and seen.unanswered else ""
+    return [cell(f"not answering{named}", "bold red")]
 
 
 def _joined(words: Sequence[Text]) -> Text:
@@ -94,12 +111,16 @@ def notes(status: PoolStatus) -> list[Text]:
 
 
 def replicas(
-    rows: Sequence[ReplicaStatus], names: Sequence[str], *, width: int
+    rows: Sequence[ReplicaStatus],
+    names: Sequence[str],
+    *,
+    width: int,
+    links_known: bool = True,
 ) -> list[RenderableType]:
     """Return the table of replicas; details stand in it where there is room, else below it."""
     if not rows:
         return []
-    cells = [[*map(_of_replica(row).__getitem__, names)] for row in rows]
+    cells = [[*map(_of_replica(row, links_known).__getitem__, names)] for row in rows]
     details = [cell(row.detail) for row in rows]
     if not any(details):
         return [table(names, cells, right=NUMBERS)]
@@ -111,29 +132,31 @@ def replicas(
     return [table(names, cells, right=NUMBERS), "", table(("", ""), below, titled=False)]
 
 
-def _of_replica(row: ReplicaStatus) -> dict[str, str | Text]:
+def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
+    link = row.link or ("-" if links_known else UNKNOWN)
     return {
         "REPLICA": f"{row.slot}.{row.generation}",
-        "PHASE": cell(row.phase, PHASES.get(row.phase, "")),
+        "PHASE": cell(row.phase, PHASES.get(row.phase, "")) if row.known else UNKNOWN,
         "LOCATION": row.location,
         "$/H": price(row.usd_per_hour).removeprefix("$"),
-        "LINK": cell(row.link or "-", LINKS.get(row.link, "dim")),
-        "RTT": milliseconds(row.rtt_s),
+        "LINK": cell(link, LINKS.get(row.link, "dim")),
+        "RTT": milliseconds(row.rtt_s) if links_known else UNKNOWN,
         "WON": number(row.won),
         "AGE": "-" if row.age_s is None else age(row.age_s),
     }
 
 
-def services(rows: Sequence[ServiceStatus]) -> Table:
+def services(rows: Sequence[ServiceStatus], *, links_known: bool = True) -> Table:
     """Return the table of services and what became of their requests."""
     cells: list[list[str | Text]] = []
     for row in rows:
         count = row.counters
+        ready = number(row.ready_replicas) if links_known else UNKNOWN
         unanswered = sum(count.get(key, 0) for key in ("silent", "empty", "turned_away"))
         cells.append(
             [
                 row.name,
-                cell(number(row.ready_replicas), "" if row.ready_replicas else "bold red"),
+                cell(ready, "" if row.ready_replicas else "bold red"),
                 number(count.get("received", 0)),
                 number(count.get("answered", 0)),
                 number(count.get("fallback", 0)),

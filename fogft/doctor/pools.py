@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta, timezone
 from functools import partial
@@ -10,10 +9,12 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
-from fogft.errors import CredentialError, FogftError
+from fogft.errors import CredentialError, StateError
 from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.replica import LinkReport, LinkState
+from fogft.pool.commands import status
+from fogft.pool.commands.current import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
@@ -21,7 +22,8 @@ from fogft.pool.manager import proxy_report
 
 _EXPIRY_WARNING = timedelta(days=3)
 # The client proxy reports twice a second.
-_REPORT_LIMIT_S = 10.0
+_REPORT_LIMIT_S = proxy_report.STALE_S
+_UP = "run `fogft up FILE`"
 
 
 def pool_file(situation: Situation) -> Iterator[Finding]:
@@ -97,39 +99,41 @@ def judge_folder(pool: str, folder: Path, now: datetime) -> Iterator[Finding]:
 
 
 def processes(situation: Situation) -> Iterator[Finding]:
-    """Every pool has a manager and a client proxy."""
+    """Every pool has a manager and a client proxy, and a request would be answered now."""
     for pool in situation.pools:
-        paths = PoolPaths.of(pool, situation.home)
-        ended = _ended(paths)
-        if ended:
-            yield ok("manager", f"pool `{pool}`: ended {ended}")
+        try:
+            seen = status.read(PoolPaths.of(pool, situation.home), situation.now)
+        except StateError as error:
+            yield fail("manager", f"pool `{pool}`: {error.message}", error.hint or _UP)
             continue
-        if disk.is_locked(paths.manager_lock):
-            yield ok("manager", f"pool `{pool}`: runs")
-        else:
-            yield warn(
-                "manager",
-                f"pool `{pool}` has none: requests continue, but lost replicas are not replaced",
-                "start it with `fogft up FILE`, or end the pool with `fogft down`",
-            )
-        if disk.is_locked(paths.proxy_lock):
-            yield ok("client proxy", f"pool `{pool}`: runs")
-        else:
-            yield fail(
-                "client proxy",
-                f"pool `{pool}` has none: no request is answered",
-                f"its manager starts it; see `{paths.proxy_log}`",
-            )
+        if seen.status.ended and not seen.manager_alive:
+            yield ok("manager", f"pool `{pool}`: ended {seen.status.ended}")
+            continue
+        yield from judge_processes(pool, seen)
 
 
-def _ended(paths: PoolPaths) -> str:
-    """Return how a pool has ended by itself; empty when it has not."""
-    if disk.is_locked(paths.manager_lock):
-        return ""
-    with contextlib.suppress(FogftError):
-        status = disk.read_json(paths.status)
-        return str(status.get("ended") or "") if isinstance(status, dict) else ""
-    return ""
+def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
+    """Judge who lives, and whether the pool answers, as `fogft status` does."""
+    proxy, up = seen.status.proxy_alive, f"run `fogft up {seen.status.file}`"
+    if seen.manager_alive:
+        yield ok("manager", f"pool `{pool}`: runs")
+    else:
+        goes_on = "requests continue, but lost replicas are not replaced"
+        what = goes_on if seen.answers else "nothing is replaced or started"
+        yield warn("manager", f"pool `{pool}` has none: {what}", f"{up}, or `fogft down {pool}`")
+    if proxy:
+        yield ok("client proxy", f"pool `{pool}`: runs")
+    else:
+        log = PoolPaths.of(pool).proxy_log.name
+        remedy = f"its manager starts it; see `{log}`" if seen.manager_alive else up
+        yield fail("client proxy", f"pool `{pool}` has none: no request is answered", remedy)
+    if seen.answers:
+        yield ok("answers", f"pool `{pool}`: each service has a ready replica")
+    elif seen.answers is None and not seen.links_known:
+        yield warn("answers", f"pool `{pool}`: nobody knows", "see `links` and `client proxy`")
+    elif seen.answers is False and proxy and seen.status.target:
+        listed = ", ".join(f"`{name}`" for name in seen.unanswered)
+        yield fail("answers", f"pool `{pool}`: no replica answers {listed}", "see `fogft status`")
 
 
 def links(situation: Situation) -> Iterator[Finding]:
@@ -150,7 +154,9 @@ def links(situation: Situation) -> Iterator[Finding]:
             yield fail(
                 "links",
                 f"pool `{pool}`: its client proxy last reported {age_s:.0f} s ago",
-                f"it hangs or is stopped; end process {report.pid}: the manager starts another",
+                f"it hangs or is stopped; end process {report.pid}: the manager starts another"
+                if disk.is_locked(paths.manager_lock)
+                else f"it hangs or is stopped; end process {report.pid}, then {_UP}",
             )
         else:
             yield from judge_links(pool, report.links)

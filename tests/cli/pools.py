@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,6 +91,33 @@ STATUS = PoolStatus(
 )  # fmt: skip
 
 
+def report(paths: PoolPaths, status: PoolStatus = STATUS, *, age_s: float = 0.2) -> None:
+    """Write what the client proxy would report of such a pool."""
+    names = [service.name for service in status.services]
+    links = [
+        {
+            "slot": one.slot, "generation": one.generation, "state": one.link,
+            "ready": names if one.phase == "ready" and one.link == "up" else [],
+            "heard_age_s": 0.1, "rtt_s": one.rtt_s, "won": one.won, "in_flight": one.in_flight,
+        }
+        for one in status.replicas if one.link
+    ]  # fmt: skip
+    written = {
+        "pid": 4712, "written_at": time.time() - age_s, "links": links,
+        "services": {service.name: service.counters for service in status.services},
+        "uplink_suspected": status.uplink_suspected,
+        "robot": status.topology.get("robot", ""),
+    }  # fmt: skip
+    disk.write_json(paths.proxy_status, written)
+
+
+@contextmanager
+def alive(paths: PoolPaths) -> Iterator[None]:
+    """Hold the locks of a manager and a client proxy, as long as these would live."""
+    with disk.locked(paths.manager_lock), disk.locked(paths.proxy_lock):
+        yield
+
+
 def lay_down(home: Path, status: PoolStatus | None = STATUS, *, age_s: float = 0.4) -> PoolPaths:
     """Write a pool's files as `up` and a manager leave them."""
     name = status.pool if status else "planner"
@@ -99,5 +128,6 @@ def lay_down(home: Path, status: PoolStatus | None = STATUS, *, age_s: float = 0
     if status is not None:
         observed: dict[str, Any] = replace(status, observed_at=time.time() - age_s).to_json()
         disk.write_json(paths.status, observed)
+        report(paths, status)
     write_identity(paths, Identity(name, UID, "local", FILE, time.time()))
     return paths

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from fogft.model.replica import LinkReport, LinkState, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.ros import environment
-from tests.cli.pools import lay_down
+from tests.cli.pools import FILE, STATUS, alive, lay_down, report
 from tests.needs import needs
 
 UID = "0123456789abcdef"
@@ -247,13 +248,33 @@ def test_a_damaged_certificate_is_found(folder):
 
 
 def test_missing_processes_are_found_and_living_ones_seen(tmp_path):
-    paths = PoolPaths.of("planner", tmp_path)
-    paths.folder.mkdir(parents=True)
+    paths = lay_down(tmp_path)
     manager, proxy = pools.processes(situation(tmp_path, "planner"))
     assert (manager.verdict, proxy.verdict) == (Verdict.WARN, Verdict.FAIL)
-    with disk.locked(paths.manager_lock), disk.locked(paths.proxy_lock):
+    assert "nothing is replaced" in manager.text
+    assert proxy.advice == f"run `fogft up {FILE}`", "what works in this state"
+    with disk.locked(paths.manager_lock):
+        _, proxy, *_ = pools.processes(situation(tmp_path, "planner"))
+    assert proxy.advice.startswith("its manager starts it")
+    with alive(paths):
         found = list(pools.processes(situation(tmp_path, "planner")))
-    assert [f.verdict for f in found] == [Verdict.OK, Verdict.OK]
+    assert [f.verdict for f in found] == [Verdict.OK] * 3
+    assert found[-1].check == "answers"
+
+
+def test_a_doctor_says_of_answers_what_status_says(tmp_path):
+    """No replica that is up: the pool does not answer, though all of its processes run."""
+    gone = replace(STATUS, replicas=[replace(one, link="suspect") for one in STATUS.replicas])
+    paths = lay_down(tmp_path, gone)
+    with alive(paths):
+        *_, answers = pools.processes(situation(tmp_path, "planner"))
+        assert (answers.verdict, answers.text) == (
+            Verdict.FAIL,
+            "pool `planner`: no replica answers `/plan`",
+        )
+        report(paths, gone, age_s=30)
+        *_, answers = pools.processes(situation(tmp_path, "planner"))
+        assert answers.verdict is Verdict.WARN
 
 
 def test_silent_links_are_found():

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from fogft import disk
-from tests.cli.pools import STATUS, lay_down
+from tests.cli.pools import STATUS, alive, lay_down
 
 
 @contextmanager
@@ -52,11 +52,11 @@ def test_logs_are_followed(home):
 
 def test_a_watched_status_is_said_again_and_again(home):
     paths = lay_down(home)
-    with disk.locked(paths.manager_lock), going_on("status", "--watch", "--json") as process:
+    with alive(paths), going_on("status", "--watch", "--json") as process:
         assert process.stdout is not None
-        assert json.loads(process.stdout.readline())["ready"] == 1
-        disk.write_json(paths.status, replace(STATUS, ready=3).to_json())
-        while json.loads(process.stdout.readline())["ready"] != 3:
+        assert json.loads(process.stdout.readline())["target"] == 3
+        disk.write_json(paths.status, replace(STATUS, target=5).to_json())
+        while json.loads(process.stdout.readline())["target"] != 5:
             pass
         assert interrupted(process)
 
@@ -65,7 +65,7 @@ def test_a_watch_ends_with_its_pool(home):
     paths = lay_down(home)
     with going_on("status", "--watch") as process:
         assert process.stdout is not None
-        assert process.stdout.readline().startswith("planner  1 of 3 ready")
+        assert process.stdout.readline().startswith("planner  not answering")
         paths.status.unlink()
         paths.identity.unlink()
         _, stderr = process.communicate(timeout=30)
@@ -78,7 +78,7 @@ def test_a_reader_that_leaves_ends_it_without_a_trace(home):
     lay_down(home)
     with going_on("status", "--watch") as process:
         assert process.stdout is not None
-        assert process.stdout.readline().startswith("planner  1 of 3 ready")
+        assert process.stdout.readline().startswith("planner  not answering")
         process.stdout.close()
         assert process.wait(30) == 141
         assert process.stderr is not None

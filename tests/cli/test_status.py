@@ -12,18 +12,21 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
+import time
 from dataclasses import fields, replace
 
 import pytest
 
 from fogft import disk
-from fogft.cli import main
+from fogft.cli import main, status
 from fogft.cli.status_text import age, milliseconds, number
+from fogft.pool.commands.current import Seen
 from fogft.pool.manager.status import PoolStatus
-from tests.cli.pools import FILE, STATUS, lay_down
+from tests.cli.pools import FILE, STATUS, alive, lay_down, report
 
 SCREEN = """\
-planner  1 of 3 ready  $0.063/h on local  seen 0.4 s ago
+planner  answering  1 of 3 ready  $0.063/h on local  seen 0.4 s ago
 
 REPLICA  PHASE     LOCATION                $/H  LINK            RTT    WON    AGE
 0.1      ready     local/us-west-2/a     0.021  up          0.42 ms  1 412  7 min
@@ -40,6 +43,9 @@ note: waiting after 3 failed launches (capacity)
 """
 
 
+KEYS = {f.name for f in fields(PoolStatus)} | {f.name for f in fields(Seen)} - {"status"}
+
+
 def without_age(screen: str) -> str:
     """Return a screen with the one thing in it that depends on the clock made the same."""
     return re.sub(r"seen [\d.]+ s ago", "seen 0.4 s ago", screen)
@@ -47,7 +53,7 @@ def without_age(screen: str) -> str:
 
 def test_the_screen_at_100_columns(home, capsys):
     paths = lay_down(home)
-    with disk.locked(paths.manager_lock):
+    with alive(paths):
         assert main.run(["status"]) == 0
     said = capsys.readouterr()
     assert without_age(said.out) == SCREEN
@@ -58,19 +64,19 @@ def test_a_pipe_gets_one_line_for_each_replica(home, capsys, monkeypatch):
     """Nothing is cut or broken into lines for a reader that is a program."""
     monkeypatch.delenv("COLUMNS")
     paths = lay_down(home)
-    with disk.locked(paths.manager_lock):
+    with alive(paths):
         main.run(["status"])
     rows = [line for line in capsys.readouterr().out.splitlines() if re.match(r"\d+\.\d+ ", line)]
     assert [row.split()[0] for row in rows] == ["0.1", "1.12", "2.3"]
     assert rows[1].endswith("4.2 s  `/plan` is not up yet")
 
 
-def test_json_is_the_managers_status_with_two_keys_more(home, capsys):
+def test_json_is_the_managers_status_with_what_is_known_now(home, capsys):
     paths = lay_down(home)
-    with disk.locked(paths.manager_lock):
+    with alive(paths):
         assert main.run(["status", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert set(said) == {f.name for f in fields(PoolStatus)} | {"age_s", "manager_alive"}
+    assert set(said) == KEYS
     assert said["manager_alive"] is True
     assert 0.4 <= said["age_s"] < 60
     assert said["replicas"][0] == json.loads(paths.status.read_text())["replicas"][0]
@@ -78,8 +84,9 @@ def test_json_is_the_managers_status_with_two_keys_more(home, capsys):
 
 def test_a_dead_manager_is_told_twice(home, capsys):
     """In the data, for whoever reads it alone, and as a warning with what to do."""
-    lay_down(home)
-    assert main.run(["status"]) == 0
+    paths = lay_down(home)
+    with disk.locked(paths.proxy_lock):
+        assert main.run(["status"]) == 0
     said = capsys.readouterr()
     assert "NO MANAGER" in said.out
     assert said.err == (
@@ -90,7 +97,7 @@ def test_a_dead_manager_is_told_twice(home, capsys):
 
 def test_a_manager_that_hangs_is_told(home, capsys):
     paths = lay_down(home, age_s=40)
-    with disk.locked(paths.manager_lock):
+    with alive(paths):
         main.run(["status"])
     assert re.search(
         r"the manager has not observed the pool for [4-9]\d s", capsys.readouterr().err
@@ -98,11 +105,60 @@ def test_a_manager_that_hangs_is_told(home, capsys):
 
 
 def test_what_sounds_alarm_stands_in_the_first_line(home, capsys):
-    status = replace(STATUS, proxy_alive=False, uplink_suspected=True, stopping=True)
-    lay_down(home, status)
+    status = replace(STATUS, uplink_suspected=True, stopping=True)
+    paths = lay_down(home, status)
     main.run(["status"])
     first = capsys.readouterr().out.splitlines()[0]
-    assert first.endswith("NO MANAGER  NO CLIENT PROXY  UPLINK SUSPECTED  ENDING")
+    assert first.endswith("NO MANAGER  NO CLIENT PROXY  ENDING")
+    with disk.locked(paths.proxy_lock):
+        main.run(["status"])
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.endswith("NO MANAGER  UPLINK SUSPECTED  ENDING")
+
+
+def test_what_died_long_ago_is_not_shown_as_it_was(home, capsys):
+    """78 s after everything has died: no link, no phase, no price, and no answer."""
+    paths = lay_down(home, age_s=78)
+    report(paths, age_s=78)
+    assert main.run(["status", "--check"]) == 1
+    said = capsys.readouterr()
+    first, _, _, *rows = said.out.splitlines()
+    assert first.startswith("planner  not answering  ? of 3 ready  ?/h on local  seen 78 s ago")
+    for row in rows[:3]:
+        assert re.fullmatch(r"\d\.\d+ +\? +local/\S+ +\S+ +\? +\? .*", row), row
+    assert said.err.startswith("warning: no manager runs: nothing is replaced")
+
+
+def test_a_client_proxy_that_hangs_is_not_believed(home, capsys):
+    """It lives, but its report is old: whether it answers is not known, and `--check` fails."""
+    paths = lay_down(home)
+    report(paths, age_s=12)
+    with alive(paths):
+        assert main.run(["status"]) == 0
+        assert "planner  answering?  ? of 3 ready" in (out := capsys.readouterr().out)
+        assert "links seen 12 s ago" in out
+
+
+def test_a_check_asks_each_link_anew(home, capsys, monkeypatch):
+    """A link that was up at the last report, and answers no probe now, does not count."""
+    monkeypatch.setattr(status, "CHECK_LIMIT_S", 0.2)
+    paths = lay_down(home)
+    with alive(paths):
+        assert main.run(["status", "--check"]) == 1
+    assert "not answering" in capsys.readouterr().out
+
+    def proxy() -> None:
+        for _ in range(20):
+            report(paths, age_s=-0.3)
+            time.sleep(0.05)
+
+    monkeypatch.setattr(status, "CHECK_LIMIT_S", 5.0)
+    thread = threading.Thread(target=proxy)
+    with alive(paths):
+        thread.start()
+        assert main.run(["status", "--check"]) == 0
+        thread.join()
+    assert "planner  answering" in capsys.readouterr().out
 
 
 def test_why_a_stateful_service_cannot_be_had_stands_below(home, capsys):
@@ -118,7 +174,7 @@ def test_a_pool_that_nobody_looked_at_yet_has_the_same_schema(home, capsys):
     lay_down(home, None)
     assert main.run(["status", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert set(said) == {f.name for f in fields(PoolStatus)} | {"age_s", "manager_alive"}
+    assert set(said) == KEYS
     assert said["age_s"] is None
     main.run(["status"])
     assert "not observed yet" in capsys.readouterr().out
@@ -176,7 +232,7 @@ def test_a_narrow_terminal_is_redrawn_with_lines_cut_at_their_ends(home):
     environ = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
     watch = [sys.executable, "-m", "fogft", "status", "--watch"]
     sent = b""
-    with disk.locked(paths.manager_lock):
+    with alive(paths):
         with subprocess.Popen(
             watch, stdout=follower, stderr=subprocess.PIPE, env={**environ, "TERM": "xterm"}
         ) as process:
@@ -195,7 +251,7 @@ def test_a_narrow_terminal_is_redrawn_with_lines_cut_at_their_ends(home):
 
 def test_a_terminal_gets_colour_unless_it_wants_none(home):
     paths = lay_down(home, age_s=0.0)
-    with disk.locked(paths.manager_lock):
+    with alive(paths):
         assert "\033[32mready" in on_a_terminal(home)
         for environ in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
             plain = on_a_terminal(home, **environ)
@@ -206,7 +262,7 @@ def test_a_terminal_gets_colour_unless_it_wants_none(home):
 def test_colour_moves_nothing(home, capsys):
     """The coloured screen without its codes is the plain one."""
     paths = lay_down(home)
-    with disk.locked(paths.manager_lock):
+    with alive(paths):
         coloured = on_a_terminal(home).replace("\r\n", "\n")
     stripped = re.sub(r"\033\[[0-9;]*m", "", coloured)
     lines = [

@@ -14,7 +14,7 @@ from fogft.cli import main
 from fogft.model.plain import from_plain, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
-from fogft.pool.commands.status import Seen
+from fogft.pool.commands.current import Seen
 from fogft.pool.commands.status_schema import status_schema
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager import status
@@ -30,10 +30,11 @@ FULL = Reason(
 )  # fmt: skip
 # Settled: later versions of the same number have these and more.
 KEYS = {
-    "age_s", "applied", "by_hand", "cloud", "cloud_reachable", "ended", "epoch", "events",
-    "excluded", "file", "manager_alive", "manager_pid", "notes", "observed_at", "pool",
-    "proxy_alive", "proxy_pid", "ready", "reasons", "replicas", "services", "stopping", "target",
-    "topology", "uid", "update", "uplink_suspected", "usd_per_hour", "version",
+    "age_s", "answers", "applied", "by_hand", "cloud", "cloud_reachable", "ended", "epoch",
+    "events", "excluded", "file", "links_known", "manager_alive", "manager_pid", "notes",
+    "observed_at", "pool", "proxy_alive", "proxy_pid", "ready", "reasons", "replicas",
+    "report_age_s", "services", "stopping", "target", "topology", "uid", "unanswered", "update",
+    "uplink_suspected", "usd_per_hour", "version",
 }  # fmt: skip
 
 

@@ -14,7 +14,8 @@ from fogft.errors import FogftError, SpecError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.pool.commands import composition, init, preview, startup
-from fogft.pool.commands.status import Seen, refreshed
+from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import refreshed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from fogft.reason_words import words
@@ -384,7 +385,7 @@ def test_refresh_without_a_manager_asks_the_cloud_and_says_so(home, capsys):
     assert main.run(["status", "--refresh"]) == 0
     said = capsys.readouterr()
     assert "note: no manager runs: the cloud was asked directly" in said.out
-    assert said.out.startswith("planner  0 of 3 ready  $0.000/h on local  seen 0.0 s ago")
+    assert said.out.startswith("planner  not answering  ? of 3 ready  $0.000/h on local")
 
 
 def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):

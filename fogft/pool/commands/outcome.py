@@ -11,7 +11,7 @@ from enum import Enum, auto
 
 from fogft.model.replica import Phase
 from fogft.planning.rollout import UpdateState
-from fogft.pool.commands.status import Seen
+from fogft.pool.commands.current import Seen
 
 HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
 

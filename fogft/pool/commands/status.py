@@ -1,10 +1,10 @@
 """A pool's status as a command sees it: how old it is, and whether anybody still looks.
 
-With a living manager that is the manager's last observation. With a dead one, `ask`
-looks for itself: at the cloud and at the client proxy's report, and changes nothing.
+Processes are looked at by their locks. What the manager saw is its last observation; with a dead
+manager, `ask` looks at the cloud itself, and changes nothing.
 
-Owns: reading, ageing and renewing a status.
-Not here: its schema (`status`) and how it is shown (`fogft.cli`).
+Owns: reading and renewing a status.
+Not here: its schema (`manager.status`), what is known now (`current`), showing it (`fogft.cli`).
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import contextlib
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fogft import disk
 from fogft.errors import CloudError, StateError, told
 from fogft.model.reason import Cause, Reason
+from fogft.pool.commands.current import Seen, current
 from fogft.pool.folder.paths import PoolPaths
-from fogft.pool.manager import status
+from fogft.pool.manager import proxy_report, status
 from fogft.pool.manager.status import PoolStatus
 
 if TYPE_CHECKING:
@@ -31,41 +31,51 @@ EVENTS_SHOWN = 20
 _LOOK_EVERY_S = 0.05
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A status with what its reader must know of it.
-
-    Attributes:
-        age_s: Since it was observed; None when nothing was observed yet.
-        manager_alive: Whether a manager runs now.
-    """
-
-    status: PoolStatus
-    age_s: float | None
-    manager_alive: bool
-
-    def to_json(self) -> dict[str, Any]:
-        """Return `status.json`'s schema with ``age_s`` and ``manager_alive``."""
-        return {
-            **self.status.to_json(),
-            "age_s": self.age_s,
-            "manager_alive": self.manager_alive,
-        }
-
-
 def read(paths: PoolPaths, now: float) -> Seen:
-    """Return what the manager last saw.
+    """Return what is known of a pool now.
 
     Raises:
         PoolNotFound: There is no such pool.
         StateError: The status is damaged, or another version's.
     """
-    alive = disk.is_locked(paths.manager_lock)
     raw = disk.read_json(paths.status)
-    if raw is None:
-        return Seen(_unobserved(paths), None, alive)
-    seen = status.from_json(raw)
-    return Seen(seen, max(0.0, now - seen.observed_at), alive)
+    seen = _unobserved(paths) if raw is None else status.from_json(raw)
+    return _current(paths, seen, now)
+
+
+def _current(
+    paths: PoolPaths, seen: PoolStatus, now: float, *, heard_since: float | None = None
+) -> Seen:
+    return current(
+        seen,
+        proxy_report.read(paths.proxy_status, seen.uid),
+        manager_alive=disk.is_locked(paths.manager_lock),
+        proxy_alive=disk.is_locked(paths.proxy_lock),
+        now=now,
+        heard_since=heard_since,
+    )
+
+
+def checked(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.time) -> Seen:
+    """Wait until each link has had its probe answered from now on, and return what holds then.
+
+    The client proxy probes all links by itself, at least once a second; a link that has not had
+    an answer within `limit_s` counts as suspect.
+
+    Raises:
+        PoolNotFound: There is no such pool.
+        StateError: The status is damaged, or another version's.
+    """
+    asked_at, deadline = clock(), time.monotonic() + limit_s
+    while True:
+        seen = read(paths, clock())
+        asked = _current(paths, seen.status, clock(), heard_since=asked_at)
+        links = [(*one.status.replicas, *one.status.by_hand) for one in (seen, asked)]
+        if not seen.status.proxy_alive or time.monotonic() >= deadline:
+            return asked
+        if seen.links_known and [r.link for r in links[0]] == [r.link for r in links[1]]:
+            return asked
+        time.sleep(_LOOK_EVERY_S)
 
 
 def renewed(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.time) -> Seen:
@@ -120,7 +130,6 @@ def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
     from fogft.planning.observed.history import History
     from fogft.planning.planner import Plan
     from fogft.planning.rollout import describe
-    from fogft.pool.manager import proxy_report
     from fogft.pool.manager.reconciler import Tick
 
     paths = store.paths
@@ -159,7 +168,7 @@ def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
         proxy_alive=disk.is_locked(paths.proxy_lock),
         notes=trouble,
     )
-    return Seen(found, 0.0, disk.is_locked(paths.manager_lock))
+    return _current(paths, found, now)
 
 
 def _unobserved(paths: PoolPaths) -> PoolStatus:

@@ -54,6 +54,7 @@ class ReplicaStatus:
         age_s: Since its launch; None where that was somebody else's.
         differs: The type of a service is not the same there as here; `detail` says how.
         reason: Why the verdict is not ``good``, as ``{cause, ...}``; None when it is.
+        known: Whether `phase` and `link` are known now; else `phase` is what was last seen.
     """
 
     slot: int
@@ -75,6 +76,7 @@ class ReplicaStatus:
     detail: str
     differs: bool = False
     reason: Reason | None = None
+    known: bool = True
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from fogft.planning.rollout import UpdateState
+from fogft.pool.commands.current import Seen
 from fogft.pool.commands.outcome import HOPELESS_RESTARTS, Awaited, Outcome
-from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from tests.cli.pools import REPLICA, STATUS
 
