@@ -269,31 +269,23 @@ class Dialer(Protocol):
 
 
 class Incoming(Protocol):
-    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing."""
+    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing.
 
-    @property
-    def service(self) -> str:
-        """Name of the service asked for."""
+    Attributes:
+        service: Name of the service asked for.
+        request_id: 16 bytes, made by the client proxy.
+        robot: Who asks; replies to one robot never wait for another.
+        remaining_s: Time that was left when the robot sent it.
+        spare: It is to be dropped where it would have to wait.
+        payload: The serialised request (CDR).
+    """
 
-    @property
-    def request_id(self) -> bytes:
-        """16 bytes, made by the client proxy."""
-
-    @property
-    def robot(self) -> str:
-        """Who asks; replies to one robot never wait for another."""
-
-    @property
-    def remaining_s(self) -> float:
-        """Time that was left when the robot sent it."""
-
-    @property
-    def spare(self) -> bool:
-        """Whether it is to be dropped where it would have to wait."""
-
-    @property
-    def payload(self) -> bytes:
-        """The serialised request (CDR)."""
+    service: str
+    request_id: bytes
+    robot: str
+    remaining_s: float
+    spare: bool
+    payload: bytes
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
         """Send the serialised response. Never blocks.

@@ -13,6 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
 from fogft.metrics.families import Labels, text
+from fogft.model.names import host_and_port
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
@@ -58,9 +59,8 @@ class Scrape:
         self._wanted = endpoint
         if not endpoint:
             return
-        host, _, port = endpoint.rpartition(":")
         try:
-            self._server = _Server((host.strip("[]"), int(port)), self._tell)
+            self._server = _Server(host_and_port(endpoint), self._tell)
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))
             return

@@ -117,5 +117,15 @@ def is_endpoint(text: str) -> bool:
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
 
 
+def host_and_port(endpoint: str) -> tuple[str, int]:
+    """Return both parts of ``host:port``, an IPv6 address without its brackets.
+
+    Raises:
+        ValueError: There is no number.
+    """
+    host, _, port = endpoint.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
 Endpoint = Annotated[str, only(is_endpoint, "`host:port`")]
 EndpointOrEmpty = Annotated[str, only(lambda text: not text or is_endpoint(text), "`host:port`")]

@@ -17,6 +17,7 @@ from typing import Any
 
 from fogft.errors import CredentialError, WireError
 from fogft.model.credentials import CredentialPaths
+from fogft.model.names import host_and_port
 from fogft.records import frames
 from fogft.records.exchange import SILENCE_S, Connection
 from fogft.records.record import RecordError
@@ -41,9 +42,8 @@ class Caller:
     def __init__(
         self, endpoint: str, credentials: CredentialPaths, signer: Signer, pool_uid: str
     ) -> None:
-        host, _, port = endpoint.rpartition(":")
         self._endpoint = endpoint
-        self._address = (host.strip("[]"), int(port))
+        self._address = host_and_port(endpoint)
         self._credentials = credentials
         self._signer = signer
         self._pool_uid = pool_uid

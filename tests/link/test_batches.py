@@ -149,7 +149,7 @@ def test_each_leaves_once_in_order_and_fits(steps: list[tuple[str, int] | None])
         else:
             service, size = step
             one = OpenAttempt(
-                service, request_id(number), bytes(size), offered=0.0, remaining_s=1.0
+                service, request_id(number), bytes(size), size, offered=0.0, deadline=1.0
             )
             came.append(one)
             leaving = held.add(one)

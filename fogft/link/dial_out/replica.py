@@ -17,7 +17,8 @@ from collections.abc import Iterable, Mapping
 
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
-from fogft.link.dial_out.tunnel import Tunnel, hang_up, keep_alive
+from fogft.link.dial_out.tunnel import Tunnels, hang_up, keep_alive
+from fogft.model.names import host_and_port
 from fogft.records import frames
 from fogft.records.record import RecordError, Sign
 
@@ -39,15 +40,14 @@ class DialOut:
     """
 
     def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:
-        host, _, port = local.rpartition(":")
-        everywhere = {"0.0.0.0": "127.0.0.1", "[::]": "::1"}
-        self._local = (everywhere.get(host, host.strip("[]")), int(port))
+        host, port = host_and_port(local)
+        self._local = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), port
         self._pool_uid = pool_uid
         self._sign = sign
         self._lock = threading.Lock()
         self._targets: dict[str, threading.Event] = {}  # set when the door is not wanted any more
         self._details: dict[str, str] = {}
-        self._tunnels: set[Tunnel] = set()
+        self._tunnels = Tunnels()
 
     def follow(self, doors: Iterable[str]) -> None:
         """Wait at these doors (``host:port``) and at no others. What is in use goes on."""
@@ -76,10 +76,7 @@ class DialOut:
     def close(self) -> None:
         """Leave all doors and end what is in use. Repeatable."""
         self.follow(())
-        with self._lock:
-            tunnels = list(self._tunnels)
-        for joined in tunnels:
-            joined.close()
+        self._tunnels.close()
 
     # -- a thread for each waiting connection -------------------------------------------------
 
@@ -102,8 +99,7 @@ class DialOut:
 
     def _come(self, door: str) -> socket.socket:
         """Return a connection on which the door was told who we are."""
-        host, _, port = door.rpartition(":")
-        link = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_TIMEOUT_S)
+        link = socket.create_connection(host_and_port(door), _CONNECT_TIMEOUT_S)
         try:
             keep_alive(link)
             nonce, _ = frames.read_challenge(tunnel.receive(link, 4 << 10, _GREETING_TIMEOUT_S))
@@ -144,14 +140,7 @@ class DialOut:
             hang_up(link)
             raise
         own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        tunnel = Tunnel(link, own, self._ended)
-        with self._lock:
-            self._tunnels.add(tunnel)
-        tunnel.start()
-
-    def _ended(self, tunnel: Tunnel) -> None:
-        with self._lock:
-            self._tunnels.discard(tunnel)
+        self._tunnels.carry(link, own)
 
     def _say(self, door: str, detail: str) -> None:
         with self._lock:

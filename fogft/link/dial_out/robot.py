@@ -25,8 +25,9 @@ from collections.abc import Callable, Collection, Mapping
 from fogft.errors import WireError
 from fogft.link.counters import Counters
 from fogft.link.dial_out import tunnel
-from fogft.link.dial_out.tunnel import Tunnel, hang_up, keep_alive
+from fogft.link.dial_out.tunnel import Tunnels, hang_up, keep_alive
 from fogft.model.credentials import Role, holder_of
+from fogft.model.names import host_and_port
 from fogft.model.replica import ReplicaId
 from fogft.records import frames
 from fogft.records.record import RecordError, Verify
@@ -81,7 +82,7 @@ class DialIn:
         self._lock = threading.Condition()
         self._waiting: dict[ReplicaId, deque[_Waiting]] = {}
         self._local: dict[ReplicaId, socket.socket] = {}
-        self._tunnels: set[Tunnel] = set()
+        self._tunnels = Tunnels()
         self._greeting = 0
         self._closed = False
         self._door = _listening(listen)
@@ -236,10 +237,7 @@ class DialIn:
                 link.close()  # the link tries again soon
                 continue
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            tunnel = Tunnel(link, one.link, self._tunnel_ended)
-            with self._lock:
-                self._tunnels.add(tunnel)
-            tunnel.start()
+            self._tunnels.carry(link, one.link)
             self._counters.add("tunnels")
 
     def _take(self, id: ReplicaId) -> _Waiting | None:
@@ -265,10 +263,6 @@ class DialIn:
                     return one
             hang_up(one.link)
 
-    def _tunnel_ended(self, tunnel: Tunnel) -> None:
-        with self._lock:
-            self._tunnels.discard(tunnel)
-
     # -- the owner ----------------------------------------------------------------------------
 
     def waiting(self) -> Mapping[ReplicaId, int]:
@@ -290,13 +284,11 @@ class DialIn:
         self.keep(())
         with self._lock:
             waiting = [one for queue in self._waiting.values() for one in queue]
-            tunnels = list(self._tunnels)
             self._lock.notify_all()
         for one in waiting:
             with contextlib.suppress(OSError):
                 one.link.shutdown(socket.SHUT_RDWR)
-        for joined in tunnels:
-            joined.close()
+        self._tunnels.close()
 
 
 def _drained(link: socket.socket) -> bool:
@@ -318,11 +310,11 @@ def _drained(link: socket.socket) -> bool:
 
 
 def _listening(listen: str) -> socket.socket:
-    host, _, port = listen.rpartition(":")
     try:
+        host, port = host_and_port(listen)
         bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind((host.strip("[]"), int(port)))
+        bound.bind((host, port))
         bound.listen(64)
     except (OSError, ValueError, OverflowError) as error:
         words = getattr(error, "strerror", None) or str(error)

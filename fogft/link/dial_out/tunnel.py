@@ -12,7 +12,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import Any
 
 from fogft.records import frames
@@ -67,52 +67,51 @@ def hang_up(link: socket.socket) -> None:
     link.close()
 
 
-class Tunnel:
-    """Carries bytes between two connections, and closes both.
+class Tunnels:
+    """Pairs of connections, the bytes of each carried to the other. Any thread."""
 
-    Args:
-        one: A connected socket.
-        other: Another.
-        ended: Called once when both directions have ended.
-    """
-
-    def __init__(
-        self, one: socket.socket, other: socket.socket, ended: Callable[[Tunnel], None]
-    ) -> None:
-        self._ends = (one, other)
-        self._ended = ended
+    def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._open = 2
-        for link in self._ends:
-            link.setblocking(True)
+        self._open: set[socket.socket] = set()  # with both directions open, or one
 
-    def start(self) -> None:
-        """Begin to carry."""
-        one, other = self._ends
-        for source, target in ((one, other), (other, one)):
+    def carry(self, one: socket.socket, other: socket.socket) -> None:
+        """Join two connected sockets, and close both when both directions have ended."""
+        ends = (one, other)
+        for link in ends:
+            link.setblocking(True)
+        with self._lock:
+            self._open.update(ends)
+        left = [other, one]  # directions that go on; list.pop is atomic
+        for source, target in (ends, ends[::-1]):
             threading.Thread(
-                target=self._carry, args=(source, target), name="fogft-tunnel", daemon=True
+                target=self._carry, args=(source, target, left), name="fogft-tunnel", daemon=True
             ).start()
 
-    def _carry(self, source: socket.socket, target: socket.socket) -> None:
+    def _carry(
+        self, source: socket.socket, target: socket.socket, left: list[socket.socket]
+    ) -> None:
         try:
             _splice(source.fileno(), target.fileno())
             target.shutdown(socket.SHUT_WR)  # the other direction may go on
         except (OSError, ValueError):
-            self.close()
-        with self._lock:
-            self._open -= 1
-            last = self._open == 0
-        if last:
-            for link in self._ends:
-                link.close()
-            self._ended(self)
+            _end((source, target))
+        left.pop()
+        if not left:
+            with self._lock:
+                self._open -= {source, target}
+            source.close()
+            target.close()
 
     def close(self) -> None:
-        """End both connections. Their threads close the sockets."""
-        for link in self._ends:
-            with contextlib.suppress(OSError):
-                link.shutdown(socket.SHUT_RDWR)
+        """End all. Their threads close the sockets."""
+        with self._lock:
+            _end(self._open)
+
+
+def _end(links: Iterable[socket.socket]) -> None:
+    for link in links:
+        with contextlib.suppress(OSError):
+            link.shutdown(socket.SHUT_RDWR)
 
 
 def _splice(source: int, target: int) -> None:

@@ -15,6 +15,7 @@ from fogft.errors import CredentialError
 from fogft.link.port import Peer
 from fogft.link.zenoh.validity import judged_here, judged_there, validity_of
 from fogft.model.credentials import CredentialPaths
+from fogft.model.names import host_and_port
 
 # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
 _OUT_OF_TIME = (9, 10)
@@ -36,13 +37,12 @@ def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
         credentials: Our side.
         timeout_s: The most that each of its steps may take.
     """
-    host, _, port = peer.endpoint.rpartition(":")
     try:
         context = _context(credentials)
     except CredentialError as error:
         return error.message
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as raw:
+        with socket.create_connection(host_and_port(peer.endpoint), timeout_s) as raw:
             with context.wrap_socket(raw) as link:
                 return _after_handshake(link, peer)
     except ssl.SSLError as error:
@@ -118,11 +118,10 @@ def _clock_words(
 
 def _certificate_of(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> bytes:
     """Return the certificate (DER) that stands at an endpoint, whoever's it is; to look at only."""
-    host, _, port = peer.endpoint.rpartition(":")
     context = _context(credentials)
     context.verify_mode = ssl.CERT_NONE
     with contextlib.suppress(OSError, ValueError):
-        with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as raw:
+        with socket.create_connection(host_and_port(peer.endpoint), timeout_s) as raw:
             with context.wrap_socket(raw) as link:
                 return link.getpeercert(binary_form=True) or b""
     return b""

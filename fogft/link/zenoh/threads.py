@@ -12,9 +12,15 @@ seconds.
 from __future__ import annotations
 
 import atexit
+import logging
 import threading
 import time
 import weakref
+from typing import Any
+
+import zenoh
+
+log = logging.getLogger(__name__)
 
 _idents: set[int] = set()
 
@@ -37,6 +43,22 @@ _leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
 def join_at_exit(thread: threading.Thread) -> None:
     """Have the process wait for this thread when it ends. The thread must be about to end."""
     _leaving.add(thread)
+
+
+def close_session(session: Any) -> None:
+    """Close a Zenoh session. May take 10 s: so long Zenoh waits for a frozen peer."""
+    try:
+        session.close()
+    except zenoh.ZError as error:  # that peer has data in flight
+        log.debug("session_closed_late reason=%r", str(error))
+
+
+def close_aside(session: Any, name: str) -> threading.Thread:
+    """Close a Zenoh session in a thread of its own, which the process waits for when it ends."""
+    closer = threading.Thread(target=close_session, args=(session,), name=name, daemon=True)
+    closer.start()
+    join_at_exit(closer)
+    return closer
 
 
 @atexit.register

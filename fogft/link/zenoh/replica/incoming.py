@@ -19,7 +19,10 @@ from fogft.requests.load import Load
 class ZenohIncoming:
     """A request that came over Zenoh; see `port.Incoming`."""
 
-    __slots__ = ("_header", "_payload", "_queues", "_service", "_streams", "_thin", "_work_queue")
+    __slots__ = (
+        *("_header", "_queues", "_streams", "_thin", "_work_queue"),
+        *("payload", "remaining_s", "request_id", "robot", "service", "spare"),
+    )
 
     def __init__(
         self,
@@ -33,42 +36,16 @@ class ZenohIncoming:
         thin: Callable[[bytes], bool],
     ) -> None:
         self._thin = thin
-        self._service = service
         self._header = header
-        self._payload = payload
+        self.service = service
+        self.payload = payload
+        self.request_id = header.request_id
+        self.robot = header.robot
+        self.remaining_s = header.remaining_s
+        self.spare = header.spare
         self._streams = [stream]  # taken by the first answer; list.pop is atomic
         self._queues = queues
         self._work_queue = work
-
-    @property
-    def service(self) -> str:
-        """Name of the service asked for."""
-        return self._service
-
-    @property
-    def request_id(self) -> bytes:
-        """16 bytes, made by the client proxy."""
-        return self._header.request_id
-
-    @property
-    def robot(self) -> str:
-        """Who asks."""
-        return self._header.robot
-
-    @property
-    def remaining_s(self) -> float:
-        """Time that was left when the robot sent it."""
-        return self._header.remaining_s
-
-    @property
-    def spare(self) -> bool:
-        """Whether it is to be dropped where it would have to wait."""
-        return self._header.spare
-
-    @property
-    def payload(self) -> bytes:
-        """The serialised request (CDR)."""
-        return self._payload
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
         """Send the serialised response. Never blocks. With `more`, others will soon follow."""
@@ -83,10 +60,11 @@ class ZenohIncoming:
             stream = self._streams.pop()
         except IndexError:
             return  # answered before
-        self._payload = b""
+        self.payload = b""
         header = self._header
         packs = header.may_pack or (header.reads_packed and self._thin(header.token))
-        reply = Reply(stream, header.request_id, payload, refusal, load=load, may_pack=packs)
+        said = frame.encode_load(load)
+        reply = Reply(stream, header.request_id, payload, refusal, said, may_pack=packs)
         self._queues.put(header.token, header.robot, reply, more=more)
 
     def __del__(self) -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import TypeVar
@@ -39,7 +38,6 @@ from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
-from fogft.link.zenoh.threads import join_at_exit
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths
@@ -313,19 +311,7 @@ class ZenohListener:
         self._queues.close(_CLOSE_WAIT_S / 2)
         sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
         self._work_queue.close()
-        closer = threading.Thread(
-            target=_close, args=(session,), name="fogft-close-listener", daemon=True
-        )
-        closer.start()
-        join_at_exit(closer)
-        closer.join(_CLOSE_WAIT_S / 2)
-
-
-def _close(session: zenoh.Session) -> None:
-    try:
-        session.close()  # type: ignore[no-untyped-call]
-    except zenoh.ZError as error:  # a robot is frozen with replies in flight; Zenoh waits 10 s
-        log.debug("session_closed_late reason=%r", str(error))
+        threads.close_aside(session, "fogft-close-listener").join(_CLOSE_WAIT_S / 2)
 
 
 def _with_port(listen: str) -> str:

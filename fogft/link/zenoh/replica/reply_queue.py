@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 
@@ -26,11 +27,11 @@ from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
 from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.model.refusal import Refusal
-from fogft.requests.load import Load
 
 log = logging.getLogger(__name__)
 
 
+@dataclass(slots=True, eq=False)
 class Reply:
     """One answer: a payload, or a refusal where that is not empty.
 
@@ -40,24 +41,12 @@ class Reply:
         may_pack: It may be compressed: its robot's link was seen to be thin.
     """
 
-    __slots__ = ("load", "may_pack", "payload", "refusal", "request_id", "stream")
-
-    def __init__(
-        self,
-        stream: Stream,
-        request_id: bytes,
-        payload: bytes,
-        refusal: str,
-        *,
-        load: Load | None = None,
-        may_pack: bool = False,
-    ) -> None:
-        self.stream = stream
-        self.load = frame.encode_load(load)
-        self.request_id = request_id
-        self.payload = payload
-        self.refusal = refusal
-        self.may_pack = may_pack
+    stream: Stream
+    request_id: bytes
+    payload: bytes
+    refusal: str
+    load: bytes = frame.NO_LOAD
+    may_pack: bool = False
 
     @property
     def joins(self) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import zenoh
 
@@ -19,31 +20,25 @@ from fogft.model import refusal
 from fogft.model.refusal import Refusal
 
 
+@dataclass(slots=True, eq=False)
 class OpenAttempt:
-    """A request on its way through one connection."""
+    """A request on its way through one connection.
 
-    __slots__ = (
-        *("deadline", "mark", "offered", "payload", "request_id", "service", "size", "spare"),
-    )
+    Attributes:
+        payload: None once it was sent, or is not wanted.
+        size: Bytes of its payload.
+        offered: When, and until when it is of use, in monotonic seconds.
+        mark: What the connection had sent once this was sent (`credit`).
+    """
 
-    def __init__(
-        self,
-        service: str,
-        request_id: bytes,
-        payload: bytes,
-        *,
-        offered: float,
-        remaining_s: float,
-        spare: bool = False,
-    ) -> None:
-        self.service = service
-        self.spare = spare
-        self.request_id = request_id
-        self.payload: bytes | None = payload  # None once it was sent, or is not wanted
-        self.size = len(payload)
-        self.offered = offered
-        self.deadline = offered + remaining_s
-        self.mark = 0  # what the connection had sent once this was sent (`credit`)
+    service: str
+    request_id: bytes
+    payload: bytes | None
+    size: int
+    offered: float
+    deadline: float
+    spare: bool = False
+    mark: int = 0
 
 
 def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:

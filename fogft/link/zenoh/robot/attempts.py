@@ -42,7 +42,7 @@ _ZENOH_HOLDS_BYTES = 2 * 65535
 _WATCH_S = 5.0
 
 # In the queue, in place of an attempt: tell the replica of what was forgotten.
-_TELL = OpenAttempt("", b"", b"", offered=0.0, remaining_s=0.0)
+_TELL = OpenAttempt("", b"", None, 0, 0.0, 0.0)
 
 
 class Outlet(Protocol):
@@ -165,7 +165,7 @@ class Attempts:
             return False
         now = time.monotonic()
         attempt = OpenAttempt(
-            service, request_id, payload, offered=now, remaining_s=remaining_s, spare=spare
+            service, request_id, payload, len(payload), now, now + remaining_s, spare
         )
         if not self._deadline.may_arrive(attempt, remaining_s, now, self._before):
             return False

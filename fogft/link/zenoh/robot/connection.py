@@ -14,12 +14,10 @@ up (`link`).
 
 from __future__ import annotations
 
-import logging
 import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import zenoh
 from zenoh import handlers
@@ -35,11 +33,8 @@ from fogft.link.zenoh.robot.attempt import read_reply
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.sockets import address
-from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names, refusal
 from fogft.model.refusal import Refusal
-
-log = logging.getLogger(__name__)
 
 _ALL = zenoh.QueryTarget.ALL
 # NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
@@ -117,7 +112,7 @@ class Connection:
                 for name, key in keys.items()
             }
         except BaseException:
-            _close_aside(self._session, peer)
+            threads.close_aside(self._session, f"fogft-close-{peer.id.short}")
             raise
         self.attempts = Attempts(
             self,
@@ -127,7 +122,7 @@ class Connection:
             gate=shared.gate,
             cancellations=Cancellations() if shared.tell_losers else None,
             tell=tell,
-            ended=partial(_close, self._session),
+            ended=partial(threads.close_session, self._session),
             name=f"fogft-send-{peer.id.short}",
         )
 
@@ -303,18 +298,3 @@ class Connection:
     def join(self, timeout_s: float) -> None:
         """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
         self.attempts.join(timeout_s)
-
-
-def _close(session: Any) -> None:
-    try:
-        session.close()
-    except zenoh.ZError as error:  # the peer is frozen with data in flight; Zenoh waits 10 s
-        log.debug("session_closed_late reason=%r", str(error))
-
-
-def _close_aside(session: Any, peer: Peer) -> None:
-    closer = threading.Thread(
-        target=_close, args=(session,), name=f"fogft-close-{peer.id.short}", daemon=True
-    )
-    closer.start()
-    join_at_exit(closer)

@@ -51,7 +51,7 @@ def test_an_answer_finds_its_request_once(steps: list[tuple[bool, int]], limit: 
     unanswered, sent = Unanswered(limit), {}
     for sends, number in steps:
         if sends:
-            attempt = OpenAttempt("/s", request_id(number), b"", offered=0.0, remaining_s=1.0)
+            attempt = OpenAttempt("/s", request_id(number), b"", 0, offered=0.0, deadline=1.0)
             unanswered.add(attempt)
             sent[number] = attempt
         else:

@@ -74,7 +74,7 @@ class Scene:
             cancellations=Cancellations(),
             tell=Callbacks(
                 answered=self.answers.append,
-                late=lambda service, id: self.late.append(id),
+                late=lambda answer: self.late.append(answer.request_id),
                 room=lambda: None,
                 large=lambda: None,
                 lost=lambda: None,

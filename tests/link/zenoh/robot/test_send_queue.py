@@ -13,7 +13,7 @@ from fogft.link.zenoh.robot.send_queue import SendQueue
 
 def attempt(service: str, born: float, number: int = 0) -> OpenAttempt:
     id = number.to_bytes(16, "big")
-    return OpenAttempt(service, id, b"payload", offered=born, remaining_s=10.0)
+    return OpenAttempt(service, id, b"payload", 7, offered=born, deadline=born + 10.0)
 
 
 def taken(queue: SendQueue) -> list[OpenAttempt]:
