@@ -1,7 +1,7 @@
 """``fogft scale | drain | exclude | include``: change what a running pool aims for.
 
-Each writes the pool's intent and returns; the manager acts on it in its next tick, even if
-it is killed and started again in between.
+Each writes the pool's intent and returns, or with `--wait` once it is carried out; the manager
+acts on it in its next tick, even if it is killed and started again in between.
 """
 
 from __future__ import annotations
@@ -21,38 +21,48 @@ if TYPE_CHECKING:
 
 Count = Annotated[int, typer.Argument(min=1, max=16, metavar="N", help="How many.")]
 
+Wait = Annotated[bool, typer.Option("--wait", help="Return once it is done.")]
+
 
 scale = group("Add or remove replicas.")
 
 
 @scale.command("up", cls=Command, epilog="fogft scale up 1")
-def scale_up(count: Count, pool: PoolOption = None) -> None:
+def scale_up(count: Count, wait: Wait = False, pool: PoolOption = None) -> None:
     """Add N replicas.
 
     This holds until `replicas` changes in the pool file.
     """
-    _scale(pool, count)
+    _scale(pool, count, wait=wait)
 
 
 @scale.command("down", cls=Command, epilog="fogft scale down 1")
-def scale_down(count: Count, pool: PoolOption = None) -> None:
+def scale_down(count: Count, wait: Wait = False, pool: PoolOption = None) -> None:
     """Remove N replicas; at least one stays.
 
     This holds until `replicas` changes in the pool file. Replicas that are removed finish
     their requests first.
     """
-    _scale(pool, -count)
+    _scale(pool, -count, wait=wait)
 
 
-def drain(slot: Slot, pool: PoolOption = None) -> None:
+def drain(slot: Slot, wait: Wait = False, pool: PoolOption = None) -> None:
     """Replace one replica, starting the new one first.
 
     The old one finishes its requests and is then ended.
     """
+    from fogft.cli import progress
     from fogft.pool.commands import change, composition
+    from fogft.pool.commands.outcome import Settled
 
     store = composition.store_of(pool)
-    replica = change.drain(store, slot, time.time())
+    since = time.time()
+    generation = change.drain(store, slot, since)
+    replica = f"{slot}.{generation}"
+    if wait:
+        progress.settle(store, Settled(since, (slot, generation)), f"has not replaced `{replica}`")
+        output.done(f"replica `{replica}` of `{store.name}` is replaced")
+        return
     output.done(f"replica `{replica}` of `{store.name}` will be replaced")
     _warn_without_manager(store)
 
@@ -96,11 +106,18 @@ def include(
     _warn_without_manager(store)
 
 
-def _scale(pool: str | None, by: int) -> None:
+def _scale(pool: str | None, by: int, *, wait: bool) -> None:
+    from fogft.cli import progress
     from fogft.pool.commands import change, composition
+    from fogft.pool.commands.outcome import Settled
 
     store = composition.store_of(pool)
+    since = time.time()
     before, after = change.scale(store, by)
+    if wait:
+        progress.settle(store, Settled(since), f"does not have {after} replicas")
+        output.done(f"`{store.name}` has {after} replicas (had {before})")
+        return
     output.done(f"`{store.name}` will have {after} replicas (was {before})")
     _warn_without_manager(store)
 

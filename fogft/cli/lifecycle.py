@@ -16,9 +16,6 @@ from fogft.errors import FogftError
 if TYPE_CHECKING:
     from fogft.pool.commands.current import Seen
 
-LIMIT_S = 300.0
-REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
-
 
 def init(
     name: Annotated[
@@ -72,16 +69,20 @@ def up(
     """Start a pool, or apply a changed pool file to a running one.
 
     Returns once every service answers. Replicas that still start do so in the background. A
-    changed file whose replicas have to be replaced is waited for: `up` fails where the update
-    is stopped and rolled back.
+    changed file whose replicas have to be replaced is waited for, also by an `up` that comes while
+    the update is under way: it fails where the update is stopped and rolled back.
     """
     from fogft.cli import progress
-    from fogft.pool.commands import preview, startup
+    from fogft.planning.rollout import UpdateState
+    from fogft.pool.commands import preview, startup, status
     from fogft.pool.commands.outcome import Awaited, Outcome
     from fogft.pool.folder.paths import PoolPaths
 
     order = preview.order(file, cloud, told=output.say)
-    progress.announce(order.preview)
+    paths = PoolPaths.of(order.spec.name)
+    update = None if order.preview.is_new else status.read(paths, time.time()).status.update
+    under_way = update is not None and update.state != UpdateState.ROLLED_BACK.value
+    progress.announce(order.preview, update if under_way else None)
     may_cost_more = order.preview.is_new or order.preview.changes
     if order.preview.costs_money and may_cost_more and not yes:
         count = len(order.preview.launches) if order.preview.is_new else 0
@@ -89,19 +90,19 @@ def up(
         if not output.confirm(f"launch {machines} at these prices?" if count else "continue?"):
             output.say("nothing was done")
             raise typer.Exit(1)
-    limit_s = timeout or (REAL_LIMIT_S if order.preview.costs_money else LIMIT_S)
+    limit_s = timeout or (progress.REAL_LIMIT_S if order.preview.costs_money else progress.LIMIT_S)
     applied_at = time.time()
     if startup.start(order) and not order.preview.is_new:
         output.say("it had no manager: a new one takes over what runs")
     name = order.spec.name
-    replaces = order.preview.replaces_replicas or order.preview.rolled_back
+    replaces = order.preview.replaces_replicas or order.preview.rolled_back or under_way
     awaited = Awaited(
         frozenset(service.name for service in order.spec.services),
         applied_at,
         order.digest if replaces else "",
     )
     try:
-        seen, outcome = progress.wait(PoolPaths.of(name), awaited, limit_s)
+        seen, outcome = progress.wait(paths, awaited, limit_s)
     except KeyboardInterrupt:
         output.say(f"interrupted: `{name}` continues to start; `fogft down {name}` ends it")
         raise typer.Exit(130) from None
@@ -116,17 +117,17 @@ def up(
             Outcome.TYPES_DIFFER: "cannot answer: robot and replicas define its type differently",
         }
         raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
-    status = seen.status
-    if not status.target:
+    found = seen.status
+    if not found.target:
         output.done(f"`{name}` is set up; its schedule asks for no replica now")
         return
-    missing = max(0, status.target - status.ready)
+    missing = max(0, found.target - found.ready)
     rest = f"; {missing} more starting, see `fogft status`" if missing else ""
     if awaited.is_updating(seen):
         rest = "; the update continues, see `fogft status`"
-    for service in () if awaited.services else status.services:
+    for service in () if awaited.services else found.services:
         output.say(f"offers {service.name} ({service.type})")
-    output.done(f"`{name}` answers, with {status.ready} of {status.target} replicas ready{rest}")
+    output.done(f"`{name}` answers, with {found.ready} of {found.target} replicas ready{rest}")
 
 
 def not_answering(seen: Seen, what: str) -> FogftError:

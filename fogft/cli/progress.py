@@ -19,15 +19,19 @@ from fogft.errors import FogftError
 if TYPE_CHECKING:
     from fogft.model.spec import PoolSpec
     from fogft.pool.commands.current import Seen
-    from fogft.pool.commands.outcome import Awaited, Outcome
+    from fogft.pool.commands.outcome import Awaited, Outcome, Settled
     from fogft.pool.commands.preview import Preview
     from fogft.pool.folder.paths import PoolPaths
+    from fogft.pool.folder.store import PoolStore
+    from fogft.pool.manager.status import UpdateStatus
 
 LOOK_EVERY_S = 0.2
+LIMIT_S = 300.0
+REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
 
 
-def announce(preview: Preview) -> None:
-    """Say what will be done."""
+def announce(preview: Preview, joined: UpdateStatus | None = None) -> None:
+    """Say what will be done; `joined` is the update that is under way to this very file."""
     spec = preview.spec
     for name, problem in preview.accounts.items():
         output.say(f"`{name}` " + (f"cannot be used: {problem}" if problem else "can be used"))
@@ -46,6 +50,9 @@ def announce(preview: Preview) -> None:
                 output.say(f"  {_no_room(spec)}")
         if preview.costs_money and preview.launches:
             output.say(f"  at today's prices the pool costs ${preview.usd_per_hour:.3f}/h")
+    elif joined is not None:
+        count = f"{joined.done} of {joined.of} replicas run it"
+        output.say(f"pool `{spec.name}` is being updated to this file: {count}; waiting for it")
     elif not preview.rolled_back:
         output.say(f"pool `{spec.name}` already matches its file; nothing changes")
     for note in preview.notes:
@@ -81,7 +88,7 @@ def _show_launches(preview: Preview) -> None:
         output.say(f"  together ${preview.usd_per_hour:.3f}/h")
 
 
-def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Outcome]:
+def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tuple[Seen, Outcome]:
     """Show a pool's progress until an `up` has an outcome; return the last status and the outcome.
 
     Raises:
@@ -107,6 +114,27 @@ def wait(paths: PoolPaths, awaited: Awaited, timeout_s: float) -> tuple[Seen, Ou
             if time.monotonic() >= deadline:
                 return seen, awaited.outcome(seen, is_last=True)
             time.sleep(LOOK_EVERY_S)
+
+
+def settle(store: PoolStore, settled: Settled, what: str) -> None:
+    """Show a pool's progress until a change of it is done.
+
+    Raises:
+        FogftError: It is not within the time that an `up` waits, or there is no manager.
+    """
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.outcome import Outcome
+
+    is_local = store.identity().cloud == composition.LOCAL
+    limit_s = LIMIT_S if is_local else REAL_LIMIT_S
+    seen, outcome = wait(store.paths, settled, limit_s)
+    if outcome is not Outcome.ANSWERING:
+        found = f"{seen.status.ready} of {seen.status.target} replicas are ready"
+        notes = "".join(f"\n  {note}" for note in seen.status.notes)
+        raise FogftError(
+            f"`{store.name}` {what} after {limit_s:.0f} s: {found}{notes}",
+            "the manager goes on with it: see `fogft status` and `fogft logs`",
+        )
 
 
 @contextmanager

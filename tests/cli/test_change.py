@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import time
+from dataclasses import replace
 
 import pytest
 
 from fogft import disk
-from fogft.cli import main
-from tests.cli.pools import FILE, lay_down
+from fogft.cli import main, progress
+from fogft.pool.commands.current import Seen
+from tests.cli.pools import FILE, REPLICA, STATUS, alive, lay_down
 
 
 def wish(paths):
@@ -91,3 +94,31 @@ def test_a_pool_that_is_being_ended_takes_no_wishes(home, capsys, command):
     assert main.run(command) == 1
     assert "pool `planner` is being ended" in capsys.readouterr().err
     assert wish(paths)["target"] is None
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["scale", "up", "1", "--wait"], "done: `planner` has 4 replicas (had 3)\n"),
+        (["drain", "0", "--wait"], "done: replica `0.1` of `planner` is replaced\n"),
+    ],
+)
+def test_what_is_waited_for_is_said_when_it_is_done(home, capsys, monkeypatch, command, said):
+    """Not before the manager has seen the change, and the pool is whole again."""
+    paths = lay_down(home)
+    ready = [replace(REPLICA, slot=slot, generation=2) for slot in range(4)]
+    whole = replace(STATUS, replicas=ready, target=4, ready=4, notes=())
+    looks = iter([STATUS, whole, replace(whole, observed_at=time.time() + 60)])
+    monkeypatch.setattr("fogft.pool.commands.change.read", lambda *_: Seen(STATUS, 0.1, True))
+    monkeypatch.setattr("fogft.pool.commands.status.read", lambda *_: Seen(next(looks), 0.1, True))
+    monkeypatch.setattr(progress, "LOOK_EVERY_S", 0.0)
+    with alive(paths):
+        assert main.run(command) == 0
+    assert capsys.readouterr().err.endswith(said)
+    assert next(looks, None) is None
+
+
+def test_a_wait_without_a_manager_is_an_error(home, capsys):
+    lay_down(home)
+    assert main.run(["drain", "0", "--wait"]) == 1
+    assert "error: the manager of `planner` has ended" in capsys.readouterr().err

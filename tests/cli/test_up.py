@@ -393,3 +393,23 @@ def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
     with disk.locked(paths.manager_lock):
         with pytest.raises(FogftError, match="did not look again"):
             refreshed(composition.make_store("planner"), limit_s=0.2)
+
+
+@pytest.mark.parametrize(
+    ("end", "status", "said"),
+    [
+        (None, 0, "with 1 of 1 replicas ready\n"),
+        ("rolled back", 1, "error: `planner` was not updated: it crashes"),
+    ],
+)
+def test_an_update_that_is_under_way_is_joined(home, file, looks, capsys, end, status, said):
+    """The same file again: `up` waits for the update, and ends as that ends."""
+    paths = lay_down(home)
+    file.write_text(POOL.replace("_service", "_node"))
+    disk.write_whole(paths.spec, file.read_text())
+    last = updated(file, end, "it crashes") if end else updated(file)
+    looks(updated(file, "in progress"), updated(file, "in progress"), last)
+    assert main.run(["up", str(file)]) == status
+    err = capsys.readouterr().err
+    assert "is being updated to this file: 1 of 2 replicas run it; waiting for it" in err
+    assert said in err

@@ -29,15 +29,15 @@ def scale(store: PoolStore, by: int) -> tuple[int, int]:
     return before.wanted(spec), after.wanted(spec)
 
 
-def drain(store: PoolStore, slot: int, now: float) -> str:
-    """Have the replica in a slot replaced; return it as ``slot.generation``.
+def drain(store: PoolStore, slot: int, now: float) -> int:
+    """Have the replica in a slot replaced; return its generation.
 
     Raises:
         FogftError: There is none.
     """
     generation = generation_in(store.paths, slot, now)
     _change(store, lambda now: intent.drain(now, slot, generation))
-    return f"{slot}.{generation}"
+    return generation
 
 
 def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:

@@ -115,7 +115,7 @@ def _in_use(paths: PoolPaths, holder: Holder) -> bool:
 def rotate_replicas(store: PoolStore, slot: int | None = None) -> list[str]:
     """Have replicas replaced, the new one first, each with a key of its own; return which."""
     chosen = slots(store.paths) if slot is None else [slot]
-    return [change.drain(store, one, time.time()) for one in chosen]
+    return [f"{one}.{change.drain(store, one, time.time())}" for one in chosen]
 
 
 def _published(store: PoolStore, holders: Sequence[Holder]) -> bool:

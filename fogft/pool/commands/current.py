@@ -144,6 +144,9 @@ def _now(one: ReplicaStatus, links: _Links, seen: Seen) -> ReplicaStatus:
         in_flight=link.in_flight,
         restarts=link.restarts,
     )
+    names = {service.name for service in seen.status.services}
+    if found.phase in _COMING and link.state is LinkState.UP and names and names <= link.ready:
+        return replace(found, phase=Phase.READY.value, detail="")  # sooner than the manager saw it
     if not seen.stale:
         return found
     if link.state is not LinkState.UP or not link.ready:

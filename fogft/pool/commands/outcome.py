@@ -82,6 +82,32 @@ class Awaited:
         return status.proxy_alive and bool(ready) and names == (self.services or ready) == ready
 
 
+@dataclass(frozen=True)
+class Settled:
+    """What a `scale` or a `drain` waits for: the pool is whole, and nothing leaves any more.
+
+    Attributes:
+        since: When the change was written, in seconds since the epoch.
+        gone: Slot and generation of the replica that was to be replaced; None for no one.
+    """
+
+    since: float
+    gone: tuple[int, int] | None = None
+
+    def outcome(self, seen: Seen, *, is_last: bool = False) -> Outcome:
+        """Judge a status, the last one like any other."""
+        del is_last
+        status = seen.status
+        leaving = [
+            one
+            for one in status.replicas
+            if one.phase == Phase.DRAINING.value or (one.slot, one.generation) == self.gone
+        ]
+        if status.observed_at < self.since or leaving or status.ready < status.target:
+            return Outcome.PENDING
+        return Outcome.ANSWERING
+
+
 def keeps_ending(seen: Seen) -> bool:
     """Whether `run` has ended so often on every replica that waiting longer is no use."""
     replicas = seen.status.replicas

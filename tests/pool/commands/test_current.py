@@ -109,6 +109,15 @@ def test_a_link_counts_only_if_it_was_heard_since_it_was_asked(status, links, be
     assert {one.slot for one in found.status.replicas if one.link == "up"} <= heard
 
 
+def test_a_replica_is_ready_as_soon_as_its_link_says_so():
+    """Not only when the manager has looked again: `up` returns with the first answer."""
+    starting = replace(STATUS, observed_at=NOW - 1, replicas=(replace(REPLICA, phase="starting"),))
+    link = LinkReport(ReplicaId(UID, 0, 1), LinkState.UP, frozenset({PLAN}))
+    found = seen(starting, (link,))
+    assert (found.answers, found.status.ready) == (True, 1)
+    assert [one.phase for one in found.status.replicas] == ["ready"]
+
+
 @pytest.mark.parametrize("report", [None, ProxyReport(1, NOW - 78.0)])
 def test_all_died_and_nothing_is_said_to_run(report):
     """The state of a pool 78 s after each of its processes was killed."""

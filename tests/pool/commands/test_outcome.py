@@ -8,12 +8,13 @@ import pytest
 
 from fogft.planning.rollout import UpdateState
 from fogft.pool.commands.current import Seen
-from fogft.pool.commands.outcome import HOPELESS_RESTARTS, Awaited, Outcome
+from fogft.pool.commands.outcome import HOPELESS_RESTARTS, Awaited, Outcome, Settled
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from tests.cli.pools import REPLICA, STATUS
 
 APPLIED_AT = 10.0
 UP = replace(STATUS, notes=(), replicas=(REPLICA,), target=1, observed_at=20.0)
+LEAVING = replace(REPLICA, slot=1, phase="draining")
 SILENT = (replace(UP.services[0], ready_replicas=0),)
 STARTING = replace(REPLICA, phase="starting")
 HOPELESS = replace(STARTING, restarts=HOPELESS_RESTARTS)
@@ -91,3 +92,27 @@ def test_when_no_time_is_left_a_pool_that_answers_is_good_enough():
     stopped = updated(UpdateState.STOPPED, fault="why")
     assert outcome(stopped, UPDATE, is_last=True) is Outcome.WITHDRAWN
     assert outcome(replace(UP, services=SILENT), is_last=True) is Outcome.PENDING
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [
+        (UP, Outcome.ANSWERING),
+        (replace(UP, observed_at=9.0), Outcome.PENDING),  # seen before the change
+        (replace(UP, target=2), Outcome.PENDING),  # one more is to come
+        (replace(UP, replicas=(REPLICA, LEAVING)), Outcome.PENDING),
+        (replace(UP, replicas=(replace(REPLICA, generation=2),)), Outcome.ANSWERING),
+    ],
+)  # fmt: skip
+def test_a_change_is_done_once_the_pool_is_whole_and_nothing_leaves(status, expected):
+    assert Settled(APPLIED_AT).outcome(Seen(status, 0.1, True)) is expected
+
+
+def test_a_drain_is_done_once_the_replica_is_gone():
+    """The pool is whole all the time: the new one is there before the old one goes."""
+    drained = Settled(APPLIED_AT, gone=(0, 1))
+    both = replace(UP, replicas=(REPLICA, replace(REPLICA, generation=2)))
+    new = replace(UP, replicas=(replace(REPLICA, generation=2),))
+    assert drained.outcome(Seen(UP, 0.1, True)) is Outcome.PENDING
+    assert drained.outcome(Seen(both, 0.1, True)) is Outcome.PENDING
+    assert drained.outcome(Seen(new, 0.1, True)) is Outcome.ANSWERING
