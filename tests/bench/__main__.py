@@ -27,6 +27,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
         commands,
         faults,
         graph,
+        load,
         ordering,
         planning,
         simulation,
@@ -47,6 +48,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["killed"] = faults.killed
     found["memory"] = speed.memory
     found["hedging"] = tail.hedging
+    found["load"] = load.load
     found["cancellation"] = tail.cancellation
     found["simulation"] = simulation.simulation
     found["ordering"] = ordering.ordering

@@ -6,7 +6,7 @@ import os
 import random
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,6 +65,10 @@ class Caller:
             if time.monotonic() > limit:
                 raise TimeoutError("the services did not appear")
             time.sleep(0.02)
+
+    def ask(self, service: str, payload: bytes, answered: Callable[[], None]) -> None:
+        """Send a request, and wait for nothing."""
+        self._clients[service].call(payload, lambda _: answered())
 
     def call(self, service: str, payload: bytes) -> float:
         """Return how long one call took, in seconds.

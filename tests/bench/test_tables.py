@@ -47,6 +47,7 @@ def test_there_is_a_measurement_for_each_promise():
         "killed",
         "memory",
         "hedging",
+        "load",
         "cancellation",
         "simulation",
         "ordering",

@@ -1,0 +1,196 @@
+"""Services that do one thing at a time, from idle to full, beside a plain load balancer.
+
+Three replicas of a serial service; callers that do not wait (open loop). `haproxy` is HAProxy
+with ``leastconn`` before three HTTP servers that sleep as the service does: what a user would
+take who gives up ROS, replacement and everything else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.machine import cpu_s
+from tests.bench.rig import Rig, free_ports
+from tests.bench.service import FLAG
+from tests.estimates import percentile
+
+REPLICAS = 3
+MEDIAN_S, TIMEOUT_S = 0.02, 2.0
+# Name: sigma, share of requests that stall, for how long.
+SERVICES = {"constant": (0.0, 0.0, 0.0), "stalling": (0.3, 0.01, 0.2)}
+Ask = Callable[[Callable[[], None]], None]
+
+
+def load(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Compare the policies and HAProxy at several loads, system after system at each load.
+
+    Load is a share of what three can do. Latencies are of what was answered within 2 s; all
+    else has failed. Copies are attempts that reached a service.
+    """
+    loads = (0.1, 0.5) if quick else (0.1, 0.3, 0.5, 0.7, 0.9)
+    seconds = 6.0 if quick else 20.0
+    rows = []
+    for name, (sigma, stalled, stall_s) in SERVICES.items():
+        below = folder / name
+        below.mkdir()
+        arguments = [MEDIAN_S, sigma, stalled, stall_s, 1]
+        words = " ".join(map(str, arguments))
+        with contextlib.ExitStack() as stack:
+            policy = {"timeout_s": TIMEOUT_S}
+            rig = stack.enter_context(Rig(below, REPLICAS, services=[words] * 3, policy=policy))
+            caller = Caller(rig.robot_domain, f"bench_load_{name}")
+            stack.callback(caller.close)
+            rig.wait_ready(range(REPLICAS))
+            caller.wait()
+            peer = None
+            if shutil.which("haproxy"):
+                peer = stack.enter_context(_haproxy(below, words))
+            for share in loads:
+                for system in ("auto", "failover", "all", "haproxy"):
+                    if system != "haproxy":
+                        row = _of_rig(rig, caller, system, share, seconds)
+                    elif peer is not None:
+                        row = peer.row(share, seconds)
+                    else:
+                        continue
+                    rows.append({"service": name, "load": share, "system": system, **row})
+    return rows
+
+
+def _of_rig(rig: Rig, caller: Caller, policy: str, share: float, seconds: float) -> dict[str, Any]:
+    rig.change(hedging=policy)
+    before = rig.report(after=time.time())["services"][FLAG[0]]
+    proxies = [rig.proxy.pid, *(replica.process.pid for replica in rig.replicas)]
+    used = sum(map(cpu_s, proxies))
+    row = _offer(_asking(caller), share, seconds)
+    row["cpu_ms_per_request"] = (sum(map(cpu_s, proxies)) - used) * 1000 / row["requests"]
+    after = rig.report(after=time.time())["services"][FLAG[0]]
+    row["copies"] = (after["sent"] - before["sent"]) / row["requests"]
+    return row
+
+
+def _asking(caller: Caller) -> Ask:
+    payload = payloads()[FLAG[0]]
+    return lambda answered: caller.ask(FLAG[0], payload, answered)
+
+
+def _offer(ask: Ask, share: float, seconds: float) -> dict[str, Any]:
+    """Ask at random moments without waiting; return what became of it."""
+    per_s = share * REPLICAS / MEDIAN_S
+    source, took = random.Random(1), list[float]()
+    count, at = int(per_s * seconds), time.perf_counter()
+    for _ in range(count):
+        at += source.expovariate(per_s)
+        time.sleep(max(0.0, at - time.perf_counter()))
+        began = time.perf_counter()
+        ask(lambda began=began: took.append(time.perf_counter() - began))
+    time.sleep(TIMEOUT_S + 0.5)
+    answered = [s for s in took if s <= TIMEOUT_S]
+    ms = milliseconds(answered)
+    return {
+        "requests": count,
+        "failed": count - len(answered),
+        "p50_ms": percentile(ms, 50),
+        "p99_ms": percentile(ms, 99),
+    }
+
+
+class _Balanced:
+    """HTTP requests through HAProxy, each in a thread, over connections that stay open."""
+
+    def __init__(self, port: int, pid: int) -> None:
+        self._port = port
+        self._pid = pid
+        self._idle: list[http.client.HTTPConnection] = []
+
+    def row(self, share: float, seconds: float) -> dict[str, Any]:
+        """Return what became of requests at a load."""
+        used = cpu_s(self._pid)
+        row = _offer(self._ask_aside, share, seconds)
+        row["cpu_ms_per_request"] = (cpu_s(self._pid) - used) * 1000 / row["requests"]
+        return {**row, "copies": 1.0}
+
+    def _ask_aside(self, answered: Callable[[], None]) -> None:
+        threading.Thread(target=self._ask, args=(answered,), daemon=True).start()
+
+    def _ask(self, answered: Callable[[], None]) -> None:
+        with contextlib.suppress(OSError, http.client.HTTPException):
+            try:
+                connection = self._idle.pop()
+            except IndexError:
+                connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=10)
+            connection.request("POST", "/", b"1")
+            response = connection.getresponse()
+            response.read()
+            self._idle.append(connection)
+            if response.status == 200:
+                answered()
+
+
+@contextlib.contextmanager
+def _haproxy(folder: Path, words: str) -> Iterator[_Balanced]:
+    front, *backs = free_ports(1 + REPLICAS)
+    servers = "".join(f"  server s{n} 127.0.0.1:{port}\n" for n, port in enumerate(backs))
+    config = folder / "haproxy.cfg"
+    config.write_text(
+        "defaults\n  mode http\n  timeout connect 5s\n  timeout client 60s\n  timeout server 60s\n"
+        f"frontend in\n  bind 127.0.0.1:{front}\n  default_backend out\n"
+        f"backend out\n  balance leastconn\n{servers}"
+    )
+    module = "tests.bench.load"
+    processes = [
+        subprocess.Popen([sys.executable, "-m", module, str(port), *words.split()])
+        for port in backs
+    ]
+    processes.append(subprocess.Popen(["haproxy", "-f", str(config), "-db", "-q"]))
+    try:
+        time.sleep(1.5)
+        yield _Balanced(front, processes[-1].pid)
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+
+
+async def serve(port: int, median_s: float, sigma: float, stalled: float, stall_s: float) -> None:
+    """Answer HTTP requests one after the other, each after a drawn time."""
+    one_at_a_time, source = asyncio.Lock(), random.Random()
+
+    async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                head = await reader.readuntil(b"\r\n\r\n")
+                length = next(
+                    int(line.split(b":")[1])
+                    for line in head.split(b"\r\n")
+                    if line.lower().startswith(b"content-length")
+                )
+                await reader.readexactly(length)
+                async with one_at_a_time:
+                    seconds = median_s * source.lognormvariate(0.0, sigma)
+                    seconds += stall_s if source.random() < stalled else 0.0
+                    await asyncio.sleep(seconds)
+                writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 1\r\n\r\n1")
+                await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(connected, "127.0.0.1", port)
+    await server.serve_forever()
+
+
+if __name__ == "__main__":
+    at, *times = sys.argv[1:6]
+    asyncio.run(serve(int(at), *map(float, times)))
