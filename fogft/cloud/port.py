@@ -88,6 +88,12 @@ class Accounts(Protocol):
     def check_task(self, task: Mapping[str, Any]) -> None:
         """Raise `SpecError` for what cannot be honoured on these clouds, before it is ordered."""
 
+    def exposures(self, clouds: Sequence[str], *, open_port: bool) -> Sequence[str]:
+        """Return, in sentences, what machines there are given or open to that they need not be.
+
+        Raises CloudError: it cannot be told now.
+        """
+
     def unverified(self, cloud: str) -> str:
         """Return why what exists in a cloud cannot be checked there; empty when it can."""
 

@@ -157,6 +157,24 @@ def test_a_cloud_that_nobody_can_check_is_told(scene, file, started, monkeypatch
     assert "warning: `aws` is not asked\n" in capsys.readouterr().err
 
 
+def test_files_that_every_vm_gets_are_told_before_anything_is_launched(
+    scene, file, started, capsys
+):
+    scene.sky.uploaded = ["~/.runpod/config.toml"]
+    assert main.run(["up", str(file)]) == 1
+    said = capsys.readouterr().err
+    assert "warning: SkyPilot gives every VM these files of yours" in said
+    assert "`~/.runpod/config.toml`" in said
+    assert "port 7447 of every VM is open to the world" in said
+    assert started == []
+
+
+def test_what_cannot_be_told_of_credentials_hinders_no_up(scene, file, started, capsys):
+    scene.sky.fail_next("uploaded_credentials", CloudUnreachable("SkyPilot cannot tell"))
+    assert main.run(["up", str(file), "--yes"]) == 0
+    assert "what a VM is given cannot be told now: SkyPilot cannot tell" in capsys.readouterr().err
+
+
 def test_skypilot_that_does_not_answer_ends_a_first_up(home, scene, file, started, capsys):
     scene.sky.fail_next("check", CloudUnreachable("SkyPilot did not answer"))
     assert main.run(["up", str(file), "--yes"]) == 1

@@ -47,6 +47,7 @@ class ScriptedProvider:
     asked_regions: list[tuple[str, ...] | None] = field(default_factory=list)
     terminated: list[str] = field(default_factory=list)
     prices: dict[tuple[str, str], float] = field(default_factory=dict)
+    mighty: str = ""
 
     def _meet(self) -> None:
         if not self.allowed:
@@ -70,6 +71,9 @@ class ScriptedProvider:
             self.terminated.append(instance.key)
             self.found.pop(instance.key, None)
 
+    def warning(self) -> str:
+        return self.mighty
+
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         self._meet()
         return {k: v for k, v in self.prices.items() if k[0].startswith(region)}
@@ -92,6 +96,7 @@ class ScriptedSky:
         self.full: set[str] = set()  # locations without capacity, for launches that do
         self.unreachable = False
         self.credentials = {"aws": "", "gcp": "run `gcloud auth login`"}
+        self.uploaded: list[str] | None = []
         self.launched: list[_Launch] = []
         self.errors: dict[str, list[CloudError]] = {}
         self._counter = itertools.count(1)
@@ -169,6 +174,10 @@ class ScriptedSky:
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
         self._meet("check", "")
         return {c: self.credentials.get(c, "no such") for c in clouds or self.credentials}
+
+    def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:
+        self._meet("uploaded_credentials", "")
+        return self.uploaded
 
     # -- what tests do to it ------------------------------------------------------------------
 

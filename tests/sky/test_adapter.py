@@ -635,3 +635,19 @@ def test_secrets_stay_private_on_disk(scene: Scene):
     assert key.stat().st_mode & 0o077 == 0
     assert key.parent.stat().st_mode & 0o077 == 0
     assert b"secret" not in b"".join(p.read_bytes() for p in key.parent.parent.glob("*.json"))
+
+
+# -- what a machine is given ------------------------------------------------------------------
+
+
+def test_what_a_machine_need_not_have_is_told(scene: Scene):
+    assert scene.cloud.exposures(["aws"], open_port=False) == []
+    scene.sky.uploaded = ["~/.lambda_cloud/lambda_keys"]
+    scene.provider.mighty = "the role may do anything"
+    role, files, port = scene.cloud.exposures(["aws"], open_port=True)
+    assert role == "the role may do anything"
+    assert "`~/.lambda_cloud/lambda_keys`" in files
+    assert "port 7447 of every VM is open to the world" in port
+    assert scene.cloud.exposures(["gcp"], open_port=False) == [files], "of the clouds asked about"
+    scene.sky.uploaded = None
+    assert "the API server elsewhere decides" in scene.cloud.exposures(["gcp"], open_port=False)[0]

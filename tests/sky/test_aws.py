@@ -99,6 +99,26 @@ def test_live_prices_are_of_each_zone(account: None):
     assert all(price > 0 for price in prices.values())
 
 
+ANYTHING = (
+    '{"Version": "2012-10-17", "Statement": [{"Effect": "Allow", "Action": "ec2:*", '
+    '"Resource": "*"}]}'
+)
+
+
+@needs("moto")
+def test_a_role_that_may_too_much_is_told(account: None):
+    """SkyPilot gives its role full access, and every VM has it."""
+    import boto3
+
+    iam = boto3.client("iam", region_name="us-east-1")
+    assert "has no role `skypilot-v1`" in Aws().warning()
+    iam.create_role(RoleName="skypilot-v1", AssumeRolePolicyDocument="{}")
+    assert Aws().warning() == ""
+    arn = iam.create_policy(PolicyName="AmazonEC2FullAccess", PolicyDocument=ANYTHING)
+    iam.attach_role_policy(RoleName="skypilot-v1", PolicyArn=arn["Policy"]["Arn"])
+    assert "`AmazonEC2FullAccess`" in Aws().warning()
+
+
 class Refusing:
     """A client whose every call fails, as botocore's do."""
 

@@ -18,10 +18,10 @@ from unittest import mock
 
 import pytest
 
-from fogft.cloud.sky import answers, guard, task
+from fogft.cloud.sky import answers, guard, settings, task
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
-from fogft.errors import CloudUnreachable
+from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Placement
 from tests.needs import needs
 from tests.sky.scene import Scene
@@ -71,7 +71,6 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     subprocess.run([sys.executable, made, str(folder)], check=True, timeout=60)
     isolated = {
         "HOME": str(folder),
-        "SKYPILOT_DISABLE_USAGE_COLLECTION": "1",
         "SKYPILOT_DISABLE_LOCAL_API_SERVER": "1",
         "AWS_ENDPOINT_URL": "http://127.0.0.1:1",
         "AWS_DEFAULT_REGION": "us-east-1",
@@ -82,15 +81,19 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture
-def real(home: Path) -> tuple[InstalledSky, Any, Any]:
+def real(home: Path) -> Iterator[tuple[InstalledSky, Any, Any]]:
     """The adapter on SkyPilot's own functions, which check their arguments and do nothing."""
     import sky
+    from sky import skypilot_config
     from sky.client import sdk
+
+    before = skypilot_config.to_dict()
 
     silent = mock.create_autospec(sdk)
     installed = InstalledSky()
     installed.modules = (sky, silent)
-    return installed, silent, sky
+    yield installed, silent, sky
+    skypilot_config._set_loaded_config(before)
 
 
 def status_record(**changes: Any) -> Any:
@@ -168,16 +171,76 @@ def test_every_launch_asks_for_the_guard_once_after_the_users_own_commands(
     silent.launch.return_value = "r1"
     # As the functions of the SDK do, whose place is taken here.
     monkeypatch.setattr("sky.utils.annotations.is_on_api_server", False)
+    skypilot_config.apply_cli_config(["aws.post_provision_runcmd=[echo mine]"])
+    for _ in range(2):
+        installed.launch({"run": "serve"}, "c")
+        asked = carried()["aws"]["post_provision_runcmd"]
+        assert asked == ["echo mine", guard.command()]
+        assert carried()["gcp"]["remote_identity"] == "NO_UPLOAD"
+    assert carried()["allowed_clouds"] == ["aws"], "all else is as it was"
+
+
+FILES_OF_CLOUDS = (
+    *(".aws/credentials", ".config/gcloud/application_default_credentials.json"),
+    *(".azure/msal_token_cache.json", ".config/vastai/vast_api_key"),
+    *(".lambda_cloud/lambda_keys", ".runpod/config.toml"),
+)
+
+
+@pytest.fixture
+def credentials(home: Path) -> Iterator[Any]:
+    """A user's home with credentials of many clouds; SkyPilot's settings, as they were after."""
+    from sky import skypilot_config
+
+    for name in FILES_OF_CLOUDS:
+        (home / name).parent.mkdir(parents=True, exist_ok=True)
+        (home / name).write_text("secret")
     before = skypilot_config.to_dict()
-    try:
-        skypilot_config.apply_cli_config(["aws.post_provision_runcmd=[echo mine]"])
-        for _ in range(2):
-            installed.launch({"run": "serve"}, "c")
-            asked = carried()["aws"]["post_provision_runcmd"]
-            assert asked == ["echo mine", guard.command()]
-        assert carried()["allowed_clouds"] == ["aws"], "all else is as it was"
-    finally:
-        skypilot_config._set_loaded_config(before)
+    yield skypilot_config
+    skypilot_config._set_loaded_config(before)
+
+
+@needs("skypilot")
+def test_a_vm_gets_no_credentials_that_skypilot_can_leave_out(home: Path, credentials: Any):
+    """What SkyPilot itself would send is what is told: files of clouds without the setting."""
+    from sky import check
+
+    sent = {name for name in check.get_cloud_credential_file_mounts(None) if "~/.aws" not in name}
+    assert sent >= {"~/.config/vastai/vast_api_key", "~/.lambda_cloud/lambda_keys"}
+    left = InstalledSky().uploaded_credentials(["aws"])
+    assert left == ["~/.lambda_cloud/lambda_keys", "~/.runpod/config.toml"]
+
+
+@needs("skypilot")
+def test_what_the_user_chose_stays(home: Path, credentials: Any):
+    credentials.apply_cli_config(["gcp.remote_identity=LOCAL_CREDENTIALS"])
+    credentials.apply_cli_config(["aws.remote_identity=my-role"])
+    for _ in range(2):
+        left = InstalledSky().uploaded_credentials(["aws"])
+        assert left is not None
+        assert "~/.config/gcloud/application_default_credentials.json" in left
+        assert credentials.get_nested(("aws", "remote_identity"), None) == "my-role"
+
+
+@needs("skypilot")
+def test_a_vm_that_ends_itself_by_its_clouds_files_gets_these(home: Path, credentials: Any):
+    installed = InstalledSky()
+    assert "~/.config/vastai/vast_api_key" not in (installed.uploaded_credentials(["aws"]) or ())
+    assert "~/.config/vastai/vast_api_key" in (installed.uploaded_credentials(["vast"]) or ())
+
+
+@pytest.mark.parametrize(("chosen", "then"), [(None, "1"), ("0", "0")])
+def test_usage_reports_are_off_unless_the_user_chose(
+    chosen: str | None, then: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(settings.NO_REPORTS, "")
+    monkeypatch.delenv(settings.NO_REPORTS)
+    if chosen is not None:
+        monkeypatch.setenv(settings.NO_REPORTS, chosen)
+    monkeypatch.setitem(sys.modules, "sky", None)
+    with pytest.raises(CloudError):
+        InstalledSky().request("r1")
+    assert os.environ[settings.NO_REPORTS] == then
 
 
 @needs("skypilot")
@@ -211,7 +274,7 @@ def test_the_names_that_are_matched_by_text_exist(home: Path):
 
     builtin = dir(__import__("builtins")) + dir(requests.exceptions)
     assert [n for n in answers.UNKNOWN if not hasattr(exceptions, n) and n not in builtin] == []
-    assert {s.value for s in RequestStatus} >= set(answers.STATES)
+    assert {s.value for s in RequestStatus} >= answers.ENDED
     assert {s.value for s in JobStatus} >= set(answers.JOBS)
     assert {s.value for s in ClusterStatus} >= {"INIT", "UP", "STOPPED"}
     for name in ("ClusterDoesNotExist", "ResourcesUnavailableError", "CommandError",

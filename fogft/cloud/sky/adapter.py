@@ -159,6 +159,28 @@ class SkyCloud:
         """See `Accounts`."""
         refuse_what_cannot_be_honoured(task)
 
+    def exposures(self, clouds: Sequence[str], *, open_port: bool) -> Sequence[str]:
+        """See `Accounts`."""
+        files = self.sky.uploaded_credentials(clouds)
+        found = [one.warning() for one in self.providers if one.cloud in clouds or not clouds]
+        if files is None:
+            found.append(
+                "the API server elsewhere decides which of its credentials every VM gets: let it "
+                "have `remote_identity: NO_UPLOAD` for its clouds"
+            )
+        elif files:
+            listed = ", ".join(f"`{file}`" for file in files)
+            found.append(
+                f"SkyPilot gives every VM these files of yours, and its own ssh key: {listed}. It "
+                "has no setting against that: move them away where a replica must not have them"
+            )
+        if open_port:
+            found.append(
+                f"port {task.LINK_PORT} of every VM is open to the world (mutual TLS), as is ssh's "
+                "(keys only): SkyPilot cannot say who may connect. `fogft.dial_in` opens no port"
+            )
+        return [one for one in found if one]
+
     def unverified(self, cloud: str) -> str:
         """See `Accounts`."""
         return self._census.unverified(cloud)

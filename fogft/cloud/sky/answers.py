@@ -35,6 +35,7 @@ JOBS = {
 }  # fmt: skip
 
 
+ENDED = frozenset(("SUCCEEDED", "FAILED", "CANCELLED"))
 _SAID_BY_SERVER = ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
                    "InvalidCloudCredentials")  # fmt: skip
 
@@ -108,8 +109,7 @@ def cluster_of(record: Any) -> Cluster:
 
 def request_of(payload: Any) -> Request:
     """Return a `RequestPayload` of SkyPilot's as our record."""
-    ended = payload.status in ("SUCCEEDED", "FAILED", "CANCELLED")
-    return Request(payload.request_id, active=not ended)
+    return Request(payload.request_id, active=payload.status not in ENDED)
 
 
 def told_reasons(output: str) -> dict[str, str]:

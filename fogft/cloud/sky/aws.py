@@ -27,6 +27,9 @@ T = TypeVar("T")
 _ALIVE = ["pending", "running", "stopping", "stopped"]  # a stopped one's disk still costs
 _FORBIDDEN = ("UnauthorizedOperation", "AccessDenied", "AccessDeniedException")
 _HOME = "us-east-1"  # any region lists the others
+_ROLE_OF = "the role of VMs"  # IAM's place among the regions: it has none
+ROLE = "skypilot-v1"
+_MIGHTY = ("AdministratorAccess", "PowerUserAccess")
 
 
 class Aws:
@@ -111,6 +114,28 @@ class Aws:
         answer = self._ask(_HOME, lambda ec2: ec2.describe_regions())
         return [str(region["RegionName"]) for region in answer["Regions"]]
 
+    def warning(self) -> str:
+        """See `Provider`. Reads the policies of SkyPilot's role, where the account may."""
+        try:
+            answer = self._ask(_ROLE_OF, lambda iam: iam.list_attached_role_policies(RoleName=ROLE))
+        except NotAllowedError:
+            return ""
+        except CloudUnreachable as error:
+            if "NoSuchEntity" not in str(error):
+                return ""
+            return (
+                f"AWS has no role `{ROLE}`: at the first launch SkyPilot makes one for every VM, "
+                "with full access to EC2 and S3. Make the one of docs/clouds.md before"
+            )
+        names = sorted(str(policy["PolicyName"]) for policy in answer["AttachedPolicies"])
+        mighty = [f"`{n}`" for n in names if n.endswith("FullAccess") or n in _MIGHTY]
+        if not mighty:
+            return ""
+        return (
+            f"AWS's role `{ROLE}`, which every VM has and your `run` can use, has "
+            f"{', '.join(mighty)}: give it what docs/clouds.md lists, and nothing else"
+        )
+
     def _client(self, region: str) -> Any:
         with self._lock:
             if region not in self.clients:
@@ -120,8 +145,9 @@ class Aws:
                 config = importlib.import_module("botocore.config").Config(
                     connect_timeout=5, read_timeout=10, retries=retries
                 )
+                service = "iam" if region == _ROLE_OF else "ec2"
                 self.clients[region] = self._session.client(
-                    "ec2", region_name=region, config=config
+                    service, region_name=_HOME if service == "iam" else region, config=config
                 )
             return self.clients[region]
 

@@ -11,17 +11,16 @@ import copy
 import functools
 import importlib
 import io
-import json
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from fogft.cloud.sky import guard
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
 from fogft.cloud.sky.calls import Calls
 from fogft.cloud.sky.sdk import Cluster, JobState, Request
+from fogft.cloud.sky.settings import Settings, report_nothing
 from fogft.errors import CloudError
 from fogft.model.replica import Offer, Placement
 
@@ -62,6 +61,7 @@ class InstalledSky:
         self._lock = threading.Lock()
         self.modules: tuple[Any, Any] | None = None
         self._calls = Calls()
+        self._settings = Settings()
 
     @_limited(LAUNCH_LIMIT_S, "the launch of `{1}`")
     def launch(self, task: Mapping[str, Any], name: str) -> str:
@@ -69,7 +69,7 @@ class InstalledSky:
         sky, sdk = self._sky()
         with as_answer():
             made = sky.Task.from_yaml_config(dict(task))
-        self._set_guard()
+        self._settings.apply([str((task.get("resources") or {}).get("infra", "")).split("/")[0]])
         return str(sdk.launch(made, cluster_name=name))
 
     @_limited(ASK_LIMIT_S, "the requests of `{0}`")
@@ -193,18 +193,14 @@ class InstalledSky:
             for cloud in sorted(asked)
         }
 
-    def _set_guard(self) -> None:
-        """Have SkyPilot give every VM of ours the guard, after the user's own commands.
+    @_limited(REFRESH_LIMIT_S, "the credentials that a VM would get")
+    def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:
+        """Return the files of credentials that go to a VM on some clouds whatever fogft sets.
 
-        A request carries this process's settings, to a server elsewhere too.
+        None: the API server is elsewhere, and decides which of its own it gives away.
         """
-        settings = importlib.import_module("sky.skypilot_config")
-        with self._lock:
-            given = list(settings.get_nested(guard.SETTING, []) or [])
-            command = guard.command()
-            if command not in given:
-                key, value = ".".join(guard.SETTING), json.dumps([*given, command])
-                settings.apply_cli_config([f"{key}={value}"])  # as `sky launch --config` does
+        self._sky()
+        return self._settings.uploaded(clouds)
 
     def _log(self, read: Callable[[io.StringIO], object]) -> str:
         out = io.StringIO()
@@ -215,6 +211,7 @@ class InstalledSky:
     def _sky(self) -> tuple[Any, Any]:
         with self._lock:
             if self.modules is None:
+                report_nothing()
                 try:
                     self.modules = (
                         importlib.import_module("sky"),

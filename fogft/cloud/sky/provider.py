@@ -50,5 +50,8 @@ class Provider(Protocol):
     def terminate(self, instances: Iterable[Instance]) -> None:
         """Ask for the end of instances. Those that are gone are no error."""
 
+    def warning(self) -> str:
+        """Return what a VM there may do that it need not; empty where nothing is known."""
+
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         """Return live spot prices: (zone, instance type) -> US dollars per hour."""

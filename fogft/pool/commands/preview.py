@@ -119,6 +119,11 @@ def order(
             concrete.check_task(spec.task)
             accounts, found = _tested(concrete, clouds_named(spec), may_fail=before is not None)
             notes += found
+            usable = [name for name, problem in accounts.items() if not problem]
+            try:
+                notes += concrete.exposures(usable, open_port=not spec.dial_in)
+            except CloudError as error:
+                notes.append(f"what a VM is given cannot be told now: {error.message}")
         try:
             sold = offers.ask(concrete, spec)
         except CloudError as error:

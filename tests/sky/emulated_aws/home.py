@@ -14,6 +14,11 @@ from pathlib import Path
 
 REGIONS = {"us-east-1": ("use1", 0.020), "us-west-2": ("usw2", 0.025), "eu-west-1": ("euw1", 0.040)}
 IMAGE = "ami-1e749f67"  # one that moto has in every region
+MARK = "a credential of the lab's"
+OF_OTHER_CLOUDS = (
+    ".config/gcloud/application_default_credentials.json",
+    ".config/vastai/vast_api_key",
+)
 VMS = (
     "InstanceType,AcceleratorName,AcceleratorCount,vCPUs,MemoryGiB,GpuInfo,Price,SpotPrice,"
     "Region,AvailabilityZone,Arch"
@@ -50,7 +55,9 @@ def main(home: Path) -> None:
     text(
         home / ".aws/credentials", "[default]\naws_access_key_id=test\naws_secret_access_key=test\n"
     )
-    text(home / ".sky/config.yaml", "allowed_clouds: [aws]\naws:\n  remote_identity: skypilot-v1\n")
+    text(home / ".sky/config.yaml", "allowed_clouds: [aws]\n")
+    for name in OF_OTHER_CLOUDS:
+        text(home / name, MARK)
 
 
 def write(path: Path, header: list[str], rows: list[list[object]]) -> None:

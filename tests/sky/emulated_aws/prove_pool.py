@@ -16,12 +16,14 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from tests.e2e.pool import Client
 from tests.sky.emulated_aws import timetable
 from tests.sky.emulated_aws.emulation import Steps, control, disk_of, running, until
+from tests.sky.emulated_aws.home import MARK
 from tests.sky.emulated_aws.pool import (
     HOME,
     Pool,
@@ -58,6 +60,19 @@ fogft:
     - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}}
 """
 step = Steps()
+
+
+def credentials_below(home: Path) -> Iterator[Path]:
+    """Yield the files of a VM's user that hold what should not leave the launching computer."""
+    for path in home.rglob("*"):
+        if path.is_file() and "skypilot-runtime" not in path.parts and path.stat().st_size < 65_536:
+            content = path.read_bytes()
+            if (
+                MARK.encode() in content
+                or b"aws_secret_access_key" in content
+                or (b"PRIVATE KEY-----" in content and path.name != "replica.key")
+            ):
+                yield path
 
 
 class Proof:
@@ -132,6 +147,7 @@ class Proof:
             (carried,) = (home / ".fogft/wheel").glob("fogft-*.whl")
             (made,) = (HOME / "sky/wheels").glob("*/fogft-*.whl")
             assert carried.read_bytes() == made.read_bytes()
+            assert not list(credentials_below(home))
             # To the world: ssh, which is SkyPilot's, and the link.
             cluster = f"fogft-{status['uid']}-{name.replace('.', '-')}"
             assert open_ports(instance["region"], f"sky-sg-{cluster}") == {22, 7447}
