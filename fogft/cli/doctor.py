@@ -53,4 +53,4 @@ def _show(finding: Finding) -> None:
         Text.assemble((f"{verdict:<4}", _STYLES[verdict]), f"  {finding.check:<18}  {text}")
     )
     if finding.advice:
-        output.data(f"{'':<26}-> {output.printable(finding.advice)}")
+        output.data(f"{'':<26}-> {finding.advice}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -27,11 +28,12 @@ if TYPE_CHECKING:
 _UNLIMITED = 100_000
 # What counts as the width of a line where no person looks.
 _WIDTH_OF_A_PIPE = 240
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # which a log may have, and which says nothing
 
 
 def data(text: str) -> None:
-    """Write a line (or lines) of data to stdout, at once."""
-    sys.stdout.write(text + "\n")
+    """Write a line (or lines) of data to stdout, at once, without what cannot be printed."""
+    sys.stdout.write(printable(text) + "\n")
     sys.stdout.flush()
 
 
@@ -77,7 +79,8 @@ def printable(text: str) -> str:
     """Return text with control characters but newlines escaped: it must not move the cursor."""
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+    plain = _COLOUR.sub("", text)
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in plain)
 
 
 def say(text: str) -> None:
@@ -117,7 +120,7 @@ def confirm(question: str) -> bool:
     """
     if not is_terminal(sys.stdin):
         raise FogftError("nobody is there to say yes", "add `--yes` to go on without being asked")
-    sys.stderr.write(f"{question} [y/N] ")
+    sys.stderr.write(f"{printable(question)} [y/N] ")
     sys.stderr.flush()
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 

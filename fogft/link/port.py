@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
 from fogft.link.send_options import SendOptions
-from fogft.model.plain import Count, Seconds
+from fogft.model.plain import Count, Line, Seconds
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.type_definition import Definition
@@ -34,7 +34,7 @@ class Probe:
         describe: The answer shall tell the definitions of the services' types.
     """
 
-    robot: str
+    robot: Line
     manager_age_s: Seconds | None = None
     describe: bool = False
 
@@ -51,14 +51,14 @@ class GatewayView:
     slot: Count
     generation: Count
     state: LinkState
-    ready: frozenset[str] = frozenset()
+    ready: frozenset[Line] = frozenset()
     draining: bool = False
     at_risk: bool = False
     silent_for_s: Seconds = 0.0
     rtt_s: Seconds | None = None
     restarts: Count = 0
-    detail: str = ""
-    through: str = ""
+    detail: Line = ""
+    through: Line = ""
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> GatewayView:
@@ -96,18 +96,18 @@ class ProbeAnswer:
 
     slot: Count
     generation: Count
-    incarnation: str
-    ready: frozenset[str] = frozenset()
+    incarnation: Line
+    ready: frozenset[Line] = frozenset()
     draining: bool = False
     at_risk: bool = False
     restarts: Count = 0
     in_flight: Count = 0
-    detail: str = ""
-    work: Mapping[str, Seconds] = field(default_factory=dict)
-    offered: Mapping[str, str] = field(default_factory=dict)
-    types: Mapping[str, Definition] = field(default_factory=dict)
+    detail: Line = ""
+    work: Mapping[Line, Seconds] = field(default_factory=dict)
+    offered: Mapping[Line, Line] = field(default_factory=dict)
+    types: Mapping[Line, Definition] = field(default_factory=dict)
     behind: tuple[GatewayView, ...] = ()
-    accepts: frozenset[str] = frozenset()
+    accepts: frozenset[Line] = frozenset()
 
 
 class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much

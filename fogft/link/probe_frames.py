@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from fogft.errors import FrameError
 from fogft.link.frame import VERSION, check_version
 from fogft.link.port import GatewayView, Probe, ProbeAnswer
-from fogft.model.plain import from_plain, to_plain
+from fogft.model.plain import as_line, from_plain, to_plain
 
 T = TypeVar("T")
 PROBE_LIMIT = 1024
@@ -68,7 +68,7 @@ def _shortened(one: GatewayView) -> GatewayView:
 
 
 def _cut(detail: str, limit: int) -> str:
-    return detail[:limit].encode(errors="replace").decode()
+    return as_line(detail[:limit])
 
 
 def _encoded(value: Probe | ProbeAnswer) -> bytes:

@@ -46,6 +46,21 @@ def within(least: float, most: float) -> Callable[[float], None]:
 
 Count = Annotated[int, within(0, 2**53)]
 Generation = Annotated[int, within(1, 1 << 31)]
+
+
+def as_line(text: str) -> str:
+    """Return a text as one line of what can be printed: a peer takes no other."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+
+
+def _check_line(text: str) -> None:
+    if not text.isprintable():
+        raise ValueError("it holds what cannot be printed")
+
+
+Line = Annotated[str, _check_line]  # it may reach a terminal: no escape, no second line
 Seconds = Annotated[float, within(-1e18, 1e18)]
 Moment = Annotated[float, within(0, 1e12)]  # seconds since the epoch
 
@@ -142,7 +157,7 @@ def _made(hint: Any) -> Read:  # noqa: PLR0911
     if origin in (tuple, frozenset, Sequence, list):
         return _listed(list if origin is Sequence else origin, _reader(arguments[0]))
     if origin is Mapping:
-        return _map(int if arguments[0] is int else _reader(str), _reader(arguments[1]))
+        return _map(int if arguments[0] is int else _reader(arguments[0]), _reader(arguments[1]))
     if issubclass(hint, Enum):
         by_value: Read = hint
         return by_value

@@ -14,10 +14,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from fogft.model.plain import Line
+
 REQUEST, RESPONSE = "request", "response"
 _NESTED = re.compile(r"(?:sequence<)?([A-Za-z]\w*/[A-Za-z]\w*)")
 
-Fields = tuple[tuple[str, str], ...]
+Fields = tuple[tuple[Line, Line], ...]
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,10 @@ class Definition:
             it into names; empty where it is not known.
     """
 
-    hash: str = ""
-    fields: Mapping[str, Fields] = field(default_factory=dict)
-    trouble: str = ""
-    service_hash: str = ""
+    hash: Line = ""
+    fields: Mapping[Line, Fields] = field(default_factory=dict)
+    trouble: Line = ""
+    service_hash: Line = ""
 
     @property
     def known(self) -> bool:

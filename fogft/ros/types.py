@@ -22,6 +22,7 @@ from typing import Any
 
 from fogft.errors import RosError, told
 from fogft.model.cdr import NUMBER_BYTES, Shape
+from fogft.model.plain import as_line
 from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
 
 _NAME = re.compile(
@@ -232,9 +233,9 @@ def definition(type_name: str) -> Definition:
         for part, message in ((REQUEST, service_type.Request), (RESPONSE, service_type.Response)):
             _add(part, message, fields)
     except RosError as error:
-        return Definition(trouble=error.message)
+        return Definition(trouble=as_line(error.message))
     except Exception as error:  # generated code: anything may go wrong in it
-        return Definition(trouble=f"its fields cannot be read: {error!r}")
+        return Definition(trouble=as_line(f"its fields cannot be read: {error!r}"))
     hashes = _hashes(type_name)
     parts = [hashes.get(f"{type_name}_{part}", "") for part in ("Request", "Response")]
     return Definition(

@@ -30,6 +30,13 @@ def test_no_table_tree_or_message_passes_control_characters_on(capsys):
     assert said.out.splitlines()[2] == r"one\ntwo"
 
 
+def test_data_and_a_log_pass_no_control_characters_on(capsys):
+    """Colours of a log go, tabs stay, and everything else is shown as what it is."""
+    output.data(f"\x1b[1;31mred\x1b[0m\t{HOSTILE}\x1b]0;title\x07")
+    said = capsys.readouterr().out
+    assert said == "red\t" + r"a\x1b[2Jb\rc\x07\u202e\x1b]0;title\x07" + "\n"
+
+
 def test_square_brackets_are_text_and_not_markup(capsys):
     output.show(output.table(["NAME"], [["[bold]x[/bold] :smile:"]]))
     assert capsys.readouterr().out.splitlines()[1] == "[bold]x[/bold] :smile:"

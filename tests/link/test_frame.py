@@ -28,7 +28,7 @@ robots = st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size
 )
 remaining = st.floats(0, frame.REMAINING_LIMIT_S, allow_nan=False)
 reasons = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=64)
-texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=100)
+texts = st.text(max_size=100).filter(str.isprintable)
 counts = st.integers(0, 2**53 - 1)
 answers = st.builds(
     ProbeAnswer,
@@ -240,6 +240,43 @@ def test_a_long_detail_is_cut_and_the_answer_still_travels() -> None:
     answer = ProbeAnswer(0, 1, "i", detail="\ud800" + "x" * 100_000)
     decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
     assert len(decoded.detail) == probe_frames.DETAIL_LIMIT
+
+
+ESCAPES = [
+    "\x1b]0;title\x07",
+    "\x1b[2J",
+    "3 of 3 ready\nrow two",
+    "\u202ereversed",
+    "\x9b31m",
+    "\r",
+]
+
+
+@pytest.mark.parametrize("hostile", ESCAPES)
+def test_what_would_move_a_cursor_is_refused_wherever_it_stands(hostile: str) -> None:
+    """A terminal's title, a second line, a reversed text: no name and no detail holds one."""
+    whole = {
+        "slot": 0, "generation": 1, "incarnation": "i", "detail": "d", "ready": ["/s"],
+        "work": {"ran": 1.0}, "offered": {"/s": "a/srv/B"}, "accepts": ["lz4"],
+        "types": {"a/srv/B": {"trouble": "t", "fields": {"request": [["x", "int32"]]}}},
+        "behind": [{"slot": 0, "generation": 1, "state": "up", "detail": "d", "through": "lab"}],
+    }  # fmt: skip
+    plain = json.dumps({"v": frame.VERSION, **whole})
+    assert probe_frames.decode_probe_answer(plain.encode()).detail == "d"
+    for text in ('"i"', '"d"', '"/s"', '"ran"', '"a/srv/B"', '"lz4"', '"t"', '"x"', '"lab"'):
+        content = plain.replace(text, json.dumps(f"a{hostile}"))
+        assert content != plain
+        with pytest.raises(FrameError, match="cannot be printed"):
+            probe_frames.decode_probe_answer(content.encode())
+
+
+@pytest.mark.parametrize("said", ESCAPES)
+def test_what_a_program_prints_travels_as_one_line(said: str) -> None:
+    """The end of a log may hold anything: the replica that tells it is not refused for it."""
+    answer = ProbeAnswer(0, 1, "i", detail=f"`run` ended: {said}")
+    decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
+    assert decoded.detail.startswith("`run` ended: ")
+    assert decoded.detail.isprintable()
 
 
 def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels() -> None:

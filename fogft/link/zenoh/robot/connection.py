@@ -34,6 +34,7 @@ from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.sockets import address
 from fogft.model import names, refusal
+from fogft.model.plain import as_line
 from fogft.model.refusal import Refusal
 
 _ALL = zenoh.QueryTarget.ALL
@@ -253,7 +254,9 @@ class Connection:
             _, _, said, _ = frame.decode_refusal(content)
         except FrameError:
             return  # Zenoh's own: it timed out, and the link's thread counts the silence
-        words = _REFUSED.get(refusal.read(said)[0], f"the replica refuses our probes: {said}")
+        words = _REFUSED.get(
+            refusal.read(said)[0], f"the replica refuses our probes: {as_line(said)}"
+        )
         self.lose(words)
 
     def tell_records(self, key: str, records: bytes) -> None:
