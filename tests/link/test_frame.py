@@ -275,7 +275,7 @@ def test_what_a_program_prints_travels_as_one_line(said: str) -> None:
     """The end of a log may hold anything: the replica that tells it is not refused for it."""
     answer = ProbeAnswer(0, 1, "i", detail=f"`run` ended: {said}")
     decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
-    assert decoded.detail.startswith("`run` ended: ")
+    assert decoded.detail.startswith("`run` ended:")
     assert decoded.detail.isprintable()
 
 
