@@ -98,6 +98,7 @@ class ServerProxyConfig:
         advertise: Address at which this replica is reached, where it differs.
         rendezvous: Where rendezvous listen.
         records: What was learned from rendezvous, for the next start.
+        revocations: The manager's signed revocations, as they stood when this was launched.
         dial_out: Robots that this replica dials, where it cannot be reached.
         metrics: Where to answer Prometheus.
         rmw: How the proxy speaks ROS.
@@ -121,6 +122,7 @@ class ServerProxyConfig:
     advertise: EndpointOrEmpty = ""
     rendezvous: tuple[Endpoint, ...] = ()
     records: Path | None = None
+    revocations: Path | None = None
     dial_out: tuple[Endpoint, ...] = ()
     metrics: EndpointOrEmpty = ""
     topics: tuple[TopicSpec, ...] = ()

@@ -137,8 +137,14 @@ class ReplicaProcess:
         delay_s: float = 0.0,
         reply_bytes: int = -1,
         settings: LinkSettings | None = None,
+        records: Path | None = None,
     ) -> None:
-        """Start one. `claims`: slot and generation that it says it is, where that is a lie."""
+        """Start one.
+
+        Args:
+            claims: Slot and generation that it says it is, where that is a lie.
+            records: What it was launched with of what the pool has signed.
+        """
         arguments = {
             "endpoint": endpoint,
             "ca": str(files.ca),
@@ -150,6 +156,7 @@ class ReplicaProcess:
             "delay_s": delay_s,
             "reply_bytes": reply_bytes,
             "settings": asdict(settings or LinkSettings()),
+            "records": str(records or ""),
         }
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.link.zenoh.replica_process", json.dumps(arguments)],

@@ -136,7 +136,11 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
     }
     if holder.role is Role.REPLICA:
         id = ReplicaId(identity.uid, int(holder.name), holder.generation)
-        files["replica.yaml"] = configuration.replica_config(identity, spec, id)
+        taken_back = store.paths.revocations
+        known = taken_back.exists()
+        files["replica.yaml"] = configuration.replica_config(identity, spec, id, revocations=known)
+        if known:
+            files[taken_back.name] = taken_back.read_text()
     elif holder.role is Role.RENDEZVOUS:
         files["rendezvous.yaml"] = configuration.rendezvous_config(identity)
     else:

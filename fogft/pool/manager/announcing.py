@@ -50,6 +50,7 @@ class ManagerRecords:
         self._certified_at: datetime.datetime | None = None
         self._said: Membership | None = None
         self._revoked: frozenset[str] = frozenset()
+        self._signed = b""  # that, as it was written last
 
     def look(self, endpoints: tuple[str, ...], membership: Membership | None) -> None:
         """Publish what is new, to these rendezvous.
@@ -58,7 +59,7 @@ class ManagerRecords:
             CredentialError: The pool's CA cannot be used.
             StateError: The manager's certificate cannot be written.
         """
-        if membership is not None and membership.revoked != self._revoked:
+        if membership is not None:
             self._write_revocations(membership.revoked)
         if endpoints != self._endpoints:
             self.close()
@@ -75,8 +76,21 @@ class ManagerRecords:
             self._say(self._client, membership)
             self._said = membership
 
-    def _write_revocations(self, revoked: frozenset[str]) -> None:
+    def revocations(self) -> bytes:
+        """Return what was taken back up to now, signed, for a launch; empty where nothing was.
+
+        Raises:
+            CredentialError: The pool's CA cannot be used.
+            StateError: The list of certificates is damaged, or the result cannot be written.
+        """
+        self._write_revocations(Ledger(self._paths.credentials).revoked())
+        return self._signed
+
+    def _write_revocations(self, more: frozenset[str]) -> None:
         """Sign what was taken back, for the client proxy to pass on: there may be no rendezvous."""
+        revoked = self._revoked | more
+        if revoked == self._revoked:
+            return
         self._certify(datetime.datetime.now(datetime.timezone.utc))
         files = self._files()
         # Revocations only grow, so their number counts the writings of one epoch.
@@ -90,7 +104,7 @@ class ManagerRecords:
         )
         signed = sign_record(record, Signer(files.certificate, files.key))
         cache.write(self._paths.revocations, [signed])
-        self._revoked = revoked
+        self._revoked, self._signed = revoked, self._paths.revocations.read_bytes()
 
     def _files(self) -> CredentialPaths:
         folder = self._paths.credentials

@@ -156,9 +156,17 @@ def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder
 
 
 def build_order(
-    paths: PoolPaths, identity: Identity, spec: PoolSpec, planned: PlannedLaunch
+    paths: PoolPaths,
+    identity: Identity,
+    spec: PoolSpec,
+    planned: PlannedLaunch,
+    *,
+    revocations: bytes = b"",
 ) -> Launch:
     """Return the order of a planned launch, with all that its server proxy needs.
+
+    Args:
+        revocations: What was taken back, signed: it is let in by no replica, however new.
 
     Raises:
         CredentialError: The pool's CA cannot be used.
@@ -174,17 +182,26 @@ def build_order(
         spec_hash=replica_hash(spec, id.slot),
         task=workspace.with_build(absolute(task_at(spec, id.slot), Path(identity.file).parent)),
         files={
-            "replica.yaml": replica_config(identity, spec, id).encode(),
+            "replica.yaml": replica_config(
+                identity, spec, id, revocations=bool(revocations)
+            ).encode(),
             "ca.crt": issued.authority_pem,
             "replica.crt": issued.certificate_pem,
             "replica.key": issued.key_pem,
+            **({paths.revocations.name: revocations} if revocations else {}),
         },
         dials_out=bool(spec.dial_in),
     )
 
 
-def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
-    """Return a replica's configuration. Address, domain and folder are the machine's to add."""
+def replica_config(
+    identity: Identity, spec: PoolSpec, id: ReplicaId, *, revocations: bool = False
+) -> str:
+    """Return a replica's configuration. Address, domain and folder are the machine's to add.
+
+    Args:
+        revocations: Whether the pool's signed revocations lie beside it.
+    """
     services = services_at(spec, id.slot)
     envs: dict[str, Any] = dict(spec.task.get("envs") or {})
     if services != spec.services:  # `run` need not start the others
@@ -201,6 +218,7 @@ def replica_config(identity: Identity, spec: PoolSpec, id: ReplicaId) -> str:
         orphan_after_s=spec.orphan_after_s,
         rendezvous=spec.rendezvous,
         records=Path("records.json"),
+        revocations=Path(PoolPaths(Path()).revocations.name) if revocations else None,
         dial_out=(spec.dial_in,) if spec.dial_in else (),
         # Those that the manager launches may share an address; others have one of their own.
         metrics=spec.metrics.of_replica(id.slot if id.slot < FIRST_BY_HAND else 0),

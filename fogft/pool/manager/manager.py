@@ -19,12 +19,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from fogft import disk, logfile
-from fogft.cloud.port import Cloud
+from fogft.cloud.port import Cloud, Launch
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.metrics.scrape import Scrape
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkReport
+from fogft.model.spec import PoolSpec
 from fogft.planning import lifetime
+from fogft.planning.planner import PlannedLaunch
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.discovered import Discovery
 from fogft.pool.folder.lease import Lease
@@ -99,7 +101,7 @@ class Manager:
             clock=time.time,
             reading=clocks.read,
             links=self._links,
-            build_order=lambda *order: configuration.build_order(self._paths, *order),
+            build_order=self._build_order,
             submit=on_thread,
             epoch=self._lease.epoch,
             revoked=self._ledger.revoked,
@@ -157,6 +159,12 @@ class Manager:
     def _bound_logs(self) -> None:
         for path in (self._paths.manager_log, self._paths.proxy_log):
             logfile.bound(path)
+
+    def _build_order(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
+        taken_back = self._records.revocations()
+        return configuration.build_order(
+            self._paths, identity, spec, planned, revocations=taken_back
+        )
 
     def _discover(self, tick: Tick) -> None:
         if self._discovery.look(tick.spec, tick.observed):

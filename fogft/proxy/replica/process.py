@@ -24,6 +24,7 @@ from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.supervisor import Supervisor
+from fogft.records import cache
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
 
@@ -108,10 +109,12 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
         return joined[0].node
 
     handshakes = HandshakeLog()
+    listener = ZenohListener(config.listen, config.credentials, config.id, handshakes=handshakes)
+    listener.take_records(cache.read(config.revocations) if config.revocations else ())
     return ServerProxy(
         config.id,
         config.services,
-        ZenohListener(config.listen, config.credentials, config.id, handshakes=handshakes),
+        listener,
         make_node,
         Supervisor(config.run, config.workdir, environ, stdout=handshakes.stdout),
         make_state=StateBytes,

@@ -23,6 +23,7 @@ from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
+from fogft.records import cache
 from tests.link.wire_pool import POOL_UID, SERVICE, keys
 
 TEXT = b"the quick brown fox jumps over the lazy dog "
@@ -88,6 +89,7 @@ def main() -> None:
     listener = ZenohListener(
         given["endpoint"], files, id, settings=settings, handshakes=HandshakeLog()
     )
+    listener.take_records(cache.read(Path(given["records"])) if given["records"] else ())
     service = Service(given["delay_s"], given["reply_bytes"])
     service.start()
     state = {"ready": [SERVICE], "draining": False}

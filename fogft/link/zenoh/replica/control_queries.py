@@ -9,7 +9,7 @@ Owns: who is let in. Not here: requests and their replies (`listener`, `reply_qu
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -141,20 +141,23 @@ class ControlQueries:
     def _take_records(
         self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query, turn: int
     ) -> None:
-        """Judge records by their own signatures: whoever brings them has no say in them."""
         if not self._greeted(greeting, query, turn):
             return
         try:
-            for one in offered:
-                verdict = self._records.offer(one)
-                if verdict is Verdict.REFUSED:
-                    self._counters.add("records_refused")
-                    log.warning("record_refused reason=%r", self._records.last_refusal)
-                elif verdict is Verdict.OLDER:
-                    self._counters.add("records_older")
+            self.take(offered)
             query.reply(query.key_expr, b"")
         finally:
             self._end(greeting, query, turn)
+
+    def take(self, offered: Sequence[SignedRecord]) -> None:
+        """Judge records by their own signatures, and do what those that are good say."""
+        for one in offered:
+            verdict = self._records.offer(one)
+            if verdict is Verdict.REFUSED:
+                self._counters.add("records_refused")
+                log.warning("record_refused reason=%r", self._records.last_refusal)
+            elif verdict is Verdict.OLDER:
+                self._counters.add("records_older")
         self._sessions.revoke(self._records.revoked)
 
     def _greeted(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> bool:
