@@ -49,6 +49,7 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "gateway": ("parts", "--config gateway.yaml --listen 0.0.0.0:7470"),
     },
 }
+_WHOLE = 1000  # of a description: it is folded, not cut
 _COMMANDS = {name: row for names in SECTIONS.values() for name, row in names.items()}
 
 
@@ -90,7 +91,7 @@ class Commands(TyperGroup):
         for title, names in SECTIONS.items():
             with formatter.section(title):
                 formatter.write_dl(
-                    [(n, self.commands[n].get_short_help_str(formatter.width)) for n in names]
+                    [(n, self.commands[n].get_short_help_str(_WHOLE)) for n in names]
                 )
 
 

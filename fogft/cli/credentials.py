@@ -85,6 +85,7 @@ def list_(
     pool: PoolOption = None,
 ) -> None:
     """List the certificates that the pool's CA has issued, without their keys."""
+    from fogft.cli.table import table
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import certificates
 
@@ -97,7 +98,8 @@ def list_(
         (e.holder.role.value, e.holder.short, e.state(now), _utc(e.not_after), e.serial[:16])
         for e in entries
     ]
-    output.show(output.table(("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL"), rows))
+    names = ("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL")
+    output.show(table(names, rows, width=output.width(sys.stdout)))
 
 
 @credentials.command(cls=Command, epilog="fogft credentials revoke robot ada")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -48,9 +49,9 @@ def _show(finding: Finding) -> None:
     from rich.text import Text
 
     verdict = finding.verdict.value
-    text = output.printable(finding.text)
+    text = output.indented(output.printable(finding.text), 26, sys.stdout)
     output.show(
         Text.assemble((f"{verdict:<4}", _STYLES[verdict]), f"  {finding.check:<18}  {text}")
     )
     if finding.advice:
-        output.data(f"{'':<26}-> {finding.advice}")
+        output.data(f"{'':<26}-> {output.indented(finding.advice, 29, sys.stdout)}")

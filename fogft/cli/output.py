@@ -12,7 +12,7 @@ import os
 import re
 import select
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import IO, TYPE_CHECKING, Any
@@ -21,13 +21,10 @@ from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
-    from rich.table import Table
     from rich.text import Text
 
 # Wide enough that nothing is ever cut: a terminal breaks a long line by itself.
 _UNLIMITED = 100_000
-# What counts as the width of a line where no person looks.
-_WIDTH_OF_A_PIPE = 240
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # which a log may have, and which says nothing
 
 
@@ -43,29 +40,13 @@ def json_data(value: Any) -> None:
 
 
 def show(*parts: RenderableType, stream: IO[str] | None = None) -> None:
-    """Write tables, trees and lines below each other, uncut; to stdout if nothing else is said."""
+    """Write tables, trees and lines below each other, to stdout if nothing else is said.
+
+    On a terminal a line is folded between words; elsewhere nothing is folded or cut.
+    """
     stream = stream or sys.stdout
-    stream.write(_drawn(stream, *parts) + "\n")
+    stream.write(_drawn(stream, *parts, limit=width(stream)) + "\n")
     stream.flush()
-
-
-def table(
-    header: Collection[str],
-    rows: Iterable[Iterable[str | Text]],
-    *,
-    right: Collection[str] = (),
-    titled: bool = True,
-) -> Table:
-    """Return a table without lines; the columns in `right` are aligned to the right."""
-    from rich.table import Table
-
-    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim",
-                 show_header=titled)  # fmt: skip
-    for name in header:
-        made.add_column(name, justify="right" if name in right else "left", no_wrap=True)
-    for row in rows:
-        made.add_row(*(cell(one) if isinstance(one, str) else one for one in row))
-    return made
 
 
 def cell(text: str, style: str = "") -> Text:
@@ -133,11 +114,20 @@ def is_terminal(stream: IO[str]) -> bool:
         return False
 
 
-def width(stream: IO[str]) -> int:
-    """Return how many characters fit in a line of a stream."""
+def width(stream: IO[str]) -> int | None:
+    """Return how many characters fit in a line of a stream; None where no person looks."""
     if not is_terminal(stream) and not os.environ.get("COLUMNS"):
-        return _WIDTH_OF_A_PIPE
+        return None
     return _console(stream).width
+
+
+def indented(text: str, by: int, stream: IO[str]) -> str:
+    """Return text that stands behind a margin, folded between words with the same margin."""
+    import textwrap
+
+    room = (width(stream) or _UNLIMITED) - by
+    folded = textwrap.wrap(text, max(room, 20), break_long_words=False, break_on_hyphens=False)
+    return ("\n" + " " * by).join(folded)
 
 
 @contextmanager
@@ -147,7 +137,9 @@ def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
     from rich.text import Text
 
     def show_in(live: Live, shown: RenderableType) -> None:
-        lines = Text.from_ansi(_drawn(stream, shown), no_wrap=True, overflow="ellipsis")
+        lines = Text.from_ansi(
+            _drawn(stream, shown, limit=width(stream)), no_wrap=True, overflow="ellipsis"
+        )
         live.update(lines, refresh=True)
 
     with Live(console=_console(stream), auto_refresh=False, vertical_overflow="crop") as live:
@@ -171,9 +163,9 @@ def silence_stdout() -> None:
     os.close(nowhere)
 
 
-def _drawn(stream: IO[str], *parts: RenderableType) -> str:
+def _drawn(stream: IO[str], *parts: RenderableType, limit: int | None) -> str:
     # With a height: of a dumb terminal rich else takes both to be small.
-    console = _console(stream, width=_UNLIMITED, height=25)
+    console = _console(stream, width=limit or _UNLIMITED, height=25)
     with console.capture() as captured:
         console.print(*parts, sep="\n")
     return "\n".join(line.rstrip() for line in captured.get().splitlines())
@@ -185,7 +177,9 @@ def _tagged(tag: str, style: str, text: str) -> None:
         return
     from rich.text import Text
 
-    show(Text.assemble((tag, style), " ", printable(text)), stream=sys.stderr)
+    told = Text.assemble((tag, style), " ", printable(text))  # whole: a command may be copied
+    sys.stderr.write(_drawn(sys.stderr, told, limit=None) + "\n")
+    sys.stderr.flush()
 
 
 def _console(stream: IO[str], **options: Any) -> Console:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,18 +19,26 @@ if TYPE_CHECKING:
     from fogft.planning.explain import Considered
     from fogft.pool.commands.plan import PlanShown
 
+_MARGIN = 14  # of the summary: its labels stand there
 _HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST", "WHY NOT")
 
 
 def show(shown: PlanShown, *, everything: bool = False) -> None:
     """Print the plan: the table of offers and a summary."""
+    from fogft.cli.table import table
+
     found = sorted(shown.explanation.considered, key=_order)
     listed = found if everything else _best_of_regions(found)
     rows = [_row(shown, one) for one in listed]
-    output.show(output.table(_HEADER, rows, right=("$/H", "RTT", "LOST")))
+    folds = ("LOCATION", "PRICE", "WHY NOT")
+    right, width = ("$/H", "RTT", "LOST"), output.width(sys.stdout)
+    output.show(table(_HEADER, rows, right=right, folds=folds, width=width))
     if len(listed) < len(found):
         output.data(f"and {len(found) - len(listed)} more offers in these regions (--all)")
-    output.data("\n".join(["", *_summary(shown)]))
+    output.data("")
+    for line in _summary(shown):
+        by = 4 if line.startswith(" ") else _MARGIN
+        output.data(line[:by] + output.indented(line[by:], by, sys.stdout))
 
 
 def to_json(shown: PlanShown) -> dict[str, Any]:

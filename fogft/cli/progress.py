@@ -72,6 +72,7 @@ def _no_room(spec: PoolSpec) -> str:
 
 def _show_launches(preview: Preview) -> None:
     from fogft.cli.plan_text import price_source
+    from fogft.cli.table import table
 
     rows = [
         (
@@ -84,7 +85,7 @@ def _show_launches(preview: Preview) -> None:
         for launch in preview.launches
     ]
     if rows:
-        output.show(output.table([""] * 5, rows, titled=False), stream=sys.stderr)
+        output.show(table([""] * 5, rows, titled=False), stream=sys.stderr)
         output.say(f"  together ${preview.usd_per_hour:.3f}/h")
 
 

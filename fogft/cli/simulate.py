@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -87,7 +88,10 @@ HEADER = (
 
 
 def _show(report: Report) -> None:
-    output.show(output.table(HEADER, map(_cells, report.rows), right=HEADER[1:]))
+    from fogft.cli.table import table
+
+    width = output.width(sys.stdout)
+    output.show(table(HEADER, map(_cells, report.rows), right=HEADER[1:], width=width))
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "made up"
     output.data(

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fogft.cli.output import cell, table
+from fogft.cli.output import cell
 
 if TYPE_CHECKING:
     from rich.console import Group, RenderableType
-    from rich.table import Table
     from rich.text import Text
     from rich.tree import Tree
 
@@ -24,25 +23,29 @@ SERVICE_COLUMNS = (
     *("SERVICE", "READY", "REQUESTS", "ANSWERED", "FALLBACK", "UNANSWERED", "LATE"),
     *("WAITING", "P50", "P99"),
 )
+RARE = ("FALLBACK", "UNANSWERED", "LATE", "WAITING")
+DETAIL = "DETAIL"
 UNKNOWN = "?"
 NUMBERS = ("$/H", "RTT", "WON", "AGE", *SERVICE_COLUMNS[1:])
 
 
-def rendered(seen: Seen, *, width: int) -> Group:
+def rendered(seen: Seen, *, width: int | None) -> Group:
     """Return the whole screen for lines of a width."""
     status = seen.status
     rows = [*status.replicas, *status.by_hand]
     parts: list[Sequence[RenderableType]] = [
         [headline(seen)],
         replicas(rows, REPLICA_COLUMNS, width=width, links_known=seen.links_known),
-        [services(status.services, links_known=seen.links_known)] if status.services else [],
+        [services(status.services, width=width, links_known=seen.links_known)]
+        if status.services
+        else [],
         topology(status.topology),
         notes(status),
     ]
     return _lines([line for part in parts if part for line in ("", *part)][1:])
 
 
-def starting(status: PoolStatus, *, width: int) -> Group:
+def starting(status: PoolStatus, *, width: int | None) -> Group:
     """Return what `up` shows meanwhile: without what only matters later."""
     return _lines([*replicas(status.replicas, STARTING_COLUMNS, width=width), *notes(status)])
 
@@ -114,22 +117,25 @@ def replicas(
     rows: Sequence[ReplicaStatus],
     names: Sequence[str],
     *,
-    width: int,
+    width: int | None,
     links_known: bool = True,
 ) -> list[RenderableType]:
     """Return the table of replicas; details stand in it where there is room, else below it."""
+    from fogft.cli.table import table
+
     if not rows:
         return []
     cells = [[*map(_of_replica(row, links_known).__getitem__, names)] for row in rows]
     details = [cell(row.detail) for row in rows]
+    own = table(names, cells, width=width, right=NUMBERS, folds=("LOCATION",))
     if not any(details):
-        return [table(names, cells, right=NUMBERS)]
+        return [own]
     taken = sum(max(len(one) + 2 for one in column) for column in zip(names, *cells, strict=True))
-    if taken + max(map(len, details)) <= width:
+    if width is None or taken + max(map(len, details)) <= width:
         beside = [[*row, one] for row, one in zip(cells, details, strict=True)]
         return [table([*names, ""], beside, right=NUMBERS)]
     below = [(row[0], one) for row, one in zip(cells, details, strict=True) if one]
-    return [table(names, cells, right=NUMBERS), "", table(("", ""), below, titled=False)]
+    return [own, "", table(("", DETAIL), below, width=width, folds=(DETAIL,), titled=False)]
 
 
 def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
@@ -146,8 +152,12 @@ def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
     }
 
 
-def services(rows: Sequence[ServiceStatus], *, links_known: bool = True) -> Table:
+def services(
+    rows: Sequence[ServiceStatus], *, width: int | None, links_known: bool = True
+) -> RenderableType:
     """Return the table of services and what became of their requests."""
+    from fogft.cli.table import table
+
     cells: list[list[str | Text]] = []
     for row in rows:
         count = row.counters
@@ -167,7 +177,9 @@ def services(rows: Sequence[ServiceStatus], *, links_known: bool = True) -> Tabl
                 milliseconds(count.get("p99_s")),
             ]
         )
-    return table(SERVICE_COLUMNS, cells, right=NUMBERS)
+    return table(
+        SERVICE_COLUMNS, cells, width=width, right=NUMBERS, folds=("SERVICE",), optional=RARE
+    )
 
 
 def topology(drawn: Mapping[str, Any]) -> list[RenderableType]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import TYPE_CHECKING, Annotated
 
@@ -60,6 +61,7 @@ def sweep(
 
 def _show(found: Swept) -> None:
     from fogft.cli.status_text import age, price
+    from fogft.cli.table import table
 
     if found.cloud == "sky":
         asked = ", ".join(f"`{name}`" for name in sorted(found.asked)) or "no cloud"
@@ -76,4 +78,6 @@ def _show(found: Swept) -> None:
         for one in found.unowned
     ]
     if rows:
-        output.show(output.table([""] * 5, rows, titled=False))
+        names = ("MACHINE", "LOCATION", "$/H", "AGE", "WHY")
+        width = output.width(sys.stdout)
+        output.show(table(names, rows, width=width, folds=("WHY", "LOCATION"), titled=False))

@@ -7,6 +7,7 @@ import io
 import pytest
 
 from fogft.cli import output
+from fogft.cli.table import table
 
 HOSTILE = "a\x1b[2Jb\rc\x07\u202e"
 
@@ -22,7 +23,7 @@ def test_control_characters_are_escaped_and_lines_kept():
 
 
 def test_no_table_tree_or_message_passes_control_characters_on(capsys):
-    output.show(output.table(["NAME"], [[HOSTILE], ["one\ntwo"]]), output.cell(HOSTILE))
+    output.show(table(["NAME"], [[HOSTILE], ["one\ntwo"]]), output.cell(HOSTILE))
     output.warn(HOSTILE)
     said = capsys.readouterr()
     for text in (said.out, said.err):
@@ -38,7 +39,7 @@ def test_data_and_a_log_pass_no_control_characters_on(capsys):
 
 
 def test_square_brackets_are_text_and_not_markup(capsys):
-    output.show(output.table(["NAME"], [["[bold]x[/bold] :smile:"]]))
+    output.show(table(["NAME"], [["[bold]x[/bold] :smile:"]]))
     assert capsys.readouterr().out.splitlines()[1] == "[bold]x[/bold] :smile:"
 
 

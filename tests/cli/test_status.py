@@ -104,7 +104,8 @@ def test_a_manager_that_hangs_is_told(home, capsys):
     )
 
 
-def test_what_sounds_alarm_stands_in_the_first_line(home, capsys):
+def test_what_sounds_alarm_stands_in_the_first_line(home, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     status = replace(STATUS, uplink_suspected=True, stopping=True)
     paths = lay_down(home, status)
     main.run(["status"])
@@ -224,8 +225,8 @@ def on_a_terminal(home, **environ: str) -> str:
     return sent.decode()
 
 
-def test_a_narrow_terminal_is_redrawn_with_lines_cut_at_their_ends(home):
-    """No column is shortened: half a number would be another number."""
+def test_a_narrow_terminal_is_redrawn_with_all_that_a_wide_one_shows(home):
+    """No column is cut, shortened or left out: what does not fit stands below."""
     paths = lay_down(home)
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 25, 60, 0, 0))
@@ -243,10 +244,39 @@ def test_a_narrow_terminal_is_redrawn_with_lines_cut_at_their_ends(home):
     os.close(follower)
     os.close(leader)
     screen = re.sub(r"\033\[[0-9;?]*[a-zA-Z]", "", sent.decode()).splitlines()
-    row = next(line for line in screen if line.startswith("0.1 "))
-    assert row.startswith("0.1      ready     local/us-west-2/a     0.021  up ")
-    assert len(row) <= 60
-    assert row.endswith("…")
+    assert all(len(line) <= 60 for line in screen)
+    first, second = [line.split() for line in screen if line.startswith("0.1 ")][:2]
+    assert first == ["0.1", "ready", "local/us-west-2/a", "0.021", "up"]
+    assert second == ["0.1", "0.42", "ms", "1", "412", "7", "min"]
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120, 200])
+def test_a_screen_fits_its_terminal_and_breaks_no_word(home, capsys, monkeypatch, columns):
+    """Each word of the widest screen stands whole on a narrower one, but a place at its slash."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    paths = lay_down(home)
+    with alive(paths):
+        assert main.run(["status"]) == 0
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= columns
+    assert set(SCREEN.split()) - set(shown.split()) <= {"0.4", "local/eu-central-1/b"}
+
+
+def test_a_terminal_is_spared_columns_that_say_nothing(home, capsys, monkeypatch):
+    """A pipe is not: whoever reads it counts columns."""
+    (service,) = STATUS.services
+    quiet = {**service.counters, "fallback": 0, "silent": 0, "turned_away": 0, "pending": 0}
+    paths = lay_down(home, replace(STATUS, services=(replace(service, counters=quiet),)))
+    with alive(paths):
+        main.run(["status"])
+        shown = capsys.readouterr().out
+        monkeypatch.delenv("COLUMNS")
+        main.run(["status"])
+        piped = capsys.readouterr().out
+    for name in ("FALLBACK", "UNANSWERED", "WAITING"):
+        assert name not in shown
+        assert name in piped
+    assert "LATE" in shown
 
 
 def test_a_terminal_gets_colour_unless_it_wants_none(home):

@@ -37,6 +37,12 @@ def pool(home: Path, machines: Local, name: str = "planner") -> PoolPaths:
     return paths
 
 
+@pytest.fixture(autouse=True)
+def piped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have one line for each machine, as a program reads it."""
+    monkeypatch.delenv("COLUMNS")
+
+
 def run(capsys, *words: str, status: int = 0) -> tuple[list[str], str]:
     """Run ``fogft sweep``; return its lines on stdout, and stderr."""
     capsys.readouterr()

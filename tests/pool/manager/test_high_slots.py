@@ -135,9 +135,10 @@ def seen() -> status.PoolStatus:
 
 
 def test_status_shows_replicas_by_hand_beside_the_managers(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They count for what a service can do, and for no number of what the pool wants."""
+    monkeypatch.delenv("COLUMNS", raising=False)
     found = seen()
     assert (found.target, found.ready, found.services[0].ready_replicas) == (4, 4, 5)
     assert [one.slot for one in found.replicas] == [0, 1, 100, 101]

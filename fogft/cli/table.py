@@ -1,0 +1,138 @@
+"""Tables that fit a terminal: first text is folded between words, then columns go below.
+
+Numbers and words are never cut, and no column is left out but an empty one that says nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from rich.cells import cell_len
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from fogft.cli.output import cell
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+_GAP = 2
+_LEAST = 18  # of a folded column, where no word is longer
+_PIECE = re.compile(r"[^ /]*[ /]?")
+_EMPTY = frozenset({"", "-", "0"})
+
+
+@dataclass(frozen=True)
+class _Column:
+    name: str
+    cells: list[Text]
+    folds: bool = False
+
+    @property
+    def natural(self) -> int:
+        """How wide it is unfolded."""
+        lines = (line for one in self.cells for line in one.plain.split("\n"))
+        return max(map(cell_len, (self.name, *lines)))
+
+    @property
+    def least(self) -> int:
+        """How wide it must be."""
+        if not self.folds:
+            return self.natural
+        pieces = (piece for one in self.cells for piece in _PIECE.findall(one.plain))
+        return min(self.natural, max(_LEAST, cell_len(self.name), *map(cell_len, pieces), 0))
+
+    def folded(self, width: int) -> _Column:
+        """Return it with lines of at most a width."""
+        return replace(self, cells=[_folded(one, width) for one in self.cells])
+
+
+def table(
+    header: Iterable[str],
+    rows: Iterable[Iterable[str | Text]],
+    *,
+    width: int | None = None,
+    right: Collection[str] = (),
+    folds: Collection[str] = (),
+    optional: Collection[str] = (),
+    titled: bool = True,
+) -> RenderableType:
+    """Return a table without lines, or several below each other that begin with one column.
+
+    Args:
+        header: The columns' names.
+        rows: As many cells each.
+        width: Of a terminal's line; None for no limit.
+        right: Columns that are aligned to the right.
+        folds: Columns whose cells may be folded.
+        optional: Columns that a terminal is spared where they are empty, or 0 everywhere.
+        titled: Whether the header is shown.
+    """
+    cells = [[cell(one) if isinstance(one, str) else one for one in row] for row in rows]
+    columns = [
+        _Column(name if titled else "", [row[at] for row in cells], name in folds)
+        for at, name in enumerate(header)
+    ]
+    if width is not None:
+        columns = [one for one in columns if one.name not in optional or not _is_empty(one)]
+    parts = [columns] if width is None else _parts(columns, width)
+    drawn: list[RenderableType] = []
+    for part in parts:
+        rows_shown = [
+            row
+            for row in zip(*(one.cells for one in part), strict=True)
+            if part is parts[0] or any(one.plain for one in row[1:])
+        ]
+        drawn += ["", _drawn(part, rows_shown, right, titled)]
+    return Group(*drawn[1:])
+
+
+def _is_empty(column: _Column) -> bool:
+    return all(one.plain in _EMPTY for one in column.cells)
+
+
+def _parts(columns: list[_Column], width: int) -> list[list[_Column]]:
+    """Return the columns in as many tables as are needed, each with its text folded to fit."""
+    first, *rest = columns
+    parts: list[list[_Column]] = []
+    while rest or not parts:
+        part = [first]
+        while rest and (len(part) == 1 or _needed([*part, rest[0]]) <= width):
+            part.append(rest.pop(0))
+        spare = width - _needed(part)
+        for at, one in enumerate(part):
+            room = one.least + max(0, spare)
+            spare -= min(one.natural, room) - one.least
+            part[at] = one.folded(room) if one.natural > room else one
+        parts.append(part)
+    return parts
+
+
+def _needed(columns: list[_Column]) -> int:
+    return sum(one.least for one in columns) + _GAP * (len(columns) - 1)
+
+
+def _folded(text: Text, width: int) -> Text:
+    lines = [""]
+    for piece in _PIECE.findall(text.plain):
+        if lines[-1] and cell_len((lines[-1] + piece).rstrip()) > width:
+            lines.append("")
+        lines[-1] += piece
+    return Text("\n".join(line.rstrip() for line in lines), text.style)
+
+
+def _drawn(
+    columns: list[_Column], rows: Iterable[Sequence[Text]], right: Collection[str], titled: bool
+) -> Table:
+    made = Table(
+        box=None, pad_edge=False, padding=(0, _GAP, 0, 0), header_style="dim", show_header=titled
+    )
+    for one in columns:
+        made.add_column(one.name, justify="right" if one.name in right else "left", no_wrap=True)
+    for row in rows:
+        made.add_row(*row)
+    return made
