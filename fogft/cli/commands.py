@@ -26,7 +26,9 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "Look": {
         "plan": ("plan", "pool.yaml"),
+        "list": ("overview", ""),
         "status": ("status", "--watch"),
+        "events": ("overview", "-n 20"),
         "logs": ("status", "2 -f"),
         "doctor": ("doctor", "pool.yaml"),
     },

@@ -176,7 +176,7 @@ def join(
     ],
     passphrase_file: PassphraseFile = None,
 ) -> None:
-    """Set this machine up as a robot, gateway or replica, from a join bundle.
+    """Make this machine a robot, gateway or replica, from a join bundle.
 
     The file is good for one time, on one machine: where the pool has a rendezvous, that is asked,
     so one has to run. Then the file is destroyed. To give a robot new keys, join again with a

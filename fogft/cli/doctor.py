@@ -24,7 +24,7 @@ def doctor(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check this machine, ROS 2 and the pools on it, and how to fix what is wrong.
+    """Check this machine, ROS 2 and the pools, and say what to do.
 
     Each finding comes with its remedy. Changes nothing. Exit status 1 when something does not work.
     """

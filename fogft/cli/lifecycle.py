@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fogft.cli import options, output
-from fogft.cli.options import DEFAULT_FILE, PoolArgument, PoolFile
+from fogft.cli.options import DEFAULT_FILE, PoolArgument, PoolFile, PoolOption
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
@@ -160,6 +160,7 @@ def down(
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Do not ask. Without a terminal, nothing is asked.")
     ] = False,
+    named: PoolOption = None,
 ) -> None:
     """End a pool: its replicas, its client proxy and its manager.
 
@@ -172,7 +173,7 @@ def down(
     if not composition.pools():
         output.say("nothing to end: there is no pool here")
         return
-    store = composition.store_of(pool)
+    store = composition.store_of(pool or named)
     paid = store.identity().cloud != composition.LOCAL
     asks = paid and not yes and output.is_terminal(sys.stdin)
     if asks and not output.confirm(f"end `{store.name}` and all its machines?"):

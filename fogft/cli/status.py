@@ -42,6 +42,7 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
     schema: Annotated[
         bool, typer.Option("--schema", help="Print the JSON Schema of --json, and stop.")
     ] = False,
+    named: PoolOption = None,
 ) -> None:
     """Show a pool: its replicas, their links, and the outcome of requests.
 
@@ -52,6 +53,7 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
 
         output.json_data(status_schema())
         return
+    pool = pool or named
     from fogft.cli import status_text
     from fogft.pool.commands import composition
     from fogft.pool.commands.status import checked, read, refreshed
@@ -105,12 +107,11 @@ def _remark(seen: Seen) -> None:
 
 
 def logs(
-    slot: Annotated[
-        int | None,
+    of: Annotated[
+        str | None,
         typer.Argument(
-            min=0,
             metavar="SLOT",
-            help="Only this replica's log; by default all logs.",
+            help="Only this replica's log, or the name of a pool; by default all logs.",
             autocompletion=options.slots,
         ),
     ] = None,
@@ -129,7 +130,8 @@ def logs(
     from fogft.pool.commands import composition
     from fogft.pool.commands.logs import find
 
-    store = composition.store_of(pool)
+    slot = int(of) if of is not None and of.isdecimal() else None
+    store = composition.store_of(pool or (of if slot is None else None))
     cloud = composition.cloud_of(store.identity())
     tails: dict[str, Tail] = {}
     begin: int | None = lines

@@ -27,7 +27,7 @@ def sweep(
         ),
     ] = None,
 ) -> None:
-    """Find machines of your pools that no manager owns, and end them on request.
+    """Find machines that no manager owns, and end them on request.
 
     Asks the clouds themselves where that can be, so it finds what everybody else forgot. A
     machine whose pool is managed from another state folder looks like nobody's.

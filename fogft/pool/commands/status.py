@@ -12,11 +12,11 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from fogft import disk
-from fogft.errors import CloudError, StateError, told
+from fogft.errors import CloudError, PoolNotFound, StateError, told
 from fogft.model.reason import Cause, Reason
 from fogft.pool.commands.current import Seen, current
 from fogft.pool.folder.paths import PoolPaths
@@ -76,6 +76,17 @@ def checked(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.
         if seen.links_known and [r.link for r in links[0]] == [r.link for r in links[1]]:
             return asked
         time.sleep(_LOOK_EVERY_S)
+
+
+def every(names: Iterable[str], now: float) -> Iterator[tuple[str, Seen | StateError]]:
+    """Yield what is known of each pool; an error of one hides no other."""
+    for name in names:
+        try:
+            yield name, read(PoolPaths.of(name), now)
+        except PoolNotFound:  # it has just been ended
+            continue
+        except StateError as error:
+            yield name, error
 
 
 def renewed(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.time) -> Seen:

@@ -239,7 +239,7 @@ def of_tick(
         replicas=replicas,
         by_hand=[_started_by_hand(id, links.get(id), tick.spec) for id in by_hand],
         services=_services(tick.spec, heard, report),
-        events=[_event(event) for event in recent],
+        events=[event_status(event) for event in recent],
         topology=_topology(tick, report if proxy_alive else None),
         applied=tick.file,
         update=_update(tick),
@@ -358,7 +358,8 @@ def _services(
     ]
 
 
-def _event(event: Event) -> EventStatus:
+def event_status(event: Event) -> EventStatus:
+    """Return an event as a status tells it."""
     return EventStatus(
         at=event.at,
         event=WORDS[event.kind],
