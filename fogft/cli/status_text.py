@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -108,6 +109,14 @@ def notes(status: PoolStatus) -> list[Text]:
         order = row.counters.get("order") or {}
         if order.get("trouble"):
             found.append(f"`{row.name}` cannot be had: {order['trouble']}")
+        poison = row.counters.get("poison")
+        if poison:
+            at = time.strftime("%F %T", time.localtime(row.counters["poisoned_at"]))
+            requests = "a request" if poison == 1 else f"{poison} requests"
+            found.append(
+                f"`{row.name}`: services died over {requests}, which were not sent again; "
+                f"the last time at {at}"
+            )
     if status.excluded:
         found.append(f"excluded: {', '.join(status.excluded)}")
     return [cell("note:", "bold cyan") + cell(f" {note}") for note in found]
@@ -162,7 +171,7 @@ def services(
     for row in rows:
         count = row.counters
         ready = number(row.ready_replicas) if links_known else UNKNOWN
-        unanswered = sum(count.get(key, 0) for key in ("silent", "empty", "turned_away"))
+        unanswered = sum(count.get(key, 0) for key in ("silent", "empty", "turned_away", "poison"))
         cells.append(
             [
                 row.name,

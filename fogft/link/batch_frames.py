@@ -26,10 +26,10 @@ BYTES_LIMIT = 16 << 10  # of all payloads together
 
 _FIRST = bytes((frame.VERSION | 0x10,))
 _STAMPED = len(_FIRST) + STAMP_BYTES
-_REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sd?I")  # id, remaining seconds, spare, length
+_REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdBI")  # id, remaining seconds, handling, length
 _ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s{frame.LOAD_BYTES}s?I")  # ..., refusal, length
 
-Requests = Sequence[tuple[bytes, float, bool, bytes]]
+Requests = Sequence[tuple[bytes, float, int, bytes]]
 Answers = Sequence[tuple[bytes, bytes, bytes, str]]
 
 
@@ -41,7 +41,7 @@ def is_batch(header: bytes) -> bool:
 def encode_requests(
     requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
 ) -> tuple[bytes, bytes]:
-    """Return header and payload for requests: id, remaining seconds, whether spare, and payload.
+    """Return header and payload for requests: id, remaining seconds, handling and payload.
 
     Args:
         requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
@@ -49,8 +49,8 @@ def encode_requests(
         seen: The stamp of the last answer that the connection has seen.
     """
     parts = []
-    for id, remaining_s, spare, payload in requests:
-        parts.append(_REQUEST.pack(id, remaining_s, spare, len(payload)))
+    for id, remaining_s, handling, payload in requests:
+        parts.append(_REQUEST.pack(id, remaining_s, handling, len(payload)))
         parts.append(payload)
     return _FIRST + seen + origin, b"".join(parts)
 
@@ -66,9 +66,10 @@ def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, 
     seen = header[1:_STAMPED]
     token, robot = frame.read_origin(header[_STAMPED:])
     found = []
-    for (id, remaining_s, spare, _), part in _entries(_REQUEST, payload):
+    for (id, remaining_s, flags, _), part in _entries(_REQUEST, payload):
         frame.check_remaining(remaining_s)
-        found.append((RequestHeader(id, remaining_s, token, robot, seen, spare=spare), part))
+        handling = frame.read_handling(flags)
+        found.append((RequestHeader(id, remaining_s, token, robot, seen, handling=handling), part))
     return found
 
 

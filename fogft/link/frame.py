@@ -18,15 +18,16 @@ from typing import Any, NamedTuple
 from fogft.errors import FrameError
 from fogft.model.keys import LONGEST_S
 from fogft.model.names import REQUEST_ID_BYTES, ROBOT_BYTES_LIMIT
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 
 VERSION = 5
-# Beside the version, only towards peers that have said that they know them.
-_PACKED = 0x80  # the payload is compressed
-_MAY_PACK = 0x40  # the answer may be
-_READS_PACKED = 0x20  # the answer may be where the replica finds the link to be thin
-_SPARE = 0x08  # to be dropped where it would have to wait
-_REQUEST_FLAGS = _PACKED | _MAY_PACK | _READS_PACKED | _SPARE
+_ANSWER_PACKED = 0x80  # beside the version: the payload is compressed
+# Of a request:
+_PACKED = 0x01  # the payload is compressed
+_MAY_PACK = 0x02  # the answer may be
+_READS_PACKED = 0x04  # the answer may be where the replica finds the link to be thin
+_HANDLINGS = {int(one): one for one in (Handling.NORMAL, Handling.DROP_IF_BUSY, Handling.ALONE)}
+_PACKING = _PACKED | _MAY_PACK | _READS_PACKED
 TOKEN_BYTES = 8
 STAMP_BYTES = 4
 NO_STAMP = bytes(STAMP_BYTES)  # nothing was seen yet, or nobody asks
@@ -37,7 +38,7 @@ _CANCEL_BYTES_LIMIT = 1 + CANCEL_LIMIT * REQUEST_ID_BYTES
 
 GREETING_LIMIT = 4096
 
-_REQUEST = struct.Struct(f">B{REQUEST_ID_BYTES}sd{STAMP_BYTES}s")
+_REQUEST = struct.Struct(f">BB{REQUEST_ID_BYTES}sd{STAMP_BYTES}s")
 _LOAD = struct.Struct(">HBBff")
 LOAD_BYTES = _LOAD.size
 NO_LOAD = bytes(LOAD_BYTES)  # of a replica whose service time is not known
@@ -59,7 +60,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
         packed: The payload is compressed.
         may_pack: The answer may be.
         reads_packed: It may be where the replica itself finds the link to be thin.
-        spare: It is to be dropped where it would have to wait.
+        handling: What the replica is asked to do with it.
     """
 
     request_id: bytes
@@ -70,7 +71,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
     packed: bool = False
     may_pack: bool = False
     reads_packed: bool = False
-    spare: bool = False
+    handling: Handling = Handling.NORMAL
 
 
 @dataclass(frozen=True)
@@ -140,21 +141,21 @@ def encode_request(
     packed: bool = False,
     may_pack: bool = False,
     reads_packed: bool = False,
-    spare: bool = False,
+    handling: Handling = Handling.NORMAL,
 ) -> bytes:
     """Return a request's header; `origin` comes from the function of that name."""
-    first = VERSION | _PACKED * packed | _MAY_PACK * may_pack | _READS_PACKED * reads_packed
-    if spare:
-        first |= _SPARE
-    return _REQUEST.pack(first, request_id, remaining_s, seen) + origin
+    flags = int(handling)
+    flags |= _PACKED * packed | _MAY_PACK * may_pack | _READS_PACKED * reads_packed
+    return _REQUEST.pack(VERSION, flags, request_id, remaining_s, seen) + origin
 
 
 def decode_request(frame: bytes) -> RequestHeader:
     """Read a request's header. Raises FrameError: it is not one."""
     if len(frame) < _ORIGIN_AT:
         raise FrameError(f"a request's header of {len(frame)} bytes")
-    first, request_id, remaining_s, seen = _REQUEST.unpack_from(frame)
-    _check_first(first, _REQUEST_FLAGS)
+    version, flags, request_id, remaining_s, seen = _REQUEST.unpack_from(frame)
+    check_version(version)
+    handling = read_handling(flags & ~_PACKING)
     check_remaining(remaining_s)
     token, robot = read_origin(frame[_ORIGIN_AT:])
     return RequestHeader(
@@ -163,11 +164,19 @@ def decode_request(frame: bytes) -> RequestHeader:
         token,
         robot,
         seen,
-        first & _PACKED != 0,
-        first & _MAY_PACK != 0,
-        first & _READS_PACKED != 0,
-        first & _SPARE != 0,
+        flags & _PACKED != 0,
+        flags & _MAY_PACK != 0,
+        flags & _READS_PACKED != 0,
+        handling,
     )
+
+
+def read_handling(flags: int) -> Handling:
+    """Return what a replica is asked to do. Raises FrameError: it is nothing that is known."""
+    handling = _HANDLINGS.get(flags)
+    if handling is None:
+        raise FrameError(f"a request with flags {flags:#x}")
+    return handling
 
 
 def encode_load(load: Load | None) -> bytes:
@@ -198,7 +207,7 @@ def encode_answer(
     stamp: bytes, request_id: bytes, *, load: bytes = NO_LOAD, packed: bool = False
 ) -> bytes:
     """Return an answer's header; `load` comes from `encode_load`."""
-    return _ANSWER.pack(VERSION | _PACKED * packed, stamp, request_id, load)
+    return _ANSWER.pack(VERSION | _ANSWER_PACKED * packed, stamp, request_id, load)
 
 
 def decode_answer(frame: bytes) -> tuple[bytes, bytes, Load | None, bool]:
@@ -210,8 +219,8 @@ def decode_answer(frame: bytes) -> tuple[bytes, bytes, Load | None, bool]:
     if len(frame) != _ANSWER.size:
         raise FrameError(f"an answer's header of {len(frame)} bytes")
     first, stamp, request_id, load = _ANSWER.unpack(frame)
-    _check_first(first, _PACKED)
-    return stamp, request_id, decode_load(load), bool(first & _PACKED)
+    check_version(first & ~_ANSWER_PACKED)
+    return stamp, request_id, decode_load(load), bool(first & _ANSWER_PACKED)
 
 
 def encode_refusal(stamp: bytes, request_id: bytes, reason: str, load: bytes = NO_LOAD) -> bytes:
@@ -303,11 +312,6 @@ def decode_cancel(frame: bytes) -> list[bytes]:
         raise FrameError(f"a cancellation of {len(frame)} bytes")
     check_version(frame[0])
     return [frame[at : at + REQUEST_ID_BYTES] for at in range(1, len(frame), REQUEST_ID_BYTES)]
-
-
-def _check_first(first: int, flags: int) -> None:
-    if first & ~flags != VERSION:
-        check_version(first)
 
 
 def check_version(version: Any) -> None:

@@ -21,7 +21,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.type_definition import Definition
 from fogft.records.record import SignedRecord
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class Link(Protocol):
         remaining_s: float,
         *,
         more: bool = False,
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> bool:
         """Take one attempt, or return False when the window is full or the link not usable.
 
@@ -217,7 +217,7 @@ class Link(Protocol):
 
         Args:
             more: Others follow at once, then `send`: it may wait for them, to leave in one message.
-            spare: The replica drops it where it would have to wait.
+            handling: What the replica is asked to do with it.
         """
 
     def send(self) -> None:
@@ -276,7 +276,7 @@ class Incoming(Protocol):
         request_id: 16 bytes, made by the client proxy.
         robot: Who asks; replies to one robot never wait for another.
         remaining_s: Time that was left when the robot sent it.
-        spare: It is to be dropped where it would have to wait.
+        handling: What this replica is asked to do with it.
         payload: The serialised request (CDR).
     """
 
@@ -284,7 +284,7 @@ class Incoming(Protocol):
     request_id: bytes
     robot: str
     remaining_s: float
-    spare: bool
+    handling: Handling
     payload: bytes
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:

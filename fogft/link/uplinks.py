@@ -25,6 +25,7 @@ from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec
 from fogft.model.uplinks import UplinkPolicy, choose
 from fogft.records.record import SignedRecord
+from fogft.requests.load import Handling
 
 _ANSWERED_KEPT = 1024
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
@@ -37,7 +38,7 @@ class _Attempt:
     service: str
     payload: bytes
     deadline: float
-    spare: bool
+    handling: Handling
     on: set[int] = field(default_factory=set)
 
 
@@ -91,10 +92,10 @@ class UplinksLink:
         remaining_s: float,
         *,
         more: bool = False,
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> bool:
         """Take one attempt, or return False when no uplink takes it. Never blocks."""
-        attempt = _Attempt(service, payload, time.monotonic() + remaining_s, spare)
+        attempt = _Attempt(service, payload, time.monotonic() + remaining_s, handling)
         with self._lock:
             if self._closed or request_id in self._attempts:
                 return False
@@ -129,7 +130,7 @@ class UplinksLink:
             attempt.on.add(index)
         left_s = attempt.deadline - time.monotonic()
         if not self._links[index].offer(
-            attempt.service, request_id, attempt.payload, left_s, spare=attempt.spare
+            attempt.service, request_id, attempt.payload, left_s, handling=attempt.handling
         ):
             with self._lock:
                 attempt.on.discard(index)

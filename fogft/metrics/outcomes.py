@@ -21,7 +21,7 @@ _LATENCIES_KEPT = 2000
 BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 OUTCOMES_COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
-    *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled"),
+    *("fallback", "fallback_failed", "turned_away", "undelivered", "cancelled", "poison"),
     *("request_bytes", "response_bytes"),
 )
 
@@ -35,6 +35,7 @@ class Outcome(str, Enum):
     SILENT = "silent"  # with none
     TURNED_AWAY = "turned_away"  # it was not taken
     CANCELLED = "cancelled"  # its caller took it back
+    POISON = "poison"  # services died while they worked on it
 
 
 class Outcomes:
@@ -46,6 +47,7 @@ class Outcomes:
             ``undelivered`` those that ROS did not take. ``request_bytes`` are those of all
             received requests together, ``response_bytes`` those of the first answers of replicas.
         refused: Refusals by reason.
+        poisoned_at: When services last died over a request that was then given up; wall clock.
         trace: How each request ended, until somebody takes it; None where it is not wanted.
     """
 
@@ -59,6 +61,7 @@ class Outcomes:
         self._buckets = [0] * (len(BUCKETS_S) + 1)
         self._took_s = 0.0
         self._late_lock = threading.Lock()
+        self.poisoned_at: float | None = None
         self.trace: deque[dict[str, Any]] | None = None
 
     def received(self, size_bytes: int) -> None:
@@ -146,6 +149,7 @@ class Outcomes:
             **self.count,
             "refused": dict(self.refused),
             "won": {replica.short: count for replica, count in self._won.items()},
+            "poisoned_at": self.poisoned_at,
             "p50_s": ordered[len(ordered) // 2] if ordered else None,
             "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,
             "buckets": list(self._buckets),

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from prometheus_client import Metric
 
 # How requests end. `pending` is the rest.
-OUTCOMES = ("answered", "fallback", "empty", "silent", "turned_away", "cancelled")
+OUTCOMES = ("answered", "fallback", "empty", "silent", "turned_away", "cancelled", "poison")
 _COUNTS = {
     "received": ("fogft_requests_total", "Requests that callers sent."),
     "sent": ("fogft_attempts_total", "Copies of requests that were sent to replicas."),

@@ -52,6 +52,9 @@ class Pending(Generic[T]):
         failures: How often an attempt at each replica has failed, those that count.
         waits: Until when a replica that failed it is left alone, and that wait, in seconds.
         rejection: The last response that was real but not ok.
+        deaths: How often a service died while it worked on this: those that died together over
+            copies of it, and of other requests, count as one.
+        alone_at: The replica that works on it with nothing beside it, since a service has died.
     """
 
     deadline: float
@@ -61,6 +64,8 @@ class Pending(Generic[T]):
     failures: dict[int, int] = field(default_factory=dict)
     waits: dict[int, tuple[float, float]] = field(default_factory=dict)
     rejection: bytes | None = None
+    deaths: int = 0
+    alone_at: int | None = None
 
 
 class FirstResponse(Generic[T]):

@@ -9,6 +9,7 @@ Owns: what is known of one replica. Not here: who is asked (`auto`, `choose`).
 
 from __future__ import annotations
 
+from enum import IntFlag
 from typing import NamedTuple
 
 from fogft.requests.latency import Latencies
@@ -28,6 +29,14 @@ _UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
 _AVOIDED_S = 0.1
 _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
+
+
+class Handling(IntFlag):
+    """What a replica is asked to do with a request, beside running it."""
+
+    NORMAL = 0
+    DROP_IF_BUSY = 0x08  # a spare copy: drop it where it would have to wait
+    ALONE = 0x10  # a service died while it worked on this: run nothing beside it
 
 
 class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much

@@ -31,8 +31,17 @@ T = TypeVar("T", bound=Item)
 Judged = tuple[Judgement, Pending[T] | None, Iterable[int], Verdict]
 
 
+POISON_DEATHS = 2  # once beside others, and then alone: that is no chance
+# So long after a death no request is at all replicas at once: another that kills would end them.
+CAUTIOUS_S = 60.0
+_SPREADS_AFTER_S = 1.0
+
+
 class PendingRequests(Generic[T]):
     """The requests of one service that await an answer.
+
+    Args:
+        counts_deaths: Whether a request may be blamed for the death of a service that has it.
 
     Attributes:
         held_bytes: Their bytes.
@@ -41,12 +50,14 @@ class PendingRequests(Generic[T]):
         fallback: When the fallback is asked; None where there never was one.
     """
 
-    def __init__(self, choose: Choose, decide: Decide) -> None:
+    def __init__(self, choose: Choose, decide: Decide, *, counts_deaths: bool = False) -> None:
         self._table: FirstResponse[T] = FirstResponse()
         self.held_bytes = 0
         self.choose = choose
         self.decide = decide
         self.fallback: FallbackTimer[Pending[T]] | None = None
+        self._counts_deaths = counts_deaths
+        self._cautious_until = -NEVER
 
     def __len__(self) -> int:
         return len(self._table)
@@ -74,6 +85,9 @@ class PendingRequests(Generic[T]):
             ValueError: The id is under way already.
         """
         chosen = self.choose.first(request, able, now)
+        if len(chosen) == len(able) > 1 and now < self._cautious_until:
+            *chosen, spared = chosen
+            self.choose.declined(request, spared, full=False)
         pending = self._table.register(
             request,
             deadline=deadline,
@@ -101,16 +115,35 @@ class PendingRequests(Generic[T]):
         return [
             (request, replica)
             for request, pending in (short[::-1] if newest_first else short)
-            for replica in self.choose.more(
-                request, pending.open, self._table.candidates(pending, able, now), now
-            )
+            for replica in self._next_for(request, pending, able, now)
         ]
+
+    def _next_for(
+        self, request: bytes, pending: Pending[T], able: Sequence[int], now: float
+    ) -> Sequence[int]:
+        candidates, room = self._table.candidates(pending, able, now), len(able)
+        if pending.deaths:  # alone
+            room = 0 if pending.open else 1
+        elif now < self._cautious_until and pending.open:
+            waited = now >= max(pending.open.values()) + _SPREADS_AFTER_S
+            room -= len(pending.open) + (0 if waited else 1)
+            candidates = candidates[: max(0, room)]
+        if room <= 0:
+            return ()
+        return self.choose.more(request, pending.open, candidates, now)[:room]
+
+    def poisonous(self, request: bytes | None) -> bool:
+        """Whether a request has ended so many services that it is not to be sent again."""
+        pending = self.get(request)
+        return pending is not None and pending.deaths >= POISON_DEATHS
 
     def attempt(self, request: bytes, replica: int, now: float) -> Pending[T] | None:
         """Enter a further attempt; None where it is not wanted any more."""
         pending = self._table.attempt(request, replica, now)
         if pending is None:
             self.choose.declined(request, replica, full=False)
+        elif pending.deaths:
+            pending.alone_at = replica
         return pending
 
     def passed_over(self, request: bytes, replica: int) -> None:
@@ -187,6 +220,13 @@ class PendingRequests(Generic[T]):
 
     def refused(self, request: bytes, replica: int, refusal: Refusal, now: float) -> Verdict:
         """Take a refusal."""
+        pending = self._table.get(request)
+        if refusal is Refusal.CRASHED and self._counts_deaths:
+            self._cautious_until = now + CAUTIOUS_S
+            if pending is not None and replica in pending.open:
+                # Beside others it is but suspected: any of them may have been the cause.
+                alone = replica == pending.alone_at
+                pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
         verdict = self._table.failed(
             request,
             replica,

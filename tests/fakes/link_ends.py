@@ -15,7 +15,7 @@ from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.robot.probing import Silence
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, doubted_after_s
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 
 if TYPE_CHECKING:
     from tests.fakes.link import MemoryDialer, MemoryListener
@@ -30,7 +30,7 @@ class _Attempt:
     request_id: bytes
     payload: bytes
     deadline: float
-    spare: bool
+    handling: Handling
 
     @property
     def size(self) -> int:
@@ -101,14 +101,14 @@ class MemoryLink:
         remaining_s: float,
         *,
         more: bool = False,
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> bool:
         """Take one attempt, or return False."""
         session = self._session
         if session is None or not self.usable or service not in self._services:
             return False
         deadline = self._wire.now + remaining_s
-        attempt = _Attempt(service, request_id, payload, deadline, spare)
+        attempt = _Attempt(service, request_id, payload, deadline, handling)
         if not session.window.admit(attempt):
             return False
         session.attempts.append(attempt)
@@ -123,7 +123,7 @@ class MemoryLink:
             self._dialer.robot,
             remaining_s,
             attempt.payload,
-            spare=attempt.spare,
+            handling=attempt.handling,
             send=lambda answer: self._wire.post(
                 session, lambda: self._end(session, attempt, answer)
             ),
@@ -290,7 +290,7 @@ class MemoryIncoming:
         remaining_s: float,
         payload: bytes,
         *,
-        spare: bool,
+        handling: Handling,
         send: Callable[[Answer], None],
         listener: MemoryListener,
     ) -> None:
@@ -299,7 +299,7 @@ class MemoryIncoming:
         self.robot = robot
         self.remaining_s = remaining_s
         self.payload = payload
-        self.spare = spare
+        self.handling = handling
         self._send: Callable[[Answer], None] | None = send
         self._listener = listener
 

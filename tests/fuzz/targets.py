@@ -237,7 +237,7 @@ def targets() -> dict[str, Target]:
             (
                 b"".join(
                     batch_frames.encode_requests(
-                        [(ID, 1.5, False, b"x"), (ID, 2.0, True, b"")], frame.origin("ada", TOKEN)
+                        [(ID, 1.5, 0, b"x"), (ID, 2.0, 8, b"")], frame.origin("ada", TOKEN)
                     )
                 ),
             ),

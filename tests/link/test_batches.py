@@ -24,7 +24,7 @@ from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -42,8 +42,11 @@ payloads = st.binary(max_size=40)
 stamps = st.binary(min_size=4, max_size=4)
 ORIGIN = frame.origin("ada", bytes(8))
 loads = st.sampled_from([NO_LOAD, frame.encode_load(Load(3, 1, 2, 0.5, 0.25))])
+handlings = st.sampled_from([Handling.NORMAL, Handling.DROP_IF_BUSY, Handling.ALONE])
 requests = st.lists(
-    st.tuples(ids, st.floats(0, frame.REMAINING_LIMIT_S), st.booleans(), payloads),
+    st.tuples(
+        ids, st.floats(0, frame.REMAINING_LIMIT_S), st.sampled_from(list(Handling)), payloads
+    ),
     min_size=1,
     max_size=8,
 )
@@ -56,11 +59,11 @@ answers = st.lists(
 
 @given(requests, stamps)
 def test_requests_come_back_in_their_order(
-    sent: list[tuple[bytes, float, bool, bytes]], seen: bytes
+    sent: list[tuple[bytes, float, Handling, bytes]], seen: bytes
 ) -> None:
     header, content = batch_frames.encode_requests(sent, ORIGIN, seen=seen)
     found = batch_frames.decode_requests(header, content)
-    came = [(one.request_id, one.remaining_s, one.spare, payload) for one, payload in found]
+    came = [(one.request_id, one.remaining_s, one.handling, payload) for one, payload in found]
     assert came == sent
     assert all((one.token, one.robot, one.seen) == (bytes(8), "ada", seen) for one, _ in found)
     assert not any(one.packed or one.may_pack or one.reads_packed for one, _ in found)
@@ -83,7 +86,7 @@ def test_answers_come_back_in_their_order(
 
 def test_a_batch_is_no_single_frame_and_the_other_way_round() -> None:
     """So that neither is ever taken for the other."""
-    header, content = batch_frames.encode_requests([(bytes(16), 1.0, False, b"x")], ORIGIN)
+    header, content = batch_frames.encode_requests([(bytes(16), 1.0, 0, b"x")], ORIGIN)
     single = frame.encode_request(bytes(16), 1.0, ORIGIN)
     assert batch_frames.is_batch(header)
     assert not batch_frames.is_batch(single)
@@ -100,7 +103,7 @@ def test_a_batch_is_no_single_frame_and_the_other_way_round() -> None:
 
 @given(requests, st.data())
 def test_a_batch_that_is_cut_is_refused_as_a_whole(
-    sent: list[tuple[bytes, float, bool, bytes]], data: st.DataObject
+    sent: list[tuple[bytes, float, Handling, bytes]], data: st.DataObject
 ) -> None:
     """Unless the cut falls between two requests: then the first ones are whole."""
     header, content = batch_frames.encode_requests(sent, ORIGIN)
@@ -117,8 +120,8 @@ def test_a_batch_that_is_cut_is_refused_as_a_whole(
 
 @pytest.mark.parametrize("remaining_s", [-1.0, float("nan"), float("inf")])
 def test_a_time_that_is_none_is_refused(remaining_s: float) -> None:
-    good = (request_id(1), 1.0, False, b"x")
-    batch = batch_frames.encode_requests([good, (request_id(2), remaining_s, False, b"y")], ORIGIN)
+    good = (request_id(1), 1.0, 0, b"x")
+    batch = batch_frames.encode_requests([good, (request_id(2), remaining_s, 0, b"y")], ORIGIN)
     with pytest.raises(FrameError, match="remaining time"):
         batch_frames.decode_requests(*batch)
 
@@ -384,9 +387,7 @@ def test_a_batch_of_a_stranger_or_of_garbage_is_not_taken(
     try:
         key = keys(0)[SERVICE]
         hears(session, key)
-        header, content = batch_frames.encode_requests(
-            [(request_id(1), 5.0, False, b"x")] * 3, ORIGIN
-        )
+        header, content = batch_frames.encode_requests([(request_id(1), 5.0, 0, b"x")] * 3, ORIGIN)
         session.put(key, content, attachment=header)
         wait_for(lambda: listener.counters().get("not_admitted") == 1)
         assert listener.counters().get("requests") == 3

@@ -217,6 +217,10 @@ class Caller:
         self.right = 0
         self.wrong: list[int] = []
 
+    def poison(self) -> None:
+        """Send a request of which the service dies; nobody waits for its answer."""
+        self._client.call_async(self._type.Request(tolerance=-1.0))
+
     def ask(self, count: int = 1) -> None:
         """Ask, all at once; nothing is taken meanwhile."""
         for _ in range(count):

@@ -9,7 +9,7 @@ from fogft.errors import RosError
 from fogft.link.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 
 UID = "0123456789abcdef"
 
@@ -33,6 +33,7 @@ class FakeLink:
         self.draining = False
         self.room = room
         self.offered: list[tuple[str, bytes, bytes, float]] = []
+        self.handled: list[Handling] = []
         self.waits = 0  # offers that wait for more
         self.forgotten: list[bytes] = []
         self.closed = False
@@ -50,11 +51,12 @@ class FakeLink:
         remaining_s: float,
         *,
         more: bool = False,
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> bool:
         if len(self.offered) >= self.room:
             return False
         self.offered.append((service, request_id, payload, remaining_s))
+        self.handled.append(handling)
         self.waits += more
         return True
 
@@ -126,9 +128,9 @@ class FakeIncoming:
         service: str = "/s",
         remaining_s=10.0,
         robot: str = "r",
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> None:
-        self.spare = spare
+        self.handling = handling
         self.load: Load | None = None
         self.request_id = request_id
         self.payload = payload
@@ -256,7 +258,7 @@ class FakeSupervisor:
         self.dies = False
         self.stopped = False
 
-    def poll(self) -> bool:
+    def poll(self, *, at_work: bool = False) -> bool:
         died, self.dies = self.dies, False
         if died or not self.alive:
             self.restarts += 1

@@ -70,6 +70,33 @@ def test_a_frozen_robot_does_not_hold_up_a_live_one(parts, call):
     assert other.all_answered()
 
 
+def test_requests_that_kill_the_service_harm_only_themselves(parts, call):
+    """Two of them among a flow: each is tried once more, alone, and nothing else is lost.
+
+    The first is at every idle replica when it kills; the second never at all three.
+    """
+    robot = parts.robot("robot", *(parts.replica(slot) for slot in range(3)))
+    wait_for(lambda: robot.ready() == [0, 1, 2], "three replicas")
+    caller = call(robot)
+    restarts = []
+    for _ in range(2):
+        for _ in range(20):
+            caller.ask()
+            caller.spin(0.02)
+        caller.poison()
+        for _ in range(60):
+            caller.ask()
+            caller.spin(0.02)
+        assert caller.all_answered()
+        wait_for(lambda: robot.ready() == [0, 1, 2], "all to be back")
+        restarts.append(sum(link["restarts"] for link in robot.links()))
+    report = robot.report()["services"]["/plan"]
+    assert report["poison"] == 2
+    assert report["silent"] == 0
+    assert restarts[0] <= 3 + 1
+    assert restarts[1] - restarts[0] <= 2 + 1
+
+
 def test_what_a_dying_command_worked_on_is_answered_by_the_next(parts, call):
     """With one replica there is nobody else: the requests wait for the command's restart."""
     replica = parts.replica(0, 0.02)

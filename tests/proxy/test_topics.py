@@ -12,6 +12,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, TopicSpec
 from fogft.proxy.replica.topics import HOLD_S, TopicsOnReplica
 from fogft.proxy.robot.topics import TopicsOnRobot
+from fogft.requests.load import Handling
 from tests.nightly import by_day
 from tests.proxy.fakes import Clock, FakeLink
 
@@ -52,7 +53,13 @@ class Carried:
 
     def __init__(self, world, slot, link, offered) -> None:
         self.service, self.request_id, self.payload, self.remaining_s = offered
-        self.robot, self.spare, self._world, self._slot, self._link = "r", False, world, slot, link
+        self.robot, self.handling, self._world, self._slot, self._link = (
+            "r",
+            Handling.NORMAL,
+            world,
+            slot,
+            link,
+        )
         self.ended = False
 
     def reply(self, payload: bytes, **_: Any) -> None:

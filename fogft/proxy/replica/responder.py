@@ -25,7 +25,7 @@ from fogft.model.refusal import Refusal
 from fogft.proxy.replica.interruption import Interruptions
 from fogft.proxy.replica.known_requests import KnownRequests, Remembered
 from fogft.proxy.replica.service_queue import Job, ServiceQueue
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -86,6 +86,11 @@ class Responder:
         self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
         self.ran_s = self.wasted_s = 0.0
         self.refused: dict[Refusal, int] = {}
+
+    @property
+    def at_work(self) -> int:
+        """Requests that the services have."""
+        return sum(queue.at_work for queue in self._queues.values())
 
     @property
     def in_flight(self) -> int:
@@ -158,7 +163,7 @@ class Responder:
         job = Job(now, incoming)
         queue = self._queues[job.service]
         self._known.add(job)
-        if queue.open:
+        if queue.takes(job):
             queue.begin(job, now)
             return job
         queue.put(job)
@@ -181,7 +186,7 @@ class Responder:
         if not self._is_ready(service) or service not in self._clients:
             return Refusal.NOT_READY, None
         queue = self._queue(service)
-        if incoming.spare and not queue.has_free_slot:
+        if incoming.handling is Handling.DROP_IF_BUSY and not queue.has_free_slot:
             return Refusal.BUSY, None
         deadline = now + remaining_s
         hopeless = not queue.open and queue.hopeless(incoming.robot, deadline, remaining_s)

@@ -129,7 +129,7 @@ class ServerProxy:
 
     def run_once(self) -> None:
         """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
-        died = self._supervisor.poll()
+        died = self._supervisor.poll(at_work=self.responder.at_work > 0)
         if died or self._node is None or not self._node.alive:
             self._ready = frozenset()
             if died:

@@ -15,7 +15,7 @@ from fogft.link.port import Incoming
 from fogft.model.spec import ServiceSpec
 from fogft.requests.admission import AdmissionQueue
 from fogft.requests.concurrency import ConcurrencyLimit
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 
 # Job whose deadline has passed is still in the service's hands and takes its room. After so
 # long its response is taken for lost.
@@ -26,7 +26,18 @@ class Job:
     """A request that was accepted: who waits for it, and its answer once there is one."""
 
     __slots__ = (
-        *("answer", "arrived", "begun", "deadline", "id", "level", "passed_on", "payload", "robot"),
+        *(
+            "alone",
+            "answer",
+            "arrived",
+            "begun",
+            "deadline",
+            "id",
+            "level",
+            "passed_on",
+            "payload",
+            "robot",
+        ),
         *("service", "size", "ticket", "unwanted", "waiting"),
     )
 
@@ -38,6 +49,7 @@ class Job:
         self.deadline = arrived + first.remaining_s
         self.payload = first.payload
         self.size = len(first.payload)
+        self.alone = first.handling is Handling.ALONE
         self.passed_on = False
         self.begun = 0.0  # when it was passed on, and
         self.level = 0  # how many were at work then, itself included
@@ -60,6 +72,7 @@ class ServiceQueue:
         self._waiting: AdmissionQueue[Job] = AdmissionQueue(latest=latest)
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
+        self._alone = False  # the job at work is to have no other beside it
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
     def __len__(self) -> int:
@@ -72,12 +85,21 @@ class ServiceQueue:
     @property
     def open(self) -> bool:
         """Whether a job that comes now is passed on at once: nothing waits, and there is room."""
-        return self.at_work < self.limit.limit and not len(self._waiting)
+        return self._has_room and not len(self._waiting)
+
+    @property
+    def _has_room(self) -> bool:
+        """Whether the service may have one more beside what it has."""
+        return self.at_work < self.limit.limit and not self._alone
 
     @property
     def has_free_slot(self) -> bool:
         """Whether nothing waits, and the service can surely begin with one more at once."""
-        return not len(self._waiting) and self.at_work < max(1, self.limit.known)
+        return self.open and self.at_work < max(1, self.limit.known)
+
+    def takes(self, job: Job) -> bool:
+        """Whether a job that comes now is passed on at once."""
+        return self.open and not (job.alone and self.at_work)
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
         """Return what there is to do; None while it is not known how long the service takes.
@@ -108,9 +130,12 @@ class ServiceQueue:
         What it returns may be past its deadline, or about to be while others wait that are not:
         then it was not begun and takes no room.
         """
-        if self.at_work >= self.limit.limit:
+        if not self._has_room:
             return None
         job = self._waiting.take()
+        if job is not None and job.alone and self.at_work:
+            self.put(job)  # when the service has nothing else
+            return None
         if job is not None and job.deadline > now + (self.limit.takes_s if self._waiting else 0.0):
             self.begin(job, now)
         return job
@@ -118,6 +143,7 @@ class ServiceQueue:
     def begin(self, job: Job, now: float) -> None:
         """Job is passed on. Job that comes while the line is `open` need not wait before."""
         self.at_work += 1
+        self._alone = job.alone
         job.passed_on, job.begun, job.level = True, now, self.at_work
 
     def remove(self, job: Job) -> bool:
@@ -135,6 +161,7 @@ class ServiceQueue:
         if job.passed_on:
             job.passed_on = False
             self.at_work -= 1
+            self._alone = False
 
     def overdue(self, job: Job, now: float) -> None:
         """Job that was passed on is past its deadline: it keeps its room for a while."""

@@ -32,8 +32,9 @@ class Supervisor:
         workdir: Where it runs.
         environ: Its whole environment.
         clock: Monotonic seconds.
-        backoff_s: First and longest wait between a death and the next start. A run
-            longer than the longest wait resets it.
+        backoff_s: Second and longest wait between a death and the next start; the first start
+            after a death is at once. A run longer than the longest wait resets it, and so does a
+            death while requests were at work.
         stdout: Descriptor for its standard output; None for our own.
     """
 
@@ -53,7 +54,7 @@ class Supervisor:
         self._environ = dict(environ)
         self._clock = clock
         self._backoff_s = backoff_s
-        self._wait_s = backoff_s[0]
+        self._wait_s = 0.0  # the first restart is at once
         self.start_at = 0.0
         self._started_at = 0.0
         self._child: subprocess.Popen[bytes] | None = None
@@ -70,8 +71,12 @@ class Supervisor:
         """Whether the command runs."""
         return self._child is not None
 
-    def poll(self) -> bool:
+    def poll(self, *, at_work: bool = False) -> bool:
         """See whether the command died, and start it when its time has come.
+
+        Args:
+            at_work: Whether it had requests: then one of these has ended it, and it is not its
+                own fault.
 
         Returns:
             Whether it has died since the last call.
@@ -82,24 +87,28 @@ class Supervisor:
             if status is None:
                 return False
             died = True
-            self._note_death(status)
+            self._note_death(status, at_work=at_work)
         if self._clock() >= self.start_at:
             self._start()
         return died
 
-    def _note_death(self, status: int) -> None:
+    def _note_death(self, status: int, *, at_work: bool) -> None:
         assert self._child is not None
         self._kill_group(self._child.pid)  # what it left behind in its group
         ran_s = self._clock() - self._started_at
-        if ran_s > self._backoff_s[1]:
-            self._wait_s = self._backoff_s[0]
+        if ran_s > self._backoff_s[1] or at_work:
+            self._wait_s = 0.0
         self.last_exit = (
             f"died of {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
         )
         log.warning("run_ended status=%d ran_s=%.1f again_in_s=%.1f", status, ran_s, self._wait_s)
         self._child = None
+        self._delay_next_start()
+
+    def _delay_next_start(self) -> None:
+        first_s, longest_s = self._backoff_s
         self.start_at = self._clock() + self._wait_s
-        self._wait_s = min(self._wait_s * 2, self._backoff_s[1])
+        self._wait_s = min(max(2 * self._wait_s, first_s), longest_s)
 
     def _start(self) -> None:
         self._started_at = self._clock()
@@ -115,8 +124,7 @@ class Supervisor:
             )
         except OSError as error:
             self.last_exit = f"cannot be started: {error}"
-            self.start_at = self._clock() + self._wait_s
-            self._wait_s = min(self._wait_s * 2, self._backoff_s[1])
+            self._delay_next_start()
             log.error("run_not_started reason=%r", str(error))
             return
         log.info("run_started pid=%d command=%r", self._child.pid, self._command)

@@ -9,6 +9,7 @@ Owns: calls of the fallback service. Not here: which answer is returned (`dispat
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
@@ -73,6 +74,18 @@ class Delivery:
             self._respond(pending.item.handle, payload)
         except RosError as error:
             self._warn("undelivered", "response_undelivered", error.message)
+
+    def poisoned(self, request: bytes, pending: Pending[Request]) -> None:
+        """Services died over a request: it ends now, as its policy says for a deadline."""
+        spec, ledger = self._ledger.spec, self._ledger
+        ledger.outcomes.poisoned_at = time.time()
+        if spec.on_timeout is OnTimeout.FALLBACK and ledger.requests.fallback is not None:
+            self._await_fallback(request, pending)
+            return
+        with ledger.lock:
+            ledger.end(request, pending, Outcome.POISON)
+        if spec.on_timeout is OnTimeout.EMPTY and self._empty_response is not None:
+            self.give(pending, self._empty_response)
 
     def expired(self, request: bytes, pending: Pending[Request]) -> None:
         """A request's deadline has come."""

@@ -21,10 +21,11 @@ _TROUBLES = {
     "silent": "got no answer",
     "empty": "got an empty answer",
     "turned_away": "were turned away",
+    "poison": "ended the service and were not sent again",
     "fallback": "were answered by the fallback",
 }
 _COUNTS = (
-    *("received", "sent", "answered", "fallback", "empty", "silent", "turned_away"),
+    *("received", "sent", "answered", "fallback", "empty", "silent", "turned_away", "poison"),
     *("late", "rejected", "fallback_failed", "undelivered", "pending"),
 )
 

@@ -32,7 +32,7 @@ from fogft.metrics.outcomes import Outcome
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.model.spec import ServiceSpec
+from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.delivery import Delivery, Respond
 from fogft.proxy.robot.replication import Replication
 from fogft.proxy.robot.request import Ledger, Request
@@ -95,7 +95,12 @@ class Dispatcher:
         self._replication = replication
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
-        self._requests: PendingRequests[Request] = PendingRequests(policy(spec), self._decide)
+        self._requests: PendingRequests[Request] = PendingRequests(
+            policy(spec),
+            self._decide,
+            # What waits for a goal to end, or has its order, is no work of its own.
+            counts_deaths=spec.part is Part.NONE and spec.state is None,
+        )
         self._ledger = Ledger(spec, self._requests, clock)
         self._lock = self._ledger.lock
         self.outcomes = self._ledger.outcomes
@@ -272,7 +277,24 @@ class Dispatcher:
             if request is None:
                 return
             verdict = self._requests.refused(request, replica, refusal, now)
-        self._after(request, verdict)
+            poisonous = self._requests.poisonous(request)
+        if poisonous:
+            self._end_poison(request, now)
+        else:
+            self._after(request, verdict)
+
+    def _end_poison(self, request: bytes, now: float) -> None:
+        """End a request over which services died: only the fallback may still answer it."""
+        with self._lock:
+            pending = self._requests.stop(request, now)
+        if pending is None:
+            return
+        log.error(
+            "request_poison service=%s type=%s deaths=%d request=%s",
+            self.spec.name, self.spec.type, pending.deaths, request.hex(),
+        )  # fmt: skip
+        self._delivery.poisoned(request, pending)
+        self._sender.forget(request, tuple(pending.open))
 
     def _after(self, request: bytes, verdict: Verdict) -> None:
         """If nobody works on a request: end it, or have another replica asked at once."""

@@ -16,7 +16,7 @@ from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
 from fogft.proxy.robot.replication import Replication
 from fogft.proxy.robot.request import Ledger
-from fogft.requests.load import NEVER
+from fogft.requests.load import NEVER, Handling
 
 
 class Sender:
@@ -56,8 +56,9 @@ class Sender:
         name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
         for replica in chosen:
             spare = is_spare(request, replica)
+            handling = Handling.DROP_IF_BUSY if spare else Handling.NORMAL
             if not links[replica].offer(
-                name, request, payload, timeout_s, more=self._in_burst, spare=spare
+                name, request, payload, timeout_s, more=self._in_burst, handling=handling
             ):
                 self._declined(request, replica, is_copy=True)
         if len(chosen) > 1 and request not in self._ledger.requests:
@@ -113,8 +114,13 @@ class Sender:
             self._ledger.outcomes.count["sent"] += 1
             if pending.item.trace is not None:
                 pending.item.trace.asked.setdefault(replica, now)
-        payload, remaining_s = pending.item.payload, pending.deadline - now
-        if not link.offer(self._ledger.spec.name, request, payload, remaining_s):
+            handling = Handling.ALONE if pending.deaths else Handling.NORMAL
+        payload, remaining_s, name = (
+            pending.item.payload,
+            pending.deadline - now,
+            self._ledger.spec.name,
+        )
+        if not link.offer(name, request, payload, remaining_s, handling=handling):
             self._declined(request, replica, is_copy=True)
             return False
         if request not in requests:  # it was answered meanwhile

@@ -77,7 +77,7 @@ def test_after_a_death_it_is_told_anew():
     scene.clock.now += SETTLED_S
     assert scene.probe().offered
     scene.supervisor.alive = False
-    scene.supervisor.poll = lambda: True  # type: ignore[method-assign]
+    scene.supervisor.poll = lambda **_: True  # type: ignore[method-assign]
     scene.look()
     assert scene.probe().offered == {}
 

@@ -13,6 +13,7 @@ from fogft.proxy.order_mark import OrderMark
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.service_order import ServiceOrder
+from fogft.requests.load import Handling
 from tests.proxy.fakes import UID, Clock, FakeClient, FakeLink
 
 STATE = StateSpec(StateService("/g", "p/srv/G", "d"), StateService("/s", "p/srv/S", "d"))
@@ -43,7 +44,7 @@ class Incoming:
     def __init__(self, scene, link, request_id, payload, robot="r"):
         self.scene, self.link = scene, link
         self.request_id, self.payload, self.robot = request_id, payload, robot
-        self.service, self.remaining_s, self.spare = "/s", 60.0, False
+        self.service, self.remaining_s, self.handling = "/s", 60.0, Handling.NORMAL
 
     def reply(self, payload, **_):
         self.scene.answers.append((self.link, Answer(self.request_id, payload=payload)))

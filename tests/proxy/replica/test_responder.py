@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.interruption import EMPTY_REQUEST
 from fogft.proxy.replica.responder import Remembered, Responder
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
 
 A = b"a" * 16
@@ -69,12 +69,12 @@ def test_a_spare_copy_is_dropped_where_it_would_have_to_wait_and_that_is_told():
     """A service of which nothing is known is taken to do one thing at a time."""
     scene = Scene()
     scene.ask(A)
-    spare = FakeIncoming(B, spare=True)
+    spare = FakeIncoming(B, handling=Handling.DROP_IF_BUSY)
     scene.responder.request(spare)
     assert spare.outcome == ["refused busy"]
     scene.clock.now += 0.5
     scene.answer(0)
-    spare = FakeIncoming(B, spare=True)
+    spare = FakeIncoming(B, handling=Handling.DROP_IF_BUSY)
     scene.responder.request(spare)
     scene.answer(1)
     assert spare.outcome == [b"r"]
@@ -83,10 +83,26 @@ def test_a_spare_copy_is_dropped_where_it_would_have_to_wait_and_that_is_told():
 def test_a_spare_copy_of_what_is_at_work_joins_it():
     scene = Scene()
     first = scene.ask(A)
-    copy = FakeIncoming(A, spare=True)
+    copy = FakeIncoming(A, handling=Handling.DROP_IF_BUSY)
     scene.responder.request(copy)
     scene.answer(0)
     assert (first.outcome, copy.outcome) == ([b"r"], [b"r"])
+
+
+def test_what_a_service_died_over_runs_alone():
+    """So that, if it dies again, nothing innocent is blamed with it."""
+    scene = Scene(limits={"/s": 4})
+    scene.ask(A)
+    scene.ask(B, handling=Handling.ALONE)
+    scene.ask(C)
+    assert len(scene.client.calls) == 1
+    scene.answer(0)
+    assert len(scene.client.calls) == 2
+    scene.responder.tick()
+    assert len(scene.client.calls) == 2  # C waits for it
+    assert scene.responder.at_work == 1
+    scene.answer(1)
+    assert len(scene.client.calls) == 3
 
 
 def test_each_end_tells_the_load_without_what_has_just_ended():

@@ -57,13 +57,25 @@ def test_a_dead_command_is_told_once_and_started_again_after_its_backoff(supervi
     supervisor = supervise("exit 3", clock=clock)
     supervisor.poll()
     wait_until(lambda: supervisor.poll())
-    assert not supervisor.alive
     assert supervisor.last_exit == "exit status 3"
+    assert supervisor.restarts == 1  # at once
+    wait_until(lambda: supervisor.poll())
+    assert not supervisor.alive
     assert not supervisor.poll()
-    assert supervisor.restarts == 0
+    assert supervisor.restarts == 1
     clock.now += 0.6
     supervisor.poll()
-    assert supervisor.restarts == 1
+    assert supervisor.restarts == 2
+
+
+def test_a_command_that_dies_over_requests_is_started_again_at_once_each_time(supervise):
+    """It is not its own fault, and others wait."""
+    clock = Clock()
+    supervisor = supervise("exit 3", clock=clock)
+    supervisor.poll()
+    for _ in range(4):
+        wait_until(lambda: supervisor.poll(at_work=True))
+    assert supervisor.restarts == 4
 
 
 def test_the_wait_doubles_and_is_bounded(supervise):
@@ -73,9 +85,9 @@ def test_the_wait_doubles_and_is_bounded(supervise):
     for _ in range(5):
         supervisor.poll()
         wait_until(lambda: supervisor.poll())
-        waits.append(supervisor.start_at - clock.now)
+        waits.append(max(0.0, supervisor.start_at - clock.now))
         clock.now = supervisor.start_at
-    assert waits == [1.0, 2.0, 4.0, 4.0, 4.0]
+    assert waits == [0.0, 1.0, 2.0, 4.0, 4.0]
 
 
 def test_a_signal_is_named(supervise):

@@ -14,7 +14,7 @@ from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.proxy.replica.responder import Responder
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.requests.load import Load
+from fogft.requests.load import Handling, Load
 
 UID = "0123456789abcdef"
 TICK_S = 0.02
@@ -66,9 +66,9 @@ class SimulatedService:
 class SimulatedIncoming:
     """A request at a replica, whose answer travels back."""
 
-    def __init__(self, link: SimulatedLink, id: bytes, payload: bytes, *, spare: bool) -> None:
+    def __init__(self, link: SimulatedLink, id: bytes, payload: bytes, handling: Handling) -> None:
         self.service, self.robot, self.remaining_s = "/s", link.world.robot, link.world.timeout_s
-        self.request_id, self.payload, self.spare = id, payload, spare
+        self.request_id, self.payload, self.handling = id, payload, handling
         self._link: SimulatedLink | None = link
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
@@ -117,13 +117,13 @@ class SimulatedLink:
         remaining_s: float,
         *,
         more: bool = False,
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> bool:
         if not self.usable or request_id in self.open:
             return False
         self.offers += 1
         self.open.add(request_id)
-        incoming = SimulatedIncoming(self, request_id, payload, spare=spare)
+        incoming = SimulatedIncoming(self, request_id, payload, handling)
         incoming.remaining_s = remaining_s
         self.world.at(self.world.now + self.rtt_s / 2, lambda: self._arrives(incoming))
         lost = Answer(request_id, refusal=Refusal.LOST, service="/s")

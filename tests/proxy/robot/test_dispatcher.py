@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from fogft.errors import RosError
 from fogft.model.cdr import Shape
 from fogft.model.refusal import Refusal
-from fogft.model.spec import HedgingMode, OnTimeout, ServiceSpec
+from fogft.model.spec import HedgingMode, OnTimeout, Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import MALFORMED_LIMIT, Dispatcher
 from fogft.proxy.robot.sending import key_of
+from fogft.requests.load import Handling
 from tests.proxy.fakes import Clock, FakeLink
 
 ALL = HedgingMode.ALL
@@ -133,13 +134,43 @@ def test_when_all_refuse_the_request_is_tried_again():
     assert scene.responses == [("caller", b"late but good")]
 
 
-def test_a_request_that_crashes_a_replica_is_not_sent_there_for_ever():
-    scene = Scene(1)
+def test_a_request_over_which_two_services_died_is_sent_nowhere_any_more():
+    """The second time it runs alone, so that nothing beside it is blamed; then it has ended."""
+    scene = Scene(3, hedging=HedgingMode.FAILOVER)
     scene.dispatcher.submit(b"poison", "caller")
-    for _ in range(10):
-        if len(scene.links[0].offered) and scene.dispatcher.report()["pending"]:
-            scene.refuse(0, Refusal.CRASHED)
-        scene.pass_time(0.02)
+    scene.refuse(0, Refusal.CRASHED)
+    scene.pass_time(0.02)
+    scene.refuse(1, Refusal.CRASHED)
+    scene.pass_time(1.0)
+    assert [len(link.offered) for link in scene.links] == [1, 1, 0]
+    assert [link.handled[0] for link in scene.links[:2]] == [Handling.NORMAL, Handling.ALONE]
+    report = scene.dispatcher.report()
+    assert (report["poison"], report["silent"], report["pending"]) == (1, 0, 0)
+    assert report["poisoned_at"] is not None
+
+
+def test_after_a_death_no_request_is_at_all_replicas_at_once():
+    """Another one that kills could take the whole pool down; a minute later all have each again."""
+    scene = Scene(3)
+    scene.dispatcher.submit(b"poison", "caller")
+    scene.refuse(0, Refusal.CRASHED)
+    scene.dispatcher.submit(b"q", "other")
+    scene.pass_time(0.1)
+    assert sorted(len(link.offered) for link in scene.links) == [1, 2, 2]
+    scene.pass_time(60.0)
+    before = [len(link.offered) for link in scene.links]
+    scene.dispatcher.submit(b"q", "third")
+    assert [len(link.offered) for link in scene.links] == [n + 1 for n in before]
+
+
+@pytest.mark.parametrize("part", [Part.GOAL, Part.RESULT])
+def test_what_waits_for_a_goal_is_not_blamed_for_a_death(part):
+    scene = Scene(1, part=part)
+    scene.dispatcher.submit(b"result", "caller")
+    for _ in range(2):
+        scene.refuse(0, Refusal.CRASHED)
+        scene.pass_time(0.1)
+    assert scene.dispatcher.report()["poison"] == 0
     assert len(scene.links[0].offered) == 3
 
 
@@ -375,7 +406,10 @@ def test_each_caller_is_answered_at_most_once_and_nothing_is_lost(steps):
             else:
                 scene.refuse(slot, Refusal.LOST if step == "lose" else Refusal.CRASHED)
     report = scene.dispatcher.report()
-    assert report["received"] == report["answered"] + report["silent"] + report["pending"]
+    assert (
+        report["received"]
+        == report["answered"] + report["silent"] + report["poison"] + report["pending"]
+    )
     handles = [handle for handle, _ in scene.responses]
     assert len(handles) == len(set(handles)) == report["answered"]
     assert all(payload == b"to q%d" % handle for handle, payload in scene.responses)

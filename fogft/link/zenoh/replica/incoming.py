@@ -21,7 +21,7 @@ class ZenohIncoming:
 
     __slots__ = (
         *("_header", "_queues", "_streams", "_thin", "_work_queue"),
-        *("payload", "remaining_s", "request_id", "robot", "service", "spare"),
+        *("handling", "payload", "remaining_s", "request_id", "robot", "service"),
     )
 
     def __init__(
@@ -42,7 +42,7 @@ class ZenohIncoming:
         self.request_id = header.request_id
         self.robot = header.robot
         self.remaining_s = header.remaining_s
-        self.spare = header.spare
+        self.handling = header.handling
         self._streams = [stream]  # taken by the first answer; list.pop is atomic
         self._queues = queues
         self._work_queue = work

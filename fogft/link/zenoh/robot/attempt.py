@@ -18,6 +18,7 @@ from fogft.link.compression import unpack
 from fogft.link.port import Answer
 from fogft.model import refusal
 from fogft.model.refusal import Refusal
+from fogft.requests.load import Handling
 
 
 @dataclass(slots=True, eq=False)
@@ -37,7 +38,7 @@ class OpenAttempt:
     size: int
     offered: float
     deadline: float
-    spare: bool = False
+    handling: Handling = Handling.NORMAL
     mark: int = 0
 
 

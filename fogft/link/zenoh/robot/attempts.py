@@ -30,6 +30,7 @@ from fogft.link.zenoh.robot.attempt import BatchBuffer, OpenAttempt, Unanswered
 from fogft.link.zenoh.robot.send_queue import SendQueue
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model.refusal import Refusal
+from fogft.requests.load import Handling
 
 # Attempts that wait for the sender, forgotten ones included: those have freed their room in the
 # window, so without a bound of its own the queue of a sender that is stuck would grow.
@@ -158,14 +159,14 @@ class Attempts:
         remaining_s: float,
         *,
         more: bool = False,
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> bool:
         """Take an attempt, or return False. Never blocks. With `more`, `send` must follow."""
         if service not in self._services or self._queue.qsize() >= _QUEUE_LIMIT:
             return False
         now = time.monotonic()
         attempt = OpenAttempt(
-            service, request_id, payload, len(payload), now, now + remaining_s, spare
+            service, request_id, payload, len(payload), now, now + remaining_s, handling
         )
         if not self._deadline.may_arrive(attempt, remaining_s, now, self._before):
             return False
@@ -212,7 +213,7 @@ class Attempts:
             attempt.payload = None
             if payload is not None and self.window.holds(attempt):
                 remaining_s = max(attempt.deadline - now, 0.0)
-                parts.append((attempt.request_id, remaining_s, attempt.spare, payload))
+                parts.append((attempt.request_id, remaining_s, attempt.handling, payload))
                 self._unanswered.add(attempt)
         if not parts:
             return
@@ -359,7 +360,7 @@ class Attempts:
             packed=packed is not None,
             may_pack=compression is not None and self._flow.thin,
             reads_packed=self.packs_answers and compression is not None,
-            spare=attempt.spare,
+            handling=attempt.handling,
         )
         content = payload if packed is None else packed
         self._outlet.publish(attempt.service, content, header)

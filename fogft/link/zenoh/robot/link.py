@@ -29,6 +29,7 @@ from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.replica import LinkState
+from fogft.requests.load import Handling
 
 log = logging.getLogger(__name__)
 
@@ -128,12 +129,12 @@ class ZenohLink:
         remaining_s: float,
         *,
         more: bool = False,
-        spare: bool = False,
+        handling: Handling = Handling.NORMAL,
     ) -> bool:
         """Take one attempt, or return False. Never blocks. With `more`, `send` must follow."""
         live = self._live
         return live is not None and live.attempts.offer(
-            service, request_id, payload, remaining_s, more=more, spare=spare
+            service, request_id, payload, remaining_s, more=more, handling=handling
         )
 
     def send(self) -> None:
