@@ -72,6 +72,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     isolated = {
         "HOME": str(folder),
         "SKYPILOT_DISABLE_LOCAL_API_SERVER": "1",
+        "SKYPILOT_DISABLE_USAGE_COLLECTION": "1",
         "AWS_ENDPOINT_URL": "http://127.0.0.1:1",
         "AWS_DEFAULT_REGION": "us-east-1",
         "AWS_EC2_METADATA_DISABLED": "true",

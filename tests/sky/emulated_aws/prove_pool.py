@@ -65,14 +65,11 @@ step = Steps()
 def credentials_below(home: Path) -> Iterator[Path]:
     """Yield the files of a VM's user that hold what should not leave the launching computer."""
     for path in home.rglob("*"):
-        if path.is_file() and "skypilot-runtime" not in path.parts and path.stat().st_size < 65_536:
-            content = path.read_bytes()
-            if (
-                MARK.encode() in content
-                or b"aws_secret_access_key" in content
-                or (b"PRIVATE KEY-----" in content and path.name != "replica.key")
-            ):
-                yield path
+        if "skypilot-runtime" in path.parts or path.name == "replica.key" or not path.is_file():
+            continue
+        content = path.read_bytes() if path.stat().st_size < 65_536 else b""
+        if any(mark in content for mark in (MARK.encode(), b"aws_secret", b"PRIVATE KEY-----")):
+            yield path
 
 
 class Proof:
