@@ -65,7 +65,7 @@ step = Steps()
 def credentials_below(home: Path) -> Iterator[Path]:
     """Yield the files of a VM's user that hold what should not leave the launching computer."""
     for path in home.rglob("*"):
-        if "skypilot-runtime" in path.parts or path.name == "replica.key" or not path.is_file():
+        if "site-packages" in path.parts or path.name == "replica.key" or not path.is_file():
             continue
         content = path.read_bytes() if path.stat().st_size < 65_536 else b""
         if any(mark in content for mark in (MARK.encode(), b"aws_secret", b"PRIVATE KEY-----")):
@@ -144,7 +144,8 @@ class Proof:
             (carried,) = (home / ".fogft/wheel").glob("fogft-*.whl")
             (made,) = (HOME / "sky/wheels").glob("*/fogft-*.whl")
             assert carried.read_bytes() == made.read_bytes()
-            assert not list(credentials_below(home))
+            left = list(credentials_below(home))
+            assert not left, left
             # To the world: ssh, which is SkyPilot's, and the link.
             cluster = f"fogft-{status['uid']}-{name.replace('.', '-')}"
             assert open_ports(instance["region"], f"sky-sg-{cluster}") == {22, 7447}
