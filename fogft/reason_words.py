@@ -118,6 +118,14 @@ def _ms(seconds: float | None) -> str:
     return "unknown" if seconds is None else f"{seconds * 1000:.0f} ms"
 
 
+def _never_ready(reason: Reason) -> str:
+    said = (
+        f"no replica of this file was ever ready, in {reason.count} launches: nothing more is "
+        "launched until the file changes or `fogft retry`"
+    )
+    return f"{said}; the last one: {words(reason.because[0])}{reason.words}"
+
+
 def _max_hours(reason: Reason) -> str:
     if reason.seconds is None:
         return "`max_hours` is over"
@@ -128,6 +136,7 @@ def _max_hours(reason: Reason) -> str:
 _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.NOT_RUNNING: "not running after {r.seconds:.0f} s",
     Cause.NOT_READY: "not ready after {r.seconds:.0f} s",
+    Cause.NOT_SET_UP: "still setting up after {r.seconds:.0f} s",
     Cause.NOTICE: "preemption notice",
     Cause.DRAINS_ITSELF: "it asked to be left alone",
     Cause.SILENT: "silent for {r.seconds:.0f} s",
@@ -178,6 +187,10 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.WORSE_SCORE: _worse_score,
     Cause.LOST_THERE: ("avoided for {minutes:.0f} min more: a replica was lost there"),
     Cause.CROWDED: ("spread: `{r.location}` has {r.count} already when slot {r.slot} is placed"),
+    Cause.NEVER_READY: _never_ready,
+    Cause.LAUNCH_LIMIT: (
+        "{r.count} machines were launched within an hour, which is the most: the next one waits"
+    ),
     Cause.SCHEDULED_AHEAD: "launching ahead of the schedule's next window",
     Cause.TARGET_UNMET: (
         "`availability: {r.target:g}` cannot be met: {r.count} replicas are expected "

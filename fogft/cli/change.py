@@ -106,6 +106,16 @@ def include(
     _warn_without_manager(store)
 
 
+def retry(pool: PoolOption = None) -> None:
+    """Launch replicas again after the pool has given up on its file."""
+    from fogft.pool.commands import change, composition
+
+    store = composition.store_of(pool)
+    change.retry(store, time.time())
+    output.done(f"`{store.name}` will launch replicas again")
+    _warn_without_manager(store)
+
+
 def _scale(pool: str | None, by: int, *, wait: bool) -> None:
     from fogft.cli import progress
     from fogft.pool.commands import change, composition

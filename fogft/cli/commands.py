@@ -37,6 +37,7 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "drain": ("change", "2"),
         "exclude": ("change", "local/us-west-2"),
         "include": ("change", "local/us-west-2"),
+        "retry": ("change", ""),
         "credentials": ("credentials", ""),
     },
     "Try what happens when": {

@@ -114,6 +114,7 @@ def up(
     if outcome is not Outcome.ANSWERING:
         what = {
             Outcome.RUN_KEEPS_ENDING: "does not answer: `run` keeps ending",
+            Outcome.NEVER_READY: "does not answer: no replica was ever ready",
             Outcome.TYPES_DIFFER: "cannot answer: robot and replicas define its type differently",
         }
         raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))

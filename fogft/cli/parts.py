@@ -101,7 +101,7 @@ def manager(
 
 
 def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
-    """Run a rendezvous: it tells robots and replicas each other's addresses.
+    """Run a rendezvous, where robots and replicas find each other.
 
     It needs a port that all can reach and carries no requests. Run two, on two machines.
     """

@@ -31,6 +31,7 @@ class Intent:
         stopping: `down` was asked for: end everything.
         began_at: When the hours of `max_hours` began anew, in seconds since the epoch; 0 as
             long as they count from the pool's creation.
+        retried_at: When `retry` was last asked for, in seconds since the epoch.
     """
 
     target: Count | None = None
@@ -39,6 +40,7 @@ class Intent:
     excluded: frozenset[str] = frozenset()
     stopping: bool = False
     began_at: Moment = 0.0
+    retried_at: Moment = 0.0
 
     def wanted(self, spec: PoolSpec) -> int:
         """Return how many replicas the user or the file names; see `sizing` for what follows."""
@@ -122,6 +124,11 @@ def include(intent: Intent, location: str) -> Intent:
         listed = ", ".join(f"`{p}`" for p in sorted(intent.excluded)) or "nothing"
         raise FogftError(f"`{place}` is not excluded", f"excluded now: {listed}")
     return replace(intent, excluded=intent.excluded - {place})
+
+
+def retry(intent: Intent, now: float) -> Intent:
+    """Launch again what was given up, as if it had never been launched."""
+    return replace(intent, retried_at=now)
 
 
 def file_changed(intent: Intent, before: PoolSpec, after: PoolSpec) -> Intent:

@@ -129,3 +129,7 @@ def host_and_port(endpoint: str) -> tuple[str, int]:
 
 Endpoint = Annotated[str, only(is_endpoint, "`host:port`")]
 EndpointOrEmpty = Annotated[str, only(lambda text: not text or is_endpoint(text), "`host:port`")]
+
+SETUP_LIMIT_S = 3600
+"""How long from its launch a machine's set-up may take. Kept by the machine itself on a real cloud,
+by who follows its launch, and by the planner. Seconds."""

@@ -22,6 +22,7 @@ class Cause(str, Enum):
     ERROR = "error"
     NOT_RUNNING = "not_running"  # of a timeout: what did not come
     NOT_READY = "not_ready"
+    NOT_SET_UP = "not_set_up"
 
     # What is wrong with a replica.
     NOTICE = "preemption_notice"
@@ -76,6 +77,9 @@ class Cause(str, Enum):
     CROWDED = "crowded"
     WORSE_SCORE = "worse_score"
     CHOSEN = "chosen"  # of a worse score: what was chosen in its place
+
+    NEVER_READY = "never_ready"  # a version is given up: none of its launches came to serve
+    LAUNCH_LIMIT = "launch_limit"
 
     # How many are wanted.
     SCHEDULED_AHEAD = "scheduled_ahead"

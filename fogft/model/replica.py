@@ -134,6 +134,8 @@ class Machine:
         failure: Why the phase is FAILED, with the cloud's words (a log's last lines after a
             line break); None otherwise.
         progress: What the cloud says is being done there until it serves, for people.
+        setting_up: The task's `setup` is under way.
+        set_up_at: When that was done, in seconds since the epoch; 0 where it is not known.
     """
 
     id: ReplicaId
@@ -146,6 +148,8 @@ class Machine:
     spec_hash: str = ""
     failure: Reason | None = None
     progress: str = ""
+    setting_up: bool = False
+    set_up_at: float = 0.0
 
 
 def by_id(machine: Machine) -> tuple[str, int, int]:

@@ -275,7 +275,8 @@ class HealthSpec:
     )
     start_limit_s: float = key(
         Number(DAY_S, "seconds"),
-        "Give up on a launch that is not ready after this long.",
+        "Give up on a launch that is not ready so long after its `setup`, or whose machine does "
+        "not run by then. `setup` itself has an hour from the launch.",
         default=900.0,
     )
 

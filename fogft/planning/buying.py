@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
-from fogft.model.groups import Group, group_of, is_stand_in
+from fogft.model.groups import Group, group_of, is_stand_in, replica_hash
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
@@ -36,6 +36,7 @@ from fogft.planning.observed.backoff import (
 from fogft.planning.observed.hazard import UNKNOWN, hazards, penalty
 from fogft.planning.observed.health import Assessment, Verdict
 from fogft.planning.observed.history import History
+from fogft.planning.observed.launches import LAUNCHES_AN_HOUR, given_up, within_an_hour
 from fogft.planning.placement import Choice, Market
 
 
@@ -111,15 +112,35 @@ class Buyer:
             old = need.replaces.id.short if need.replaces else ""
             self.notes.append(Reason(Cause.SURGE_FULL, slot=need.slot, replica=old))
             return False
+        hopeless = given_up(self.history, replica_hash(self.spec, need.slot), self._retried_at)
+        if hopeless is not None:
+            self.notes.append(hopeless)
+            return False
         choice, reason = self._choose(need, self.budget)
         if choice.offer is None:
             self.notes.append(Reason(Cause.WAITS, slot=need.slot, because=because(choice.why_not)))
             if self.cap is not None:
                 self._make_room(need, self.cap)
             return False
+        if not self._is_within_limit(on_demand=not choice.offer.placement.spot):
+            return False
         generation = self._next_generation(need.slot)
         self.launches.append(PlannedLaunch(need.slot, generation, choice.offer, reason))
         return True
+
+    @cached_property
+    def _retried_at(self) -> float:
+        return self.history.by_clock(self.intent.retried_at)
+
+    def _is_within_limit(self, *, on_demand: bool) -> bool:
+        """Whether one more machine of a market may be had within this hour; a note if not."""
+        had = within_an_hour(self.history, self.observed.now, on_demand=on_demand)
+        planned = sum(x.offer.placement.spot is not on_demand for x in self.launches)
+        most = LAUNCHES_AN_HOUR * max(1, sum(group.replicas for group in self.groups))
+        if len(had) + planned < most:
+            return True
+        self.notes.append(Reason(Cause.LAUNCH_LIMIT, count=most))
+        return False
 
     def market(self, group: Group, spot: bool | None, *, at_leisure: bool = False) -> Market:
         """Return what is sold to a group: of one kind only unless `spot` is None.

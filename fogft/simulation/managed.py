@@ -17,7 +17,7 @@ from fogft.model.replica import LinkReport, LinkState, MachinePhase, Membership,
 from fogft.model.spec import PoolSpec
 from fogft.planning.endings import DRAIN_SETTLE_S
 from fogft.planning.fallback import SETTLED_S, STAYS_S
-from fogft.planning.observed import backoff
+from fogft.planning.observed import backoff, launches
 from fogft.planning.observed.hazard import EVERY_S, as_of
 from fogft.planning.observed.health import LONE_SILENCE_FACTOR
 from fogft.planning.observed.history import Event, History, compacted
@@ -130,6 +130,8 @@ class Managed:
         health = tick.spec.health
         waits, restless = tick.plan.waits, {(id.slot, id.generation) for id in tick.plan.restless}
         times = [backoff.next_change(history, now, waits=waits, restless=bool(restless))]
+        if waits:
+            times.append(launches.next_change(history, now))
         if tick.spec.schedule is not None:
             times.append(schedule.next_change(tick.spec.schedule, now))
         if tick.spec.migration is not None:

@@ -10,6 +10,7 @@ import pytest
 
 from fogft.errors import CloudUnreachable, NoCapacity, QuotaExceeded
 from fogft.model import intent as intents
+from fogft.model.reason import Cause
 from fogft.model.spec import HealthSpec, PoolSpec
 from tests.nightly import by_day
 from tests.simulation.world import SERVICE, UID, CheckedCloud, World
@@ -200,7 +201,10 @@ def live_through_faults(world: World, faults: list[Callable[..., object]]) -> No
 
 
 def recover(world: World) -> int:
-    """Tick until the pool is whole and stays so for a while; return the number of ticks."""
+    """Tick until the pool is whole and stays so for a while; return the number of ticks.
+
+    The user asks again for what was given up, and waits where the hour's launches are used up.
+    """
     quiet = 0
     for count in range(RECOVERY_STEPS):
         tick = world.tick()
@@ -209,7 +213,10 @@ def recover(world: World) -> int:
         quiet = quiet + 1 if idle and world.whole() else 0
         if quiet >= 5:
             return count
-        world.step(1.0 if count < 100 else 5.0)
+        causes = {note.cause for note in tick.plan.notes} if tick is not None else ()
+        if Cause.NEVER_READY in causes:
+            world.store.the_intent = intents.retry(world.store.the_intent, world.now)
+        world.step(60.0 if Cause.LAUNCH_LIMIT in causes else 1.0 if count < 100 else 5.0)
     state = [(m.id.short, m.phase.value, m.placement.location) for m in world.truth()]
     notes = tick.plan.notes if tick else ()
     pytest.fail(f"not whole: wanted {world.wanted()}, have {state}, notes {notes}")

@@ -43,6 +43,7 @@ class PoolOnSky:
         self.store = MemoryStore(identity, self.spec)
         self.draining: set[ReplicaId] = set()
         self.late: dict[ReplicaId, float] = {}
+        self.serves: Callable[[str], bool] = lambda cluster: True  # by the cluster's name
         self.last: Tick | None = None
         self.manager = self._new_manager(1)
 
@@ -81,7 +82,8 @@ class PoolOnSky:
         runs = any(i.id == id for i in self.scene.provider.found.values())
         if not runs or cluster is None or cluster.state is not ClusterState.UP:
             return LinkReport(id, LinkState.CONNECTING)
-        return LinkReport(id, LinkState.UP, frozenset({SERVICE.name}), draining=id in self.draining)
+        ready = frozenset({SERVICE.name}) if self.serves(cluster.name) else frozenset[str]()
+        return LinkReport(id, LinkState.UP, ready, draining=id in self.draining)
 
     def tick(self, count: int = 1, seconds: float = 1.0) -> Tick:
         """Let the manager work, its threads too, and time pass; return the last tick."""

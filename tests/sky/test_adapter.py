@@ -10,8 +10,8 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.following import ASK_LIMIT_S, JOB_PAUSE_S, LAUNCH_LIMIT_S
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
-from fogft.cloud.sky.task import SETUP_LIMIT_S
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
+from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from tests.sky.scene import Scene

@@ -10,8 +10,10 @@ from fogft.cloud.sky.naming import cluster_name, infra
 from fogft.cloud.sky.presence import PROVIDER_SURE_AFTER_S
 from fogft.cloud.sky.sdk import JobState
 from fogft.errors import CloudUnreachable
+from fogft.model.intent import retry
 from fogft.model.replica import ReplicaId
 from fogft.planning.observed.backoff import LIMIT_S
+from fogft.planning.observed.history import EventKind
 from fogft.pool.manager import teardown
 from tests.sky.pool_on_sky import NORTH, UID, PoolOnSky
 from tests.sky.scripted_sky import EAST, WEST, replica
@@ -311,3 +313,79 @@ def resources(id: ReplicaId) -> dict[str, object]:
     return {
         "infra": infra(EAST), "instance_type": "m6i.large", "use_spot": True, "labels": labels
     }  # fmt: skip
+
+
+# -- pools that are slow, or never ready -------------------------------------------------------
+
+HOUR_S = 3600.0
+
+
+def test_a_set_up_that_takes_longer_than_a_start_may_is_waited_for(tmp_path: Path):
+    """`start_limit_s` counts from the end of `setup`: one launch a replica, and the pool serves."""
+    pool = PoolOnSky(tmp_path, replicas=3)
+    pool.sky.boots = False
+    began: dict[str, float] = {}
+
+    def set_up() -> None:
+        for one in pool.sky.launched:
+            if one.request.active:
+                pool.sky.finish(one.name, JobState.SETTING_UP)
+                began[one.name] = pool.scene.now
+            elif pool.scene.now - began[one.name] > 1000.0:
+                pool.sky.jobs[one.name] = JobState.RUNNING
+
+    pool.serves = lambda name: pool.sky.jobs[name] is JobState.RUNNING
+    for _ in range(400):
+        set_up()
+        pool.tick(seconds=5.0)
+    assert pool.ready() == ["0.1", "1.1", "2.1"]
+    assert len(pool.ordered()) == 3
+
+
+def never_ready(folder: Path) -> PoolOnSky:
+    """A pool whose service never comes, after twelve hours."""
+    pool = PoolOnSky(folder, replicas=3)
+    pool.serves = lambda name: False
+    pool.sky.job_logs = dict.fromkeys(
+        (cluster_name(replica(slot, n)) for slot in range(3) for n in (1, 2)), "no module `plan`"
+    )
+    pool.tick(int(12 * HOUR_S / 10), seconds=10.0)
+    return pool
+
+
+def test_a_service_that_is_never_ready_is_launched_twice_a_slot_and_no_more(tmp_path: Path):
+    """It would bill for ever: the pool says so, with the log, and waits for the user."""
+    pool = never_ready(tmp_path)
+    assert len(pool.ordered()) == 6
+    assert pool.running() == []
+    assert "no replica of this file was ever ready" in pool.notes
+    assert "not ready after 900 s" in pool.notes
+    assert "no module `plan`" in pool.notes
+    rests = [event for event in pool.store.events if event.kind is EventKind.FAILED]
+    assert len(rests) == 6
+
+
+def test_what_was_given_up_is_launched_again_when_asked_or_when_the_file_changes(tmp_path: Path):
+    pool = never_ready(tmp_path)
+    pool.kill_the_manager()
+    pool.tick(60)
+    assert len(pool.ordered()) == 6, "it is remembered"
+    pool.store.the_intent = retry(pool.store.the_intent, pool.scene.now)
+    pool.tick(int(4 * HOUR_S / 10), seconds=10.0)
+    assert len(pool.ordered()) == 12
+    pool.change(task={"run": "serve --better", "resources": {"infra": "aws"}})
+    pool.serves = lambda name: True
+    pool.until(lambda: len(pool.ready()) == 3)
+    assert "ever ready" not in pool.notes
+
+
+def test_a_version_that_was_ready_once_is_never_given_up(tmp_path: Path):
+    """What it needs may be away for a while: it is tried on, within the hour's limit."""
+    pool = PoolOnSky(tmp_path)
+    pool.until(pool.ready)
+    pool.serves = lambda name: False
+    pool.sky.preempt(FIRST)
+    pool.tick(int(6 * HOUR_S / 10), seconds=10.0)
+    assert len(pool.ordered()) > 4
+    pool.serves = lambda name: True
+    pool.until(pool.ready)

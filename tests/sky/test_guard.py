@@ -11,7 +11,7 @@ from pathlib import Path
 from fogft import template_files
 from fogft.cloud.sky import guard
 from fogft.cloud.sky.following import LAUNCH_LIMIT_S
-from fogft.cloud.sky.task import SETUP_LIMIT_S
+from fogft.model.names import SETUP_LIMIT_S
 
 LIMIT_S = 60.0
 

@@ -16,6 +16,7 @@ import pytest
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming, task
 from fogft.errors import SpecError
+from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.replica import Placement
 from tests.sky.scripted_sky import EAST, WEST, replica
 
@@ -300,7 +301,7 @@ def test_a_hanging_setup_is_ended_by_the_machine_itself(vm: Path):
     `shell` returns only when nobody holds the pipe any more, as SkyPilot does.
     """
     script = built({"setup": HANGING})["setup"]
-    limit = f"read -rt {task.SETUP_LIMIT_S} "
+    limit = f"read -rt {SETUP_LIMIT_S} "
     assert limit in script
     done = shell(vm, script.replace(limit, "read -rt 1 "))
     assert done.returncode != 0
@@ -317,7 +318,7 @@ def test_what_a_hanging_setup_is_just_starting_is_killed_too(tmp_path: Path):
     def hang(n: int) -> subprocess.CompletedProcess[str]:
         home = tmp_path / str(n)
         (home / ".fogft").mkdir(parents=True)
-        limit = f"read -rt {task.SETUP_LIMIT_S} "
+        limit = f"read -rt {SETUP_LIMIT_S} "
         return shell(home, script.replace(limit, f"read -rt {0.001 * (n + 1):.3f} "))
 
     script = built({"setup": HANGING})["setup"]

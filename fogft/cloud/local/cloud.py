@@ -253,6 +253,8 @@ def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machi
         spec_hash=order.spec_hash,
         failure=state.failure,
         progress=state.progress,
+        setting_up=state.setting_up,
+        set_up_at=state.set_up_at,
     )
 
 

@@ -82,6 +82,8 @@ class State:
     endpoint: str | None = None
     failure: Reason | None = None
     progress: str = ""
+    setting_up: bool = False
+    set_up_at: float = 0.0
     pids: Mapping[str, int] = field(default_factory=dict)
     domain_id: int | None = None
 

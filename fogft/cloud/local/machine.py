@@ -139,9 +139,13 @@ class Machine:
             return
         # One at a time in a folder: machines share it, and two builds in it would clash.
         turn = disk.Lock(task_commands.turn_file(self._folder.path.parent.parent, workdir))
-        self._say(State(MachinePhase.PROVISIONING, progress="waiting for another's setup"))
+        self._say(
+            State(
+                MachinePhase.PROVISIONING, progress="waiting for another's setup", setting_up=True
+            )
+        )
         self._wait(lambda: turn.acquire(wait=False))
-        self._say(State(MachinePhase.PROVISIONING, progress="setup"))
+        self._say(State(MachinePhase.PROVISIONING, progress="setup", setting_up=True))
         log.info("setup_started command=%r", command)
         begin = logfile.size(self._folder.log)
         environ = task_commands.environment(self._record.order.task)
@@ -175,6 +179,7 @@ class Machine:
             endpoint=endpoint,
             pids={"machine": os.getpid(), "guard": self._guard, "serve": pid},
             domain_id=domain.number,
+            set_up_at=time.time(),
         )
         self._say(running)
         log.info("machine_runs endpoint=%s domain=%d serve_pid=%d", endpoint, domain.number, pid)

@@ -68,7 +68,7 @@ def plain(text: str) -> str:
     return " ".join(_COLOUR.sub("", text).split())
 
 
-def tail(log: str, lines: int = 12, width: int = 200) -> str:
+def tail(log: str, lines: int = 20, width: int = 200) -> str:
     """Return the last lines of a log that say something, each cut to `width` characters."""
     lines_of_log = (_SPEAKER.sub("", line.rstrip()) for line in _COLOUR.sub("", log).splitlines())
     told = [line for line in lines_of_log if line.strip() and not line.startswith(_DECORATION)]

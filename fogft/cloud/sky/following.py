@@ -20,8 +20,8 @@ from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import UNDER_WAY, Entry, Journal, Stage
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
-from fogft.cloud.sky.task import SETUP_LIMIT_S
 from fogft.errors import CloudError
+from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
 from fogft.reason_words import words as in_words
@@ -118,7 +118,7 @@ class Following:
             pause_s = max(JOB_PAUSE_S, 3 * (now - asked_at))
             self._job_not_before[entry.id] = now + pause_s
         if job is JobState.RUNNING:
-            self._move(entry, stage=Stage.RUNNING)
+            self._move(entry, stage=Stage.RUNNING, set_up_at=self.clock())
         elif job is JobState.SETUP_FAILED:
             self._fail(entry, Reason(Cause.SETUP, words="`setup` failed" + self._job_tail(entry)))
         elif job is JobState.MISSING:
@@ -150,8 +150,11 @@ class Following:
 
     def _hung(self, entry: Entry, limit_s: float, doing: str) -> Reason:
         words = f"still {doing} after {limit_s:.0f} s"
-        log_tail = self._job_tail(entry) if entry.stage is Stage.SETTING_UP else ""
-        return Reason(Cause.TIMEOUT, words=words + (log_tail or self._provision_tail(entry)))
+        if entry.stage is not Stage.SETTING_UP:
+            return Reason(Cause.TIMEOUT, words=words + self._provision_tail(entry))
+        log_tail = self._job_tail(entry) or self._provision_tail(entry)
+        awaited = Reason(Cause.NOT_SET_UP, seconds=limit_s)
+        return Reason(Cause.TIMEOUT, words=words + log_tail, because=(awaited,))
 
     def _job_tail(self, entry: Entry) -> str:
         told = tail(self.sky.job_log(cluster_name(entry.id), entry.job, 30))

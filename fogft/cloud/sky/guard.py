@@ -12,7 +12,7 @@ from __future__ import annotations
 import base64
 
 from fogft import template_files
-from fogft.cloud.sky.task import SETUP_LIMIT_S
+from fogft.model.names import SETUP_LIMIT_S
 
 SETTING = ("aws", "post_provision_runcmd")
 ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60

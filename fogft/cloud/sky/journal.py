@@ -57,6 +57,7 @@ class Entry:
     # SkyPilot's number of the job that runs the server proxy; None until known
     job: int | None = None
     failure: Reason | None = None  # as in `Machine.failure`
+    set_up_at: float = 0.0  # when the job was seen to run
 
 
 class Journal:

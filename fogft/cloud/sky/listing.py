@@ -47,6 +47,8 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         spec_hash=entry.spec_hash,
         failure=failure,
         progress=progress,
+        setting_up=phase is MachinePhase.RUNNING and entry.stage is Stage.SETTING_UP,
+        set_up_at=entry.set_up_at,
     )
 
 

@@ -18,14 +18,11 @@ from fogft import template_files
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming
 from fogft.errors import CloudError, FogftError, SpecError
-from fogft.model.names import NO_VM_CLOUDS
+from fogft.model.names import NO_VM_CLOUDS, SETUP_LIMIT_S
 from fogft.model.replica import Placement
 from fogft.poolfile.resources import alternatives, place
 
 LINK_PORT = 7447
-SETUP_LIMIT_S = 3600
-"""How long a machine's set-up may take. Seconds; kept by the machine itself, and by who follows
-its launch."""
 OURS = "~/.fogft"
 _CHOICES = (
     *("infra", "cloud", "region", "zone", "any_of", "ordered"),

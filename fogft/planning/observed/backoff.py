@@ -8,8 +8,9 @@ n failures in a row a supply is not tried for
 
 seconds from the last one; NO_ROOM_S in place of BASE_S where it had no room, so that a round over
 all locations ends before the first is asked again. A replica that becomes ready there, or
-FORGIVE_S without a failure, ends it. A failed `setup` is the pool file's fault, not the location's:
-it counts against `EVERYWHERE`, so that a broken file is not tried in one location after the other.
+FORGIVE_S without a failure, ends it. A failed `setup`, or a service that is not ready in time, is
+the pool file's fault, not the location's: it counts against `EVERYWHERE`, so that a broken file is
+not tried in one location after the other.
 
 A location where a replica was lost is avoided: used only when no other is left, for
 
@@ -31,7 +32,7 @@ from typing import NamedTuple
 
 from fogft.model.reason import Cause
 from fogft.planning.observed.expiring import Expiring
-from fogft.planning.observed.history import Failure, History
+from fogft.planning.observed.history import OWN_FAULTS, Failure, History
 
 BASE_S = 5.0
 NO_ROOM_S = 120.0
@@ -115,8 +116,8 @@ def _outlook(history: History, supply: str, now: float) -> Expiring[_Outlook | N
         return Expiring(None, until)
     proven_at = history.proven_at(supply)
     bad = lately if lately[0].at > proven_at else [f for f in lately if f.at > proven_at]
-    setup = [f for f in lately if f.cause is Cause.SETUP]
-    pause = _backoff([f for f in bad if f.cause is not Cause.SETUP] if setup else bad, now)
+    setup = [f for f in lately if f.cause in OWN_FAULTS]
+    pause = _backoff([f for f in bad if f.cause not in OWN_FAULTS] if setup else bad, now)
     backoff_changes = NEVER if pause is None else min([pause.until, *_shortened(lately, pause)])
     recent_failure = None
     if bad:

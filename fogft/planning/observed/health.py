@@ -15,6 +15,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from fogft.model.groups import ready_at, replica_hash
+from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
     LinkReport,
@@ -248,6 +249,10 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
         return Verdict.FAILED, machine.failure or Reason(Cause.ERROR)
     if machine.notice:
         return Verdict.LEAVING, Reason(Cause.NOTICE)
+    if machine.setting_up and not serving:
+        if now - _accepted_at(machine, record, now) > SETUP_LIMIT_S:
+            return Verdict.FAILED, _timeout(Cause.NOT_SET_UP, SETUP_LIMIT_S)
+        return Verdict.GOOD, None
     if machine.phase is MachinePhase.PROVISIONING:
         if now - _accepted_at(machine, record, now) > health.start_limit_s:
             return Verdict.FAILED, _timeout(Cause.NOT_RUNNING, health.start_limit_s)
@@ -268,6 +273,7 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
         return Verdict.GOOD, None
     if record is None or record.first_ready_at is None:
         since = machine.launched_at if record is None else record.launched_at
+        since = max(since, machine.set_up_at) if machine.set_up_at <= now else since
         if now - since > health.start_limit_s:
             return Verdict.FAILED, _timeout(Cause.NOT_READY, health.start_limit_s)
         return Verdict.GOOD, None

@@ -59,6 +59,7 @@ class Event:
         on_demand: Of a launch: not bought on the spot market.
         reason: Why it happened, where that is known.
         by_s: Of CLOCK and SLEPT: so much later is all that was remembered before.
+        version: Of a launch: what it runs (`replica_hash`).
     """
 
     omits_defaults: ClassVar = True  # written as plain data
@@ -71,6 +72,13 @@ class Event:
     reason: Reason | None = None
     on_demand: bool = False
     by_s: float = 0.0
+    version: str = ""
+
+
+_NO_FAULT = Reason(Cause.ERROR)
+OWN_FAULTS = frozenset({Cause.SETUP, Cause.NOT_SET_UP, Cause.NOT_READY})
+LAUNCHES_KEPT_S = 3600.0
+_PROOFS = 32  # of a version's failed launches: two of each of 16 slots
 
 
 @dataclass
@@ -89,6 +97,8 @@ class Record:
     closed: EventKind | None = None
     closed_at: float = 0.0
     on_demand: bool = False
+    version: str = ""
+    fault: Reason = _NO_FAULT
 
     def move(self, by_s: float) -> None:
         """Let all of it be later."""
@@ -114,6 +124,14 @@ class Failure(NamedTuple):
     cause: Cause
 
 
+def fault_of(reason: Reason | None) -> Cause:
+    """Return the cause of a failure: of a time-out, what did not come."""
+    if reason is None:
+        return Cause.ERROR
+    awaited = reason.because[0].cause if reason.because else reason.cause
+    return awaited if reason.cause is Cause.TIMEOUT and awaited in OWN_FAULTS else reason.cause
+
+
 class History:
     """Events folded into facts. `add` is the only change; planner and placement only read."""
 
@@ -129,6 +147,9 @@ class History:
         self._of_lives: dict[str, tuple[float, float]] = {}  # what follows from them, as of when
         self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
         self.version = 0  # of all facts: counts events
+        self._fruitless: dict[str, list[Record]] = {}  # by version: failed for a reason of its own
+        self._ready_versions: set[str] = set()
+        self._launches: dict[bool, list[Record]] = {False: [], True: []}  # by market, of late
         # What follows from failures and proofs of each supply, and from losses at each location.
         self._of_supplies: dict[Callable[..., Any], TtlCache[Any, Any]] = {}
         self._of_losses: dict[Callable[..., Any], TtlCache[Any, Any]] = {}
@@ -147,8 +168,10 @@ class History:
         record = self._records.get(key)
         if record is None:
             record = Record(event.slot, event.generation, event.at, event.location)
-            record.on_demand = event.on_demand
+            record.on_demand, record.version = event.on_demand, event.version
             self._records[key] = record
+            if event.kind is EventKind.LAUNCH:
+                self._note_launch(record)
             if not record.on_demand:
                 kept = self._lives.get(record.location, ())
                 self._lives[record.location] = (*kept, record)
@@ -160,6 +183,11 @@ class History:
             self._open[key] = record
         else:
             self._open.pop(key, None)
+
+    def _note_launch(self, record: Record) -> None:
+        late = record.launched_at - LAUNCHES_KEPT_S
+        kept = self._launches[record.on_demand]
+        self._launches[record.on_demand] = [*(r for r in kept if r.launched_at > late), record]
 
     def _move(self, event: Event) -> None:
         """Let all that is remembered be later, so that durations stay what they were."""
@@ -192,6 +220,8 @@ class History:
         later._failures, later._proven_at = self._failures, self._proven_at
         later._losses, later._served = self._losses, self._served
         later._of_supplies, later._of_losses = self._of_supplies, self._of_losses
+        later._fruitless, later._ready_versions = self._fruitless, self._ready_versions
+        later._launches = dict(self._launches)
         for event in events:
             if event.kind not in _ORDERS:
                 raise ValueError(f"`{event.kind.value}` is none of our own orders")
@@ -209,6 +239,8 @@ class History:
             if record.first_ready_at is None:
                 record.first_ready_at = event.at
             record.unready_since = None
+            if record.version:
+                self._ready_versions.add(record.version)
             if record.generation > self._served.get(record.slot, 0):
                 self._served[record.slot] = record.generation
             self._proven_at[record.supply] = event.at
@@ -224,6 +256,9 @@ class History:
             record.ending = True
         elif kind is EventKind.FAILED:
             record.failed = True
+            record.fault = event.reason or _NO_FAULT
+            if fault_of(event.reason) in OWN_FAULTS:
+                self._fruitless.setdefault(record.version, []).append(record)
             self._fail(record, event)
 
     def _close(self, record: Record, event: Event) -> None:
@@ -245,8 +280,8 @@ class History:
     def _fail(self, record: Record, event: Event) -> None:
         supply = record.supply
         outdate(self._of_supplies, supply)
-        cause = event.reason.cause if event.reason is not None else Cause.ERROR
-        insort(self._failures.setdefault(supply, []), Failure(event.at, cause), key=_AT)
+        failure = Failure(event.at, fault_of(event.reason))
+        insort(self._failures.setdefault(supply, []), failure, key=_AT)
 
     def record(self, slot: int, generation: int) -> Record | None:
         """Return what is known of a launch."""
@@ -268,6 +303,25 @@ class History:
     def served(self, slot: int) -> int:
         """Return the highest generation of a slot that was ever ready; 0 for none."""
         return self._served.get(slot, 0)
+
+    def fruitless(self, version: str) -> Sequence[Record]:
+        """Return the launches of a version that failed for a reason of its own, oldest first."""
+        return self._fruitless.get(version, ()) if version else ()
+
+    def was_ready(self, version: str) -> bool:
+        """Whether a launch of a version was ever ready."""
+        return version in self._ready_versions
+
+    def proofs(self) -> set[tuple[int, int]]:
+        """Return the launches that tell whether a version ever served: slot and generation."""
+        failed = [record for records in self._fruitless.values() for record in records[-_PROOFS:]]
+        ready = {r.version: r for r in self._records.values() if r.version in self._ready_versions
+                 and r.first_ready_at is not None}  # fmt: skip
+        return {(record.slot, record.generation) for record in (*failed, *ready.values())}
+
+    def launches(self, *, on_demand: bool) -> Sequence[Record]:
+        """Return the launches of one market of the last hour before its latest one."""
+        return self._launches[on_demand]
 
     @property
     def generations(self) -> Mapping[int, int]:
@@ -361,7 +415,8 @@ def compacted(
     """Drop what no decision needs any more.
 
     Kept whole: launches that are open, or to which something happened within `keep_s`.
-    Kept in part: the latest launch of each slot, so that generations stay used. Of a
+    Kept in part: the latest launch of each slot, so that generations stay used; the latest failed
+    launches of a version, and one that was ready, so that it is known what was given up. Of a
     kept launch's comings and goings of readiness the first READY and the last two stay. That the
     clock was set is never forgotten, that the machine slept only with all that was before.
 
@@ -381,6 +436,7 @@ def compacted(
     for index, event in enumerate(events):
         if event.kind in (EventKind.READY, EventKind.UNREADY):
             flapping.setdefault((event.slot, event.generation), []).append(index)
+    kept |= history.proofs()
     dropped: set[int] = set()
     for indices in flapping.values():
         first_ready = [i for i in indices if events[i].kind is EventKind.READY][:1]

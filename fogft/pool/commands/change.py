@@ -1,4 +1,4 @@
-"""Change what a pool aims for besides its file: `scale`, `drain`, `exclude`, `include`.
+"""Change what a pool aims for besides its file: `scale`, `drain`, `exclude`, `include`, `retry`.
 
 Each writes the new intent under the pool's lock and returns; the manager, now or when
 there is one again, acts on it.
@@ -68,6 +68,11 @@ def include(store: PoolStore, location: str) -> None:
         FogftError: It is not excluded.
     """
     _change(store, lambda now: intent.include(now, location))
+
+
+def retry(store: PoolStore, now: float) -> None:
+    """Launch again what was given up."""
+    _change(store, lambda before: intent.retry(before, now))
 
 
 def generation_in(paths: PoolPaths, slot: int, now: float) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from fogft.model.reason import Cause
 from fogft.model.replica import Phase
 from fogft.planning.rollout import UpdateState
 from fogft.pool.commands.current import Seen
@@ -23,6 +24,7 @@ class Outcome(Enum):
     ANSWERING = auto()
     WITHDRAWN = auto()  # the update was stopped and rolled back
     RUN_KEEPS_ENDING = auto()  # on every replica
+    NEVER_READY = auto()  # no replica ever was: nothing more is launched
     TYPES_DIFFER = auto()  # every replica defines a service's type otherwise than this machine
 
 
@@ -56,6 +58,8 @@ class Awaited:
             return Outcome.RUN_KEEPS_ENDING
         if types_differ(seen):
             return Outcome.TYPES_DIFFER
+        if is_given_up(seen) and seen.status.observed_at >= self.since:
+            return Outcome.NEVER_READY
         return Outcome.ANSWERING if self.is_answering(seen) else Outcome.PENDING
 
     def is_updating(self, seen: Seen) -> bool:
@@ -106,6 +110,12 @@ class Settled:
         if status.observed_at < self.since or leaving or status.ready < status.target:
             return Outcome.PENDING
         return Outcome.ANSWERING
+
+
+def is_given_up(seen: Seen) -> bool:
+    """Whether nothing is launched any more, and nothing that was launched may still serve."""
+    gave_up = any(reason.cause is Cause.NEVER_READY for reason in seen.status.reasons)
+    return gave_up and not seen.status.replicas
 
 
 def keeps_ending(seen: Seen) -> bool:

@@ -9,13 +9,16 @@ Not here: the decisions (`fogft.planning.planner`), the loop and the processes (
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from fogft import logfile
 from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.errors import CloudError, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.model.groups import replica_hash, sales, task_at
@@ -37,7 +40,7 @@ from fogft.model.topology import certified
 from fogft.planning import lifetime
 from fogft.planning.observed.clock_jumps import Reading
 from fogft.planning.observed.health import judge
-from fogft.planning.observed.history import EventKind, History
+from fogft.planning.observed.history import EventKind, History, fault_of
 from fogft.planning.observed.refresh import Silent
 from fogft.planning.planner import Plan, PlannedLaunch, plan
 from fogft.planning.rollout import Update
@@ -52,6 +55,7 @@ from fogft.reason_words import words
 log = logging.getLogger(__name__)
 
 OFFERS_EVERY_S = 30.0
+LOG_LINES = 20
 
 Links = Callable[[str, float], "tuple[LinkReport, ...] | None"]
 Distances = Callable[
@@ -151,6 +155,7 @@ class Reconciler:
         self._remember = Remembering(store, lambda: self._time.now)
         self._membership: Membership | None = store.membership()
         self._published_for: tuple[Any, ...] | None = None  # what it follows from
+        self._log_tail = ""  # of the last replica that was ended because it was never ready
 
     def tick(self) -> Tick:
         """Observe, plan and apply once.
@@ -191,6 +196,7 @@ class Reconciler:
                 spec, trial, decided.health, history, wanted=decided.wanted, now=observed.now
             )
         trouble += [update.reason] if update is not None else []
+        decided = decided._replace(notes=tuple(map(self._with_log, decided.notes)))
         if trouble:
             decided = decided._replace(notes=(*decided.notes, *trouble))
         if observed.machines is not None:
@@ -339,6 +345,7 @@ class Reconciler:
             location=location,
             reason=planned.reason,
             on_demand=not order.placement.spot,
+            version=order.spec_hash,
         )
         why = words(planned.reason)
         log.info("launch_ordered replica=%s zone=%s reason=%r", order.id.short, location, why)
@@ -359,7 +366,23 @@ class Reconciler:
         if record is None or not record.ending:
             self._remember.add(EventKind.ENDING, id, reason=reason)
             log.info("terminate_ordered replica=%s reason=%r", id.short, words(reason))
-        self.operations.start(id, None, lambda: self._cloud.terminate(id))
+        never_ready = fault_of(reason) is Cause.NOT_READY
+        self.operations.start(id, None, lambda: self._end(id, keep_log=never_ready))
+
+    def _end(self, id: ReplicaId, *, keep_log: bool) -> None:
+        """End a machine, off the loop; keep the end of its log where it says why it goes."""
+        if keep_log:
+            with contextlib.suppress(CloudError):
+                path = self._cloud.log(id)
+                self._log_tail = logfile.tail(Path(path), lines=LOG_LINES) if path else ""
+        self._cloud.terminate(id)
+
+    def _with_log(self, note: Reason) -> Reason:
+        """Return a note with the log of what was never ready."""
+        hopeless = note.cause is Cause.NEVER_READY and self._log_tail
+        if not hopeless or fault_of(note.because[0]) is not Cause.NOT_READY:
+            return note
+        return replace(note, words=f"\n{self._log_tail}")
 
 
 def _refusal(error: Exception) -> Cause | None:

@@ -40,6 +40,7 @@ class Remembering:
         reason: Reason | None = None,
         on_demand: bool = False,
         at: float | None = None,
+        version: str = "",
     ) -> None:
         """Add one event, of now unless told.
 
@@ -47,7 +48,9 @@ class Remembering:
             StateError: It cannot be written; it did not happen.
         """
         when = self._clock() if at is None else at
-        self._store.append(Event(when, kind, id.slot, id.generation, location, reason, on_demand))
+        self._store.append(
+            Event(when, kind, id.slot, id.generation, location, reason, on_demand, version=version)
+        )
 
     def losses(self, observed: Observed) -> None:
         """Note who is no longer listed. The cloud's list must be known.
@@ -82,6 +85,7 @@ class Remembering:
                     location=place.location,
                     on_demand=not place.spot,
                     at=now,
+                    version=machine.spec_hash,
                 )
                 record = history.record(id.slot, id.generation)
             if record is None:

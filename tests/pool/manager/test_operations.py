@@ -195,5 +195,8 @@ def test_events_are_one_per_line_facts() -> None:
     bench = Bench()
     bench.reconciler.tick()
     assert bench.store.events == [
-        Event(NOW, EventKind.LAUNCH, 0, 1, "east/one/a", Reason(Cause.NEW_SLOT))
+        Event(
+            *(NOW, EventKind.LAUNCH, 0, 1, "east/one/a", Reason(Cause.NEW_SLOT)),
+            version=bench.store.spec().replica_hash,
+        )
     ]

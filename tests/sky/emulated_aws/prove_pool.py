@@ -65,7 +65,8 @@ step = Steps()
 def credentials_below(home: Path) -> Iterator[Path]:
     """Yield the files of a VM's user that hold what should not leave the launching computer."""
     for path in home.rglob("*"):
-        if "site-packages" in path.parts or path.name == "replica.key" or not path.is_file():
+        code = "site-packages" in path.parts or ".cache" in path.parts
+        if code or path.name == "replica.key" or not path.is_file():
             continue
         content = path.read_bytes() if path.stat().st_size < 65_536 else b""
         if any(mark in content for mark in (MARK.encode(), b"aws_secret", b"PRIVATE KEY-----")):

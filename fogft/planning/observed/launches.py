@@ -1,0 +1,61 @@
+"""Which version is not launched any more, and how many launches an hour there may be. Pure.
+
+A version (`replica_hash`) whose launches fail for its own reasons is given up: once a slot has had
+GIVE_UP_AFTER launches of it that failed so, and none of it was ever ready anywhere. Nothing of it
+is launched until the file changes or the user asks for it again. Reasons of its own are a `setup`
+that fails or hangs, and a service that is not ready in time; what a cloud refuses or takes away is
+none.
+
+Whatever else is wrong, no more than LAUNCHES_AN_HOUR machines a replica are had within an hour;
+spot machines and those on demand are counted apart, so that what restores readiness is not held up.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from fogft.model.reason import Cause, Reason
+from fogft.planning.observed.history import EventKind, History, Record
+
+GIVE_UP_AFTER = 2
+LAUNCHES_AN_HOUR = 12
+HOUR_S = 3600.0
+
+
+def given_up(history: History, version: str, since: float) -> Reason | None:
+    """Return why a version is not launched any more; None while it is.
+
+    Args:
+        history: What happened.
+        version: Of the launch that is needed.
+        since: What was launched before does not count: the user asked for it again.
+    """
+    if history.was_ready(version):
+        return None
+    failed = [record for record in history.fruitless(version) if record.launched_at >= since]
+    if max(Counter(record.slot for record in failed).values(), default=0) < GIVE_UP_AFTER:
+        return None
+    return Reason(Cause.NEVER_READY, count=len(failed), because=(failed[-1].fault,))
+
+
+def within_an_hour(history: History, now: float, *, on_demand: bool) -> Sequence[Record]:
+    """Return the launches of one market within the last hour that have come to a machine."""
+    return [
+        record
+        for record in history.launches(on_demand=on_demand)
+        if 0 <= now - record.launched_at < HOUR_S and not _was_refused(record)
+    ]
+
+
+def _was_refused(record: Record) -> bool:
+    """Whether a launch cost nothing: at once, or after the cloud had looked for a place."""
+    late = record.failed and record.fault.cause in (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS)
+    return late or record.closed is EventKind.REFUSED
+
+
+def next_change(history: History, now: float) -> float:
+    """Return when a launch is an hour old next; infinity for never."""
+    both = (*history.launches(on_demand=False), *history.launches(on_demand=True))
+    ends = [record.launched_at + HOUR_S for record in both]
+    return min([at for at in ends if at > now], default=float("inf"))
