@@ -29,12 +29,16 @@ class SpecError(FogftError):
     Attributes:
         key: The key that it is about, such as ``fogft.replicas``; empty where it is about none.
         what: What is wrong with it.
+        line: Where, from 1; 0 where it is about no line.
     """
 
-    def __init__(self, message: str, hint: str = "", *, key: str = "", what: str = "") -> None:
+    def __init__(
+        self, message: str, hint: str = "", *, key: str = "", what: str = "", line: int = 0
+    ) -> None:
         super().__init__(message, hint)
         self.key = key
         self.what = what
+        self.line = line
 
 
 class StateError(FogftError):

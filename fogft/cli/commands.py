@@ -25,6 +25,7 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "sweep": ("sweep", ""),
     },
     "Look": {
+        "check": ("plan", "pool.yaml"),
         "plan": ("plan", "pool.yaml"),
         "list": ("overview", ""),
         "status": ("status", "--watch"),

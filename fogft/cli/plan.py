@@ -1,4 +1,4 @@
-"""``fogft plan``: what a pool file would launch, where, why there, and at what price."""
+"""``fogft check | plan``: what is wrong in a pool file, and what it would launch at what price."""
 
 from __future__ import annotations
 
@@ -56,3 +56,27 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     if plot is not None:
         plan_plot.draw(shown, plot)
         output.done(f"`{plot}` is drawn")
+
+
+def check(file: PoolFile = DEFAULT_FILE, as_json: AsJson = False) -> None:
+    """Show all mistakes in a pool file. Changes nothing.
+
+    Types of services are looked up on this machine. Exit status 1 when something is wrong.
+    """
+    from fogft.pool.commands.check import mistakes
+
+    found = mistakes(file)
+    if as_json:
+        output.json_data(
+            [
+                {"line": one.line, "key": one.key, "message": one.message, "hint": one.hint}
+                for one in found
+            ]
+        )
+    for one in () if as_json else found:
+        output.data(one.message + (f"\n    {one.hint}" if one.hint else ""))
+    if not found:
+        output.done(f"`{file}` is right")
+        return
+    output.say(f"\n{len(found)} {'mistake' if len(found) == 1 else 'mistakes'} in `{file}`")
+    raise typer.Exit(1)

@@ -9,7 +9,7 @@ from pathlib import Path
 from fogft.errors import SpecError
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import yaml_tree
-from fogft.poolfile.pool import UNCHECKED, Checks, pool_spec
+from fogft.poolfile.pool import UNCHECKED, Checks, mistakes_in, pool_spec
 
 MAX_BYTES = 1 << 20
 
@@ -21,6 +21,15 @@ def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
         SpecError: The file cannot be read, or its first mistake: ``file:line: key: what``.
     """
     return parse(read_text(path), str(path), checks, Path(path).parent)
+
+
+def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
+    """Return all that is wrong in a pool file, by line; only the first where it is not YAML."""
+    checks = replace(checks, workdir=partial(_no_folder, path.parent))
+    try:
+        return mistakes_in(yaml_tree.tree(read_text(path), str(path)), str(path), checks)
+    except SpecError as error:
+        return [error]
 
 
 def parse(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
+from fogft.errors import SpecError
 from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
 from fogft.model.groups import MAX_GROUPS
 from fogft.model.names import POOL_NAME_PATTERN
@@ -19,6 +20,7 @@ from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
 from fogft.poolfile import rules
 from fogft.poolfile.actions import action_services, action_topics
+from fogft.poolfile.mistakes import Mistakes
 from fogft.poolfile.reader import Reader
 from fogft.poolfile.task import check_task
 from fogft.poolfile.tree import Node, Section, plain, shown
@@ -56,35 +58,70 @@ def pool_spec(root: Node, file: str, checks: Checks = UNCHECKED) -> PoolSpec:
     Raises:
         SpecError: The first mistake found; ``file:line: key: what is wrong``.
     """
+    return _judged(root, file, checks, Mistakes())
+
+
+def mistakes_in(root: Node, file: str, checks: Checks = UNCHECKED) -> list[SpecError]:
+    """Return all that is wrong in a pool file, by line.
+
+    What depends on something that is wrong is not judged: that may still be wrong then.
+    """
+    found = Mistakes(keep=True)
+    with found.step():
+        _judged(root, file, checks, found)
+    return sorted(found.found, key=lambda error: error.line)
+
+
+def _judged(root: Node, file: str, checks: Checks, mistakes: Mistakes) -> PoolSpec:
     top = Section(file, "", root, "write a SkyPilot task with a `fogft` section")
-    check_task(top)
-    ours = top.section("fogft", "write `fogft:` with `services:` below it")
     task = {key: plain(node) for key, node in top.children.items() if key != "fogft"}
 
     def whole(section: Section, made: PoolSpec) -> PoolSpec:
-        return _whole(section, replace(made, name=_name(top), task=task))
+        return _whole(section, replace(made, task=task))
 
-    spec: PoolSpec = Reader({**rules.RULES, PoolSpec: whole}).map(PoolSpec, ours)
+    with mistakes.whole():
+        check_task(top, mistakes)
+        ours = top.section("fogft", "write `fogft:` with `services:` below it")
+        reader = Reader({**rules.RULES, PoolSpec: whole}, mistakes)
+        with mistakes.step():
+            spec: PoolSpec = reader.map(PoolSpec, ours)
+        with mistakes.step():
+            name = _name(top)
+    spec = replace(spec, name=name)
+    _judge_here(top, ours, spec, checks, mistakes)
+    return spec
+
+
+def _judge_here(
+    top: Section, ours: Section, spec: PoolSpec, checks: Checks, mistakes: Mistakes
+) -> None:
+    """Judge what only this machine can tell, and what is about the whole pool."""
     workdir = spec.task.get("workdir")
     if isinstance(workdir, str):
-        _judge(top, "workdir", checks.workdir(workdir))
+        with mistakes.step():
+            _judge(top, "workdir", checks.workdir(workdir))
     sections = ours.sections("services", "") if "services" in ours.children else ()
     for section, service in zip(sections, spec.services, strict=False):
-        _check_quorum(section, service, spec)
+        with mistakes.step():
+            _check_quorum(section, service, spec)
     for section, service in zip(sections, spec.services, strict=False):
-        if spec.rmw.robot is not Speaks.ZENOH or service.needs_type:
-            _judge(section, "type", checks.types(service.type))
-        if service.ok_field:
-            _judge(section, "ok_field", checks.fields(service.type, service.ok_field))
-        if service.tolerance:
-            reason = checks.tolerances(service.type, dict(service.tolerance))
-            _judge(section, "tolerance", reason)
-        if service.state is not None:
-            _judge(section, "state", checks.states(service.state))
+        with mistakes.step():
+            _judge_types(section, service, spec, checks)
     for key, end in (("topics", ""), ("actions", "_SendGoal")):
         for section in ours.sections(key, "") if key in ours.children else ():
-            _judge(section, "type", checks.types(section.text("type", "") + end))
-    return spec
+            with mistakes.step():
+                _judge(section, "type", checks.types(section.text("type", "") + end))
+
+
+def _judge_types(section: Section, service: ServiceSpec, spec: PoolSpec, checks: Checks) -> None:
+    if spec.rmw.robot is not Speaks.ZENOH or service.needs_type:
+        _judge(section, "type", checks.types(service.type))
+    if service.ok_field:
+        _judge(section, "ok_field", checks.fields(service.type, service.ok_field))
+    if service.tolerance:
+        _judge(section, "tolerance", checks.tolerances(service.type, dict(service.tolerance)))
+    if service.state is not None:
+        _judge(section, "state", checks.states(service.state))
 
 
 def _whole(ours: Section, made: PoolSpec) -> PoolSpec:

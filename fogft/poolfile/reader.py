@@ -14,6 +14,7 @@ from fogft.errors import SpecError
 from fogft.model import keys
 from fogft.model.keys import Entry, keys_of
 from fogft.poolfile import removed
+from fogft.poolfile.mistakes import Mistakes
 from fogft.poolfile.tree import Node, Section, plain, shown
 
 T = TypeVar("T")
@@ -24,8 +25,9 @@ Rule = Callable[[Section, Any], Any]
 class Reader:
     """Reads maps; a rule judges the dataclass that was read, and may return another."""
 
-    def __init__(self, rules: Mapping[type, Rule]) -> None:
+    def __init__(self, rules: Mapping[type, Rule], mistakes: Mistakes | None = None) -> None:
         self._rules = rules
+        self._mistakes = mistakes or Mistakes()
 
     def map(self, cls: type[T], section: Section) -> T:
         """Return the dataclass that a map describes.
@@ -37,17 +39,21 @@ class Reader:
         below = [e.name for e in entries if e.key.advanced]
         known = [e.name for e in entries if not e.key.advanced]
         allowed = [*known, ADVANCED] if below else known
-        section.only(allowed, hints=removed.hints(cls), elsewhere=removed.places(cls))
-        advanced = section.section(ADVANCED if below else "")
-        if advanced.children:
-            advanced.only(below, elsewhere=removed.places(None))
+        hints, elsewhere = removed.hints(cls), removed.places(cls)
         values: dict[tuple[str, ...], Any] = {}
-        for entry in entries:
-            here = advanced if entry.key.advanced and entry.name in advanced.children else section
-            if entry.name in here.children:
-                values[entry.path] = self._value(entry, here)
-            elif entry.required:
-                raise here.error(entry.name, "is missing", _hint(entry))
+        with self._mistakes.whole():
+            self._mistakes.add(section.unknown(allowed, hints=hints, elsewhere=elsewhere))
+            advanced = section.section(ADVANCED if below else "")
+            if advanced.children:
+                self._mistakes.add(advanced.unknown(below, elsewhere=removed.places(None)))
+            for entry in entries:
+                is_below = entry.key.advanced and entry.name in advanced.children
+                here = advanced if is_below else section
+                with self._mistakes.step():
+                    if entry.name in here.children:
+                        values[entry.path] = self._value(entry, here)
+                    elif entry.required:
+                        raise here.error(entry.name, "is missing", _hint(entry))
         made: T = _build(cls, values)
         rule = self._rules.get(cls)
         return made if rule is None else rule(section, made)
@@ -60,14 +66,15 @@ class Reader:
         if len(sections) > form.most:
             raise section.error(key, f"has {len(sections)} entries", f"list {form.most} at most")
         for below in sections:
-            made: Any = self.map(form.of, below)
-            name = getattr(made, "name", None)
-            if name in lines:
-                what = f"`{name}` stands here twice (first in line {lines[name]})"
-                raise below.error("name", what, "give each one entry")
-            if name is not None:
-                lines[name] = below.children["name"].line
-            found.append(made)
+            with self._mistakes.step():
+                made: Any = self.map(form.of, below)
+                name = getattr(made, "name", None)
+                if name in lines:
+                    what = f"`{name}` stands here twice (first in line {lines[name]})"
+                    raise below.error("name", what, "give each one entry")
+                if name is not None:
+                    lines[name] = below.children["name"].line
+                found.append(made)
         return tuple(found)
 
     def _value(self, entry: Entry, section: Section) -> Any:  # noqa: PLR0911
@@ -106,7 +113,7 @@ class Reader:
             children = {name: Node(node.value, node.line, node.key_line) for name in form.short}
             below = section.below(key, children)
             try:
-                return self.map(form.of, below)
+                return Reader(self._rules).map(form.of, below)
             except SpecError as error:  # of the key that was written, not the one it stands for
                 raise section.error(key, error.what, error.hint) from None
         return self.map(form.of, section.section(key, form.hint))

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import removed
+from fogft.poolfile.mistakes import Mistakes
 from fogft.poolfile.tree import Section, plain, shown
 
 # The task schema of SkyPilot 0.14.1, without the keys that it keeps for itself.
@@ -39,39 +40,51 @@ REFUSED_TASK_KEYS = {
 _ENV_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-def check_task(top: Section) -> None:
+def check_task(top: Section, mistakes: Mistakes) -> None:
     """Check the top level of a pool file.
 
     Raises:
-        SpecError: The first mistake.
+        SpecError: The first mistake, unless all are kept.
     """
-    for key, reason in REFUSED_TASK_KEYS.items():
-        if key in top.children:
-            raise top.error(key, "cannot stand in a pool file", reason, at_key=True)
-    top.only((*TASK_KEYS, "fogft"), hints=removed.hints(PoolSpec), elsewhere=removed.places(None))
-    if "fogft" not in top.children:
-        raise top.error("fogft", "is missing", "add `fogft:` with `services:` below it")
-    top.text("run", "write the command that starts your service, such as `run: exec python3 x.py`")
-    if top.has("num_nodes"):
-        nodes = top.children["num_nodes"].value
-        if isinstance(nodes, bool) or nodes != 1:
-            raise top.error(
-                "num_nodes",
-                f"must be 1, not {shown(plain(top.children['num_nodes']))}: "
-                "a replica is one machine",
-                "remove it, and set `fogft.replicas` for more replicas",
-            )
+    mistakes.add(
+        top.error(key, "cannot stand in a pool file", reason, at_key=True)
+        for key, reason in REFUSED_TASK_KEYS.items()
+        if key in top.children
+    )
+    known, hints = (*TASK_KEYS, *REFUSED_TASK_KEYS, "fogft"), removed.hints(PoolSpec)
+    mistakes.add(top.unknown(known, hints=hints, elsewhere=removed.places(None)))
+    with mistakes.step():
+        if "fogft" not in top.children:
+            raise top.error("fogft", "is missing", "add `fogft:` with `services:` below it")
+    with mistakes.step():
+        start = "write the command that starts your service, such as `run: exec python3 x.py`"
+        top.text("run", start)
+    with mistakes.step():
+        _one_machine(top)
     for key in ("resources", "file_mounts", "envs", "config", "volumes"):
-        if top.has(key):
-            top.section(key)
-    if top.has("setup"):
-        top.text("setup", "write the commands that install what `run` needs, or remove it")
-    if top.has("envs"):
-        _envs(top.section("envs"))
-    if top.has("workdir"):
-        _workdir(top)
-    if top.has("resources"):
-        _spot(top.section("resources"))
+        with mistakes.step():
+            if top.has(key):
+                top.section(key)
+    with mistakes.step():
+        if top.has("setup"):
+            top.text("setup", "write the commands that install what `run` needs, or remove it")
+    for key, check in (("envs", _envs), ("resources", _spot)):
+        with mistakes.step():
+            if top.has(key) and isinstance(top.children[key].value, Mapping):
+                check(top.section(key))
+    with mistakes.step():
+        if top.has("workdir"):
+            _workdir(top)
+
+
+def _one_machine(top: Section) -> None:
+    nodes = top.children["num_nodes"] if top.has("num_nodes") else None
+    if nodes is not None and (isinstance(nodes.value, bool) or nodes.value != 1):
+        raise top.error(
+            "num_nodes",
+            f"must be 1, not {shown(plain(nodes))}: a replica is one machine",
+            "remove it, and set `fogft.replicas` for more replicas",
+        )
 
 
 def _workdir(top: Section) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeVar
@@ -109,16 +109,21 @@ class Section:
         word = key if key and key == key.strip() else f'"{key}"'
         full = f"{self.path}.{word}" if self.path else word
         message = f"{self.file}:{line}: {shown(full, 80)[1:-1]}: {what}"
-        return SpecError(message, hint, key=full, what=what)
+        return SpecError(message, hint, key=full, what=what, line=line)
 
-    def only(
+    def only(self, known: Iterable[str]) -> None:
+        """Refuse every key that is not known."""
+        for error in self.unknown(known):
+            raise error
+
+    def unknown(
         self,
         known: Iterable[str],
         *,
         hints: Mapping[str, str] | None = None,
         elsewhere: Mapping[str, str] | None = None,
-    ) -> None:
-        """Refuse every key that is not known.
+    ) -> Iterator[SpecError]:
+        """Yield an error for each key that is not known.
 
         Args:
             known: The keys that may stand here.
@@ -126,17 +131,16 @@ class Section:
             elsewhere: Keys that have their place in another section, with that place.
         """
         allowed = set(known)
-        for key in self.children:
-            if key in allowed:
-                continue
+        for key in [key for key in self.children if key not in allowed]:
             if hints and key in hints:
                 what, _, todo = hints[key].partition("; ")
-                raise self.error(key, what, todo, at_key=True)
+                yield self.error(key, what, todo, at_key=True)
+                continue
             if elsewhere and key in elsewhere:
                 hint = f"`{key}` belongs {elsewhere[key]}"
             else:
                 hint = nearest(key, allowed)
-            raise self.error(key, "unknown key", hint, at_key=True)
+            yield self.error(key, "unknown key", hint, at_key=True)
 
     def has(self, key: str) -> bool:
         """Whether the key is there with a value, here or under `advanced`."""

@@ -20,6 +20,7 @@ from fogft.planning.buying import PlannedLaunch
 from fogft.planning.observed.history import History
 from fogft.planning.planner import plan
 from fogft.planning.rollout import has_room
+from fogft.pool.commands.check import checks_here
 from fogft.pool.commands.composition import cloud_named_by, make_cloud, make_store
 from fogft.pool.commands.plan import far
 from fogft.pool.folder.store import PoolStore, digest
@@ -27,7 +28,6 @@ from fogft.pool.manager import offers
 from fogft.poolfile.changes import changes, replaces_replicas
 from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import clouds_named, located
-from fogft.poolfile.pool import Checks
 from fogft.reason_words import words
 
 
@@ -100,13 +100,8 @@ def order(
         SpecError: The first mistake in the file, or the cloud can never meet its resources.
         CloudError: There is no such cloud, or a new pool cannot use any that it names.
     """
-    from fogft.ros.comparison import check_tolerances
-    from fogft.ros.state_bytes import check_state
-    from fogft.ros.types import check_ok_field, check_type
-
     source = read_text(file)
-    checks = Checks(check_type, check_ok_field, check_state, check_tolerances)
-    spec = parse(source, str(file), checks, file.parent)
+    spec = parse(source, str(file), checks_here(), file.parent)
     cloud_name = cloud or cloud_named_by(spec, source, file)
     concrete = make_cloud(cloud_name, file.resolve().parent)
     before, rolled_back = _before(make_store(spec.name), source)

@@ -1,0 +1,99 @@
+"""All that is wrong in a file, each mistake once."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.errors import SpecError
+from fogft.poolfile import yaml_tree
+from fogft.poolfile.pool import Checks, mistakes_in, pool_spec
+
+BAD = """\
+name: Pool!
+runs: x
+run: serve
+num_nodes: 2
+envs: {1A: x}
+fogft:
+  replcas: 3
+  max_surge: 9
+  services:
+    - {name: /a, timeout_s: -1, hedging: some}
+    - {name: /b, type: p/srv/B, quorum: 9}
+    - {name: /b, type: p/srv/B}
+  health: {suspect_after_s: 0, start_limit: 3}
+  availability: 2
+"""
+ALL = [
+    (1, "name: `Pool!` is not a pool name"),
+    (2, "runs: unknown key"),
+    (4, "num_nodes: must be 1"),
+    (5, "envs.1A: is not the name"),
+    (7, "fogft.replcas: unknown key"),
+    (8, "fogft.max_surge: must be from 0 to 4"),
+    (10, "fogft.services[0].type: is missing"),
+    (10, "fogft.services[0].timeout_s: must be above 0"),
+    (10, "fogft.services[0].hedging: must be `auto`"),
+    (12, "fogft.services[2].name: `/b` stands here twice"),
+    (13, "fogft.health.start_limit: unknown key"),
+    (13, "fogft.health.suspect_after_s: must be above 0"),
+    (14, "fogft.availability: must be above 0"),
+]
+
+
+def found(text: str, **checks) -> list[SpecError]:
+    return mistakes_in(yaml_tree.tree(text, "p.yaml"), "p.yaml", Checks(**checks))
+
+
+def test_every_mistake_is_found_with_its_line():
+    shown = [(one.line, one.message) for one in found(BAD)]
+    assert len(shown) == len(ALL)
+    for line, what in ALL:
+        assert any(at == line and what in message for at, message in shown), (line, what)
+    assert [line for line, _ in shown] == sorted(line for line, _ in shown)
+
+
+def test_what_only_this_machine_tells_is_asked_of_each_service():
+    """Once the file itself is right: two types that are not installed are two mistakes."""
+    text = "run: x\nfogft:\n  services:\n" + "".join(
+        f"    - {{name: /s{n}, type: p/srv/T{n}}}\n" for n in range(3)
+    )
+    told = found(text, types=lambda name: None if name == "p/srv/T1" else "no package; install it")
+    assert [(one.line, one.key) for one in told] == [
+        (4, "fogft.services[0].type"),
+        (6, "fogft.services[2].type"),
+    ]
+    assert {one.hint for one in told} == {"install it"}
+
+
+lines = BAD.splitlines(keepends=True)
+
+
+@pytest.mark.parametrize("without", range(len(lines)))
+def test_the_first_mistake_is_one_of_all(without):
+    """`up` and `check` read by the same rules, whichever lines a file has."""
+    text = "".join(line for n, line in enumerate(lines) if n != without)
+    try:
+        tree = yaml_tree.tree(text, "p.yaml")
+    except SpecError:
+        return
+    with pytest.raises(SpecError) as first:
+        pool_spec(tree, "p.yaml")
+    assert first.value.message in [one.message for one in found(text)]
+
+
+@given(st.lists(st.sampled_from(lines), max_size=12))
+def test_a_file_is_right_exactly_where_nothing_is_found(some):
+    text = "".join(some)
+    try:
+        tree = yaml_tree.tree(text, "p.yaml")
+    except SpecError:
+        return
+    try:
+        pool_spec(tree, "p.yaml")
+    except SpecError:
+        assert found(text)
+    else:
+        assert not found(text)
