@@ -67,6 +67,26 @@ def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
             yield ends[1], connection
 
 
+def listening(port: int) -> socket.socket | None:
+    """Return a socket of ours to the one that listens at a port; None where there is none."""
+    for number in _numbers():
+        connection = _duplicate(number)
+        if connection is None:
+            continue
+        if _listens(connection, port):
+            return connection
+        connection.close()
+    return None
+
+
+def _listens(connection: socket.socket, port: int) -> bool:
+    try:
+        listens = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+        return bool(listens) and connection.getsockname()[1] == port
+    except OSError:
+        return False
+
+
 class OwnSocket:
     """One connection of this process. It is looked up anew each time and held by nobody here.
 
@@ -94,6 +114,14 @@ class OwnSocket:
                 return connection
             connection.close()
         return None
+
+
+def count() -> int:
+    """Return how many descriptors this process has open."""
+    try:
+        return len(os.listdir(_DESCRIPTORS))
+    except OSError:
+        return 0
 
 
 def _numbers() -> list[int]:

@@ -1,13 +1,14 @@
 """Close connections at a replica's port that belong to no admitted robot, or deliver nothing.
 
 Zenoh owns the port. It lets a connection that never says who it is stand for as long as it
-likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look ourselves,
-four times a second, at this process's own sockets: what is connected to the port and is no
-authenticated link is ended when it is too old or when there are too many, a link of a revoked
-holder at once, and one that delivers nothing of what it holds after a while. All are counted.
-Who looks sees, too, which links are thin.
+likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look ourselves at this
+process's own sockets, four times a second and whenever somebody comes: what is connected to the
+port and is no authenticated link is ended or kept out as `door` says, a link of a revoked
+holder is ended at once, and one that delivers nothing of what it holds after a while. All are
+counted. Who looks sees, too, which links are thin.
 
-Owns: ending connections, and how they drain. Not here: whose requests are refused (`sessions`).
+Owns: ending connections, and how they drain. Not here: who has to go (`door`), whose requests are
+refused (`sessions`).
 """
 
 from __future__ import annotations
@@ -23,16 +24,15 @@ from fogft.link.counters import Counters
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
+from fogft.link.zenoh.replica.door import Door
+from fogft.link.zenoh.replica.listen_filter import ListenFilter
 from fogft.link.zenoh.sockets import Address
 
 log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.25
-# Longer than Zenoh takes to accept or give up a peer that talks.
-PATIENCE_S = 5.0
-STRANGERS_LIMIT = 16
-# In a flood even the young have to go, but not one that may be in the middle of its handshake.
-LEAST_AGE_S = 0.5
+_LOOK_AGAIN_S = 0.01  # while somebody comes, or is kept out
+RUSH_LIMIT = 2  # so many new ones since the last look
 # A robot that is out of reach has long opened another link by then.
 STUCK_AFTER_S = 15.0
 
@@ -69,8 +69,11 @@ class ConnectionReaper:
         self._also = also
         self._stuck_after_s = stuck_after_s
         self.thin: frozenset[str] = frozenset()
-        self._first_seen: dict[Address, float] = {}
         self._progress: dict[Address, SocketProgress] = {}
+        self._filter = ListenFilter(port)
+        self._door = Door()
+        self._shut = False
+        self._descriptors = sockets.count()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fogft-reaper", daemon=True)
         self._thread.start()
@@ -81,12 +84,26 @@ class ConnectionReaper:
         self._thread.join(1.0)
 
     def _run(self) -> None:
-        while not self._stop.wait(LOOK_EVERY_S):
+        while not self._stop.is_set():
+            self._await_look()
             try:
                 self.look(time.monotonic())
                 self._also()
             except Exception:
                 log.exception("doorkeeper_failed port=%d", self._port)
+                self._filter.drop(frozenset())
+        self._filter.close()
+
+    def _await_look(self) -> None:
+        """Wait until it is time to look: soon after somebody came, at once where many do."""
+        began = time.monotonic()
+        until = began + (_LOOK_AGAIN_S if self._shut else LOOK_EVERY_S)
+        while (left_s := until - time.monotonic()) > 0 and self._filter.wait(left_s):
+            if sockets.count() >= self._descriptors + RUSH_LIMIT:
+                self._filter.drop(None)  # until it is known whose they are
+                return
+            until = min(until, began + _LOOK_AGAIN_S)
+            time.sleep(_LOOK_AGAIN_S / 50)
 
     def look(self, now: float) -> None:
         """Look once, and end what has to go."""
@@ -101,11 +118,21 @@ class ConnectionReaper:
                 if name in revoked and peer in found:
                     self._end(found[peer], peer, "revoked_links", name)
             self._watch(links, found, now)
-            seen = {peer: self._first_seen.get(peer, now) for peer in found if peer not in links}
-            for peer in condemned(seen, now):
-                self._end(found[peer], peer, "unauthenticated", "")
-                del seen[peer]
-            self._first_seen = seen
+            stranger = self._door.look(found.keys() - links.keys(), links.keys(), now)
+            if stranger is not None:
+                self._end(found[stranger], stranger, "unauthenticated", "")
+            self._keep_out(self._door.kept_out)
+        self._descriptors = sockets.count()
+
+    def _keep_out(self, hosts: frozenset[str] | None) -> None:
+        self._filter.drop(hosts)
+        shut = hosts is None or bool(hosts)
+        if shut and not self._shut:
+            self._counters.warn(
+                log, "kept_out", "door_shut hosts=%s", "all" if hosts is None else sorted(hosts)
+            )
+            self._filter.turn_away()
+        self._shut = shut
 
     def _watch(
         self, links: Mapping[Address, str], found: Mapping[Address, socket.socket], now: float
@@ -137,19 +164,3 @@ class ConnectionReaper:
         self._counters.warn(
             log, event, "connection_ended reason=%s peer=%s:%d name=%r", event, *peer, name
         )
-
-
-def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
-    """Return which strangers have to go: those too old, and the oldest of too many. Pure.
-
-    Args:
-        strangers: When each was first seen.
-        now: The same clock.
-    """
-    by_age = sorted(strangers, key=lambda peer: strangers[peer])
-    surplus = by_age[: max(0, len(by_age) - STRANGERS_LIMIT)]
-    return [
-        peer
-        for peer in by_age
-        if now - strangers[peer] >= (LEAST_AGE_S if peer in surplus else PATIENCE_S)
-    ]

@@ -299,8 +299,9 @@ class ZenohListener:
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
         ``malformed``, ``records``, ``records_refused``, ``records_older``, ``not_admitted``,
-        ``handshakes_refused``, ``unauthenticated``, ``revoked_links``, ``stuck_links``,
-        ``reply_dropped``, ``failed``, ``cancellations``, ``control_queries_dropped``.
+        ``handshakes_refused``, ``unauthenticated``, ``kept_out``, ``revoked_links``,
+        ``stuck_links``, ``reply_dropped``, ``failed``, ``cancellations``,
+        ``control_queries_dropped``.
         """
         return self._counters.snapshot()
 

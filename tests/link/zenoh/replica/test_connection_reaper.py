@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.zenoh.replica.connection_reaper import (
+from fogft.link.zenoh.replica.door import (
     LEAST_AGE_S,
     PATIENCE_S,
     STRANGERS_LIMIT,

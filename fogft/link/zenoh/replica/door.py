@@ -1,0 +1,90 @@
+"""Whom a replica's port accepts, and which strangers have to go. Pure: `now` is an argument.
+
+A stranger is who has connected and not said who he is: a robot in the midst of its handshake, or
+nobody that is wanted. Zenoh rests for 0.1 s after each handshake that fails, and all that come
+after wait for that. So few strangers are let in of each host, and they are ended one by one.
+
+Owns: the judgement. Not here: the sockets (`connection_reaper`, `listen_filter`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+
+from fogft.link.zenoh.sockets import Address
+
+# Longer than Zenoh takes to accept or give up a peer that talks.
+PATIENCE_S = 5.0
+STRANGERS_LIMIT = 16
+# Of one host: from then on nothing more of it is accepted.
+HOST_LIMIT = 8
+# Of all hosts that are let in still: from then on nothing is accepted.
+SHUT_LIMIT = 32
+# In a flood even the young have to go, but not one that may be in the middle of its handshake.
+LEAST_AGE_S = 0.5
+# A host is kept out for so long, where no robot there has a link.
+KEPT_OUT_S = 10.0
+# One at a time: longer than Zenoh's rest.
+END_EVERY_S = 0.12
+
+
+class Door:
+    """One port's. Its memory is bounded by the connections that there may be at once."""
+
+    def __init__(self) -> None:
+        self._first_seen: dict[Address, float] = {}
+        self._until: dict[str, float] = {}  # hosts that are kept out
+        self._ended_at = float("-inf")
+
+    def look(
+        self, strangers: Collection[Address], linked: Collection[Address], now: float
+    ) -> Address | None:
+        """Take who is connected; return the stranger that is to be ended now, if there is one.
+
+        Args:
+            linked: Whose links are authenticated.
+            now: Monotonic seconds.
+        """
+        self._first_seen = {peer: self._first_seen.get(peer, now) for peer in strangers}
+        known = {host for host, _ in linked}
+        self._until = {
+            host: until for host, until in self._until.items() if now < until and host not in known
+        }
+        self._until.update((host, now + KEPT_OUT_S) for host in full(strangers))
+        gone = condemned(self._first_seen, now)
+        if not gone or now - self._ended_at < END_EVERY_S:
+            return None
+        self._ended_at = now
+        return gone[0]
+
+    @property
+    def kept_out(self) -> frozenset[str] | None:
+        """Hosts of which nothing more is to be accepted; None for everybody."""
+        others = [host for host, _ in self._first_seen if host not in self._until]
+        return None if len(others) >= SHUT_LIMIT else frozenset(self._until)
+
+
+def full(strangers: Collection[Address]) -> set[str]:
+    """Return the hosts of which there are too many strangers."""
+    of_host = Counter(host for host, _ in strangers)
+    return {host for host, count in of_host.items() if count >= HOST_LIMIT}
+
+
+def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
+    """Return which strangers have to go, oldest first: who is too old, or one of too many.
+
+    Args:
+        strangers: When each was first seen.
+        now: The same clock.
+    """
+    by_age = sorted(strangers, key=lambda peer: strangers[peer])
+    surplus = set(by_age[: max(0, len(by_age) - STRANGERS_LIMIT)])
+    for host in full(strangers):  # who shares its address is to have a turn
+        of_host = [peer for peer in by_age if peer[0] == host]
+        surplus.update(of_host[: len(of_host) - HOST_LIMIT // 2])
+    return [
+        peer
+        for peer in by_age
+        if now - strangers[peer] >= (LEAST_AGE_S if peer in surplus else PATIENCE_S)
+    ]
