@@ -135,6 +135,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     """Return the error of an `up` that failed, with all that is known of the reason."""
     from fogft import logfile
     from fogft.pool.commands import composition, logs
+    from fogft.pool.commands.outcome import is_given_up
 
     status = seen.status
     silent = [service.name for service in status.services if not service.ready_replicas]
@@ -149,11 +150,10 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     label, path = found[-1] if status.proxy_alive else found[1]
     lines += [f"the end of the log of `{label}`:"]
     lines += [f"  {line}" for line in logfile.tail(path, lines=8).splitlines()]
-    return FogftError(
-        "\n".join(lines),
-        "the manager keeps trying: see `fogft status` and `fogft logs`; "
-        f"`fogft down {status.pool}` ends it",
-    )
+    tries = "the manager keeps trying: see `fogft status` and `fogft logs`"
+    if is_given_up(seen):
+        tries = "change the file and `fogft up` it again, or `fogft retry`; nothing costs money now"
+    return FogftError("\n".join(lines), f"{tries}; `fogft down {status.pool}` ends it")
 
 
 def down(

@@ -119,7 +119,12 @@ def notes(status: PoolStatus) -> list[Text]:
             )
     if status.excluded:
         found.append(f"excluded: {', '.join(status.excluded)}")
-    return [cell("note:", "bold cyan") + cell(f" {note}") for note in found]
+    lines: list[Text] = []
+    for note in found:  # a log's last lines stand below what they explain
+        first, *more = note.splitlines() or [""]
+        lines.append(cell("note:", "bold cyan") + cell(f" {first}"))
+        lines += [cell(f"  {line}") for line in more]
+    return lines
 
 
 def replicas(

@@ -74,6 +74,14 @@ def test_exclude_and_include(home, capsys):
     assert "is not excluded" in capsys.readouterr().err
 
 
+def test_retry_is_written_down(home, capsys):
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock):
+        assert main.run(["retry"]) == 0
+    assert "`planner` will launch replicas again" in capsys.readouterr().err
+    assert abs(wish(paths)["retried_at"] - time.time()) < 60
+
+
 @pytest.mark.parametrize(
     ("place", "hint"),
     [("us-west-2", "`local/us-west-2`"), ("local/us-west-9", "`local/us-west-2`")],

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from fogft.model.reason import Cause, Reason
 from fogft.planning.rollout import UpdateState
 from fogft.pool.commands.current import Seen
 from fogft.pool.commands.outcome import HOPELESS_RESTARTS, Awaited, Outcome, Settled
@@ -53,6 +54,14 @@ def updated(state: UpdateState | None, *, applied: str = "new", fault: str = "",
 )
 def test_a_pool_answers_once_every_service_does(status, expected):
     assert outcome(status) is expected
+
+
+def test_a_pool_that_gave_up_is_not_waited_for():
+    """Nothing that was launched is left, and nothing more is launched."""
+    status = replace(UP, services=SILENT, replicas=(), reasons=(Reason(Cause.NEVER_READY),))
+    assert outcome(status) is Outcome.NEVER_READY
+    assert outcome(replace(status, replicas=(STARTING,))) is Outcome.PENDING
+    assert outcome(replace(status, observed_at=9.0)) is Outcome.PENDING
 
 
 def test_a_schedule_that_asks_for_no_replica_is_no_failure():
