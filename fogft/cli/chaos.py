@@ -68,6 +68,9 @@ def thaw(slot: Slot, pool: PoolOption = None) -> None:
     """Let a frozen machine continue."""
     machine = _machine(pool, slot)
     count = _chaos().thaw(machine)
+    if not count:
+        output.say(f"replica `{machine.short}` was not frozen: nothing was done")
+        return
     output.done(f"replica `{machine.short}` continues ({count} processes)")
 
 

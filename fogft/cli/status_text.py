@@ -16,7 +16,13 @@ if TYPE_CHECKING:
     from fogft.pool.commands.current import Seen
     from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
 
-PHASES = {"provisioning": "yellow", "starting": "yellow", "ready": "green", "draining": "magenta"}
+PHASES = {
+    "provisioning": "yellow",
+    "starting": "yellow",
+    "ready": "green",
+    "draining": "magenta",
+    "unready": "bold red",
+}
 LINKS = {"up": "green", "connecting": "yellow", "suspect": "bold red"}
 REPLICA_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "LINK", "RTT", "WON", "AGE")
 STARTING_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "AGE")
@@ -27,6 +33,7 @@ SERVICE_COLUMNS = (
 RARE = ("FALLBACK", "UNANSWERED", "LATE", "WAITING")
 DETAIL = "DETAIL"
 UNKNOWN = "?"
+LOST = "unready"  # it has served, and does not now
 NUMBERS = ("$/H", "RTT", "WON", "AGE", *SERVICE_COLUMNS[1:])
 
 
@@ -154,9 +161,10 @@ def replicas(
 
 def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
     link = row.link or ("-" if links_known else UNKNOWN)
+    phase = LOST if row.phase == "starting" and row.has_served else row.phase
     return {
         "REPLICA": f"{row.slot}.{row.generation}",
-        "PHASE": cell(row.phase, PHASES.get(row.phase, "")) if row.known else UNKNOWN,
+        "PHASE": cell(phase, PHASES.get(phase, "")) if row.known else UNKNOWN,
         "LOCATION": row.location,
         "$/H": price(row.usd_per_hour).removeprefix("$"),
         "LINK": cell(link, LINKS.get(row.link, "dim")),

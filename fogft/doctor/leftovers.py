@@ -46,12 +46,11 @@ def orphaned_processes(situation: Situation) -> Iterator[Finding]:
     if not orphans:
         yield ok("leftovers", "no replicas without a pool")
         return
-    listed = " ".join(map(str, orphans[:20]))
     yield warn(
         "leftovers",
         f"{len(orphans)} processes of replicas run whose pool is not in `{situation.home}`",
-        "they end themselves after `orphan_after_s`. Is FOGFT_HOME the one that the pool was "
-        f"started with? If the pool is gone for good: `kill {listed}`",
+        "they belong to a pool of another state folder: with that in FOGFT_HOME `fogft list` shows "
+        "it and `fogft down` ends it. Where the folder is lost they end after `orphan_after_s`",
     )
 
 

@@ -130,6 +130,16 @@ def test_what_died_long_ago_is_not_shown_as_it_was(home, capsys):
     assert said.err.startswith("warning: no manager runs: nothing is replaced")
 
 
+def test_a_replica_that_has_served_is_not_starting(home, capsys):
+    """One that was frozen, or whose service died, is told from one that is still new."""
+    new = replace(STATUS.replicas[1], link="suspect")
+    paths = lay_down(home, replace(STATUS, replicas=(new, replace(new, slot=2, has_served=True))))
+    with alive(paths):
+        main.run(["status"])
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[3:5]]
+    assert [row[:2] for row in rows] == [["1.12", "starting"], ["2.12", "unready"]]
+
+
 def test_a_client_proxy_that_hangs_is_not_believed(home, capsys):
     """It lives, but its report is old: whether it answers is not known, and `--check` fails."""
     paths = lay_down(home)

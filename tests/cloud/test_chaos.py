@@ -113,7 +113,8 @@ def test_freeze_stops_every_process_and_thaw_lets_them_go_on(local, call):
     assert all(map(processes.stopped, processes.find(machine=str(machine.id))))
     assert not caller.echo(within_s=0.2)
     assert local.machine(machine.id).phase is MachinePhase.RUNNING, "the cloud sees no fault"
-    local.chaos.thaw(machine.id)
+    assert local.chaos.thaw(machine.id) > 0
+    assert local.chaos.thaw(machine.id) == 0, "nothing is frozen any more"
     assert caller.echo()
     assert not any(map(processes.stopped, processes.find(machine=str(machine.id))))
 

@@ -218,7 +218,7 @@ class MemoryLink:
         if listener is None:
             self._say(f"`{self._peer.endpoint}`: connection refused")
         elif listener.frozen:
-            self._say(f"`{self._peer.endpoint}` does not answer: frozen, blackholed or overloaded")
+            self._say(f"`{self._peer.endpoint}` does not answer yet")
         elif listener.certificate_name != self._peer.certificate_name:
             self._say(wrong_name(listener.certificate_name, self._peer))
         else:

@@ -62,11 +62,11 @@ class Chaos:
         return len(pids)
 
     def thaw(self, id: ReplicaId) -> int:
-        """Let a frozen machine go on (SIGCONT); return of how many processes it is."""
+        """Let a frozen machine go on (SIGCONT); return how many of its processes were frozen."""
         self._living(id)
-        pids = processes.find(machine=str(id))
-        processes.send(pids, signal.SIGCONT)
-        return len(pids)
+        frozen = [pid for pid in processes.find(machine=str(id)) if processes.stopped(pid)]
+        processes.send(frozen, signal.SIGCONT)
+        return len(frozen)
 
     def slow(
         self,

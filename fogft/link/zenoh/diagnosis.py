@@ -48,7 +48,7 @@ def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
     except ssl.SSLError as error:
         return _clock_words(error, peer, credentials, timeout_s) or _tls_words(error)
     except TimeoutError:
-        return f"`{peer.endpoint}` does not answer: frozen, blackholed or overloaded"
+        return f"`{peer.endpoint}` does not answer"
     except (OSError, ValueError) as error:
         words = getattr(error, "strerror", None) or str(error)
         return f"`{peer.endpoint}`: {words.lower()}"

@@ -55,6 +55,8 @@ class ReplicaStatus:
         differs: The type of a service is not the same there as here; `detail` says how.
         reason: Why the verdict is not ``good``, as ``{cause, ...}``; None when it is.
         known: Whether `phase` and `link` are known now; else `phase` is what was last seen.
+        has_served: Whether it was ready before: one that is ``starting`` then has lost its
+            service, or cannot be reached.
     """
 
     slot: int
@@ -77,6 +79,7 @@ class ReplicaStatus:
     differs: bool = False
     reason: Reason | None = None
     known: bool = True
+    has_served: bool = False
 
 
 @dataclass(frozen=True)
@@ -297,6 +300,7 @@ def _replica(
         age_s=max(0.0, now - launched_at),
         detail=_detail(one),
         reason=one.why,
+        has_served=record is not None and record.first_ready_at is not None,
     )
 
 

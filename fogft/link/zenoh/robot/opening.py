@@ -29,6 +29,7 @@ class Opening:
         self._peer = peer
         self._settings = settings
         self._timed_out = 0  # tries in a row
+        self._was_open = False
         self._explained_at = float("-inf")
 
     @property
@@ -43,6 +44,7 @@ class Opening:
     def done(self) -> None:
         """A try was well."""
         self._timed_out = 0
+        self._was_open = True
 
     def failed(self, took_s: float, now: float, credentials: CredentialPaths) -> str:
         """A try was not; return why, or nothing where that was looked for lately.
@@ -56,7 +58,9 @@ class Opening:
         if interface and interface not in {name for _, name in socket.if_nameindex()}:
             return f"there is no network interface `{interface}` here"
         if took_s >= self._settings.open_timeout_s * _NEARLY:
-            return f"`{self._peer.endpoint}` does not answer: frozen, blackholed or overloaded"
+            if self._was_open:
+                return f"`{self._peer.endpoint}` no longer answers: frozen, cut off or overloaded"
+            return f"`{self._peer.endpoint}` does not answer yet"
         if now - self._explained_at < _EXPLAIN_EVERY_S:
             return ""
         self._explained_at = now

@@ -45,6 +45,15 @@ def test_words_are_looked_for_once_in_five_seconds(monkeypatch: pytest.MonkeyPat
     assert said == ["refused", "", "", "refused", ""]
 
 
+def test_a_replica_that_was_never_reached_is_not_called_frozen() -> None:
+    """A machine that still starts answers nobody: that says nothing of what is wrong with it."""
+    opening = Opening(peer("10.0.0.1:1"), SETTINGS)
+    assert opening.failed(1.0, 0.0, CREDENTIALS) == "`10.0.0.1:1` does not answer yet"
+    opening.done()
+    said = opening.failed(1.0, 0.0, CREDENTIALS)
+    assert said == "`10.0.0.1:1` no longer answers: frozen, cut off or overloaded"
+
+
 def test_an_interface_that_is_not_there_is_named() -> None:
     opening = Opening(replace(peer("10.0.0.1:1"), interface="no-such"), SETTINGS)
     assert "`no-such`" in opening.failed(0.01, 0.0, CREDENTIALS)
