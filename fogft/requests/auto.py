@@ -259,9 +259,9 @@ class Auto(Choose):
             if expired:
                 known.doubt(begun, now)
 
-    def came(self, replica: int) -> None:
-        """Its link is new: forget what was on the way there."""
-        self._of(replica).came()
+    def forget(self, replica: int) -> None:
+        """Forget what was on the way there."""
+        self._of(replica).forget()
         for copies in (self._spares.open, self._beaten):
             for key in [key for key in copies if key[1] == replica]:
                 del copies[key]

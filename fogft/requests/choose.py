@@ -67,8 +67,8 @@ class Choose:
     ) -> None:
         """A request ended without these: its deadline came, or it was answered otherwise."""
 
-    def came(self, replica: int) -> None:
-        """A replica's link is new, or was opened again."""
+    def forget(self, replica: int) -> None:
+        """A replica's link is new, or gone: of what was on the way there nothing more is heard."""
 
     def report(self) -> dict[str, Any]:
         """Return what the policy has learned, for people."""
@@ -187,9 +187,9 @@ class Failover(Choose):
         if expired and self._current in open:
             self._failed = True
 
-    def came(self, replica: int) -> None:
+    def forget(self, replica: int) -> None:
         """Forget what was on the way."""
-        self._of(replica).came()
+        self._of(replica).forget()
 
     def report(self) -> dict[str, Any]:
         """Return how often the replica changed, and how often another was asked as well."""

@@ -202,7 +202,7 @@ class ReplicaLoad:
             self.doubted = True
         return self.doubted
 
-    def came(self) -> None:
-        """Its link is new: nothing is on the way, and what was doubted is over."""
+    def forget(self) -> None:
+        """Its link is new, or gone: nothing is on the way, and what was doubted is over."""
         self._at_work.clear()
         self.doubted = False

@@ -159,7 +159,12 @@ class PendingRequests(Generic[T]):
         """These replicas can be asked (again)."""
         for replica in replicas:
             self._table.came(replica)
-            self.choose.came(replica)
+            self.choose.forget(replica)
+
+    def left(self, replicas: Iterable[int]) -> None:
+        """These replicas cannot be asked for now."""
+        for replica in replicas:
+            self.choose.forget(replica)
 
     def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
         """A replica has begun anew what some requests are about: what it said before is void."""

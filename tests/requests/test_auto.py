@@ -252,10 +252,20 @@ def test_a_burst_does_not_queue_at_one_replica():
 def test_a_link_that_was_opened_again_has_nothing_on_the_way():
     policy = learned(r1=0.1, r2=0.1)
     policy.first(A, (1, 2), 31.0)
-    policy.came(1)
-    policy.came(2)
+    policy.forget(1)
+    policy.forget(2)
     assert len(policy.first(B, (1, 2), 31.01)) == 2
     assert not policy.is_spare(A, 2)
+
+
+def test_spares_at_a_replica_that_is_gone_are_not_blamed_for_ever():
+    policy = learned(r1=0.1, r2=0.1)
+    first, other = policy.first(A, (1, 2), 31.0)
+    policy.answered(A, {1: 31.0, 2: 31.0}, first, idle(0.1), 31.1)
+    policy.forget(other)
+    for n in range(20):
+        policy.first(bytes([n]) * 16, (first,), 31.2)
+    assert policy.report()["spare_share"] == 1.0
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2), st.booleans()), max_size=200))

@@ -76,6 +76,7 @@ class Sender:
         replication, now = self._replication, self._ledger.clock()
         with self._ledger.lock:
             added = [key for key, link in routed.items() if self.links.get(key) is not link]
+            self._ledger.requests.left(self.links.keys() - routed.keys())
             self.links = routed
             if replication is None or not replication.sends_requests:
                 self.able = tuple(routed)
