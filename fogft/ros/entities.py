@@ -17,7 +17,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.log_limits import worth_logging
-from fogft.ros.pacing import Pacer
+from fogft.ros.pacing import Pacer, Probes
 from fogft.ros.port import OnBurst
 from fogft.ros.transfer import ClientEnd, ServiceEnd
 
@@ -48,7 +48,9 @@ class Server:
         end: ServiceEnd,
         on_request: Callable[[bytes, Any], None],
         withdraw: Callable[[Server], None],
+        *,
         on_burst: OnBurst | None = None,
+        probes: Probes | None = None,
     ) -> None:
         self.handle = service.handle
         self._service = service
@@ -60,7 +62,7 @@ class Server:
         self._unreadable = _Unreadable(service.srv_name)
         self._in_bursts = False  # several came together the last time
         self._lock = threading.Lock()
-        self._pacer = Pacer(self._send)
+        self._pacer = Pacer(self._send, probes)
 
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send the serialised response; in a burst, when the client can bear it."""
@@ -81,6 +83,7 @@ class Server:
         Where requests came one at a time lately, the first does not wait until ROS was asked for
         another one: it takes no part in a burst that begins with it.
         """
+        together = not self._in_bursts  # the second that is taken comes right after the first
         taken = self._next()
         if taken is not None and not self._in_bursts:
             self._deliver(taken)
@@ -90,17 +93,17 @@ class Server:
         following = self._next()
         self._in_bursts = following is not None
         if following is None:
-            self._deliver(taken)
+            self._deliver(taken, together=together)
             return
         self._tell_burst(True)
         try:
-            self._deliver(taken)
+            self._deliver(taken, together=together)
             for _ in range(BURST - 2):
-                self._deliver(following)
+                self._deliver(following, together=True)
                 following = self._next()
                 if following is None:
                     return
-            self._deliver(following)
+            self._deliver(following, together=True)
         finally:
             self._tell_burst(False)
 
@@ -111,8 +114,8 @@ class Server:
             self._unreadable(error)
             return None
 
-    def _deliver(self, taken: tuple[bytes, Any]) -> None:
-        self._pacer.requested(taken[1])
+    def _deliver(self, taken: tuple[bytes, Any], *, together: bool = False) -> None:
+        self._pacer.requested(taken[1], together=together)
         try:
             self._on_request(*taken)
         except Exception:

@@ -20,6 +20,7 @@ from fogft.errors import RosError
 from fogft.model import ros_names
 from fogft.model.topic import Quality
 from fogft.ros import topic_ends, transfer
+from fogft.ros.client_probes import NodeProbes, ServiceProbes
 from fogft.ros.entities import Client, Server
 from fogft.ros.port import OnBurst
 from fogft.ros.topic_ends import Publisher, Reader, Subscription
@@ -59,6 +60,7 @@ class SerialisedNode:
         self._stopping = False
         self._ended = threading.Event()
         self._visible: VisibleNode | None = None
+        self._probes = NodeProbes(self)
         try:
             self._start_ros(name, domain_id)
         except ImportError as error:
@@ -129,7 +131,10 @@ class SerialisedNode:
             )
             try:
                 end = ends.service(service, service_type)
-                return Server(service, end, on_request, self._withdraw, on_burst)
+                probes = ServiceProbes(service.service_name, self._probes)
+                return Server(
+                    service, end, on_request, self._withdraw, on_burst=on_burst, probes=probes
+                )
             except BaseException:
                 self._node.destroy_service(service)
                 raise
@@ -212,14 +217,37 @@ class SerialisedNode:
         for name, namespace in nodes:
             if name.startswith(_NOT_APPLICATIONS):
                 continue
-            try:
-                services = self._node.get_service_names_and_types_by_node(name, namespace)
-            except Exception:  # the node has gone since
-                continue
-            for service, kinds in services:
+            for service, kinds in self._services_of(name, namespace):
                 if kinds and ros_names.is_of_application(service, kinds[0]):
                     found.setdefault(service, kinds[0])
         return found
+
+    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
+        """Return name and namespace of the node that a client of a service belongs to.
+
+        Args:
+            service: Its absolute name.
+            client: The first 16 bytes of a request's handle: the reader of its responses.
+        """
+        find: Any = self._node.get_subscriptions_info_by_topic
+        try:
+            readers = find(f"rr{service}Reply", no_mangle=True)
+        except Exception:  # rclpy's InvalidHandle: closed meanwhile
+            return None
+        for reader in readers:
+            if bytes(reader.endpoint_gid)[: len(client)] == client:
+                return reader.node_name, reader.node_namespace
+        return None
+
+    def services_of(self, name: str, namespace: str) -> list[str]:
+        """Return the names of a node's services, as discovery knows them; empty if it is gone."""
+        return [service for service, _ in self._services_of(name, namespace)]
+
+    def _services_of(self, name: str, namespace: str) -> Any:
+        try:
+            return self._node.get_service_names_and_types_by_node(name, namespace)
+        except Exception:  # the node has gone since
+            return []
 
     def _ends(self, type_name: str) -> tuple[Any, transfer.Ends]:
         """Return a service type, and how its bytes travel, which is found out once."""

@@ -1,15 +1,14 @@
-"""Send responses no faster than an ordinary ROS client's queue can take.
+"""Send responses no faster than their clients take them.
 
 An ordinary ROS client keeps the last ten responses that it has not taken yet and silently
 loses more. A service answers one request after another, but a proxy answers in bursts: all
-that a failover held up, at once. Nobody tells how deep a client's queue is or whether it
-takes, but a client that asks again after it was answered does. So `WINDOW` responses may be
-on their way to a client; each request of one that has no more open than it usually has, or
-else each `EVERY_S`, makes room for another. A client that proves quick gets a wider window.
+that a failover held up, at once. So what a client's queue has no room for waits here.
 
-A response to a client that discovery has not found yet is sent again until it has.
+A client that discovery has not found yet gets its first response again until it has; the others
+wait behind it.
 
-Owns: when a response is sent. Not here: sending it (`entities`).
+Owns: the responses that wait, and the thread that sends them. Not here: when one may be sent
+(`pace`), sending it (`entities`), asking a client's node (`client_probes`).
 """
 
 from __future__ import annotations
@@ -17,98 +16,40 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
 from fogft.errors import RosError
+from fogft.ros.pace import EVERY_S, ClientPace, Pace, Probing
 from fogft.ros.port import NotFoundYet
 
 log = logging.getLogger(__name__)
 
-WINDOW = 5  # of the ten in rmw_qos_profile_services_default
-WINDOW_LIMIT = 64
-# What waits for one client; what comes beyond is sent at once, as a fast service would.
-WAITING_LIMIT, WAITING_BYTES_LIMIT = 1024, 64 << 20
-EVERY_S = 0.005  # so a burst may meet a client that takes nothing for 25 ms
-_QUIET_S = 0.05  # after so long without a request a client must prove anew that it is quick
-_USUAL_GROWS = 4  # each `EVERY_S`, and by a twentieth of what is open: faster is a burst
-_CLIENTS_KEPT = 64
-# A client may ask before discovery has told the way back to it. ROS waits 0.1 s a try.
-_FIND_LIMIT_S = 10.0
+_ASK_EVERY_S, _ASK_LIMIT_S = 0.02, 1.0  # whether a node answers probes
+_LOOK_EVERY_S = 0.2
 _GUID_BYTES = 16
 
 
-class Pace:
-    """One client: how many responses it may not have taken yet. Pure; seconds come in."""
+class Probes(Protocol):
+    """How a service learns that a client's executor has had a turn."""
 
-    def __init__(self, now: float) -> None:
-        self.waiting: deque[tuple[Any, bytes]] = deque()
-        self._waiting_bytes = 0
-        self._open = 0  # asked and not answered; one that is never answered stays: no harm
-        self._usual = WINDOW  # no more open than this is nothing new
-        self._untaken = 0
-        self._window = WINDOW
-        self._proofs = 0
-        self._refilled_at = self._grown_at = now
-        self.asked_at = now
+    def answers(self, client: bytes) -> bool | None:
+        """Whether the client's node answers probes; None while discovery does not tell."""
 
-    def requested(self, now: float) -> None:
-        """Note a request. Where it takes the place of another, that one's response was taken."""
-        self._refill(now)
-        if now - self.asked_at > _QUIET_S:
-            self._window, self._proofs, self._usual = WINDOW, 0, WINDOW
-        if self._open == 0:
-            self._usual = min(self._usual, WINDOW)
-        self.asked_at = now
-        self._open += 1
-        if self._open > self._usual:
-            # It only asks for more, and who asks in a burst does not take meanwhile.
-            self._proofs, self._refilled_at = 0, now
-        elif self._untaken:
-            self._untaken -= 1
-            self._proofs += 1
-            if self._proofs >= 4 * self._window:
-                self._window, self._proofs = min(2 * self._window, WINDOW_LIMIT), 0
+    def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
+        """Send a probe; `on_answer` comes from the take loop, or never."""
 
-    def hold(self, handle: Any, payload: bytes) -> bool:
-        """Have a response wait; False where too much waits already."""
-        whole = self._waiting_bytes + len(payload)
-        if self.waiting and (len(self.waiting) >= WAITING_LIMIT or whole > WAITING_BYTES_LIMIT):
-            return False
-        self._waiting_bytes = whole
-        self.waiting.append((handle, payload))
-        return True
 
-    def next(self) -> tuple[Any, bytes]:
-        """Return the response that waited for longest."""
-        handle, payload = self.waiting.popleft()
-        self._waiting_bytes -= len(payload)
-        return handle, payload
+class NoProbes:
+    """No client's node answers."""
 
-    def take(self, now: float) -> bool:
-        """Whether a response may be sent now; if so, it counts as sent."""
-        self._refill(now)
-        if self._untaken >= self._window:
-            return False
-        self._untaken += 1
-        self._open = max(self._open - 1, 0)
-        return True
+    def answers(self, client: bytes) -> bool | None:
+        """Return that it does not."""
+        return False
 
-    def wait_s(self, now: float) -> float:
-        """Return how long until there is room, should no request come."""
-        return max(self._refilled_at + EVERY_S - now, 0.0)
-
-    def _refill(self, now: float) -> None:
-        steps = int((now - self._refilled_at) / EVERY_S)
-        if steps > 0:
-            self._refilled_at += steps * EVERY_S
-            self._untaken = max(self._untaken - steps, 0)
-        steps = int((now - self._grown_at) / EVERY_S)
-        if steps > 0:
-            self._grown_at += steps * EVERY_S
-            grown = self._usual + steps * (_USUAL_GROWS + self._open // 20)
-            self._usual = max(self._usual, min(grown, self._open + self._open // 4))
+    def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
+        """Do nothing."""
 
 
 class Pacer:
@@ -116,33 +57,41 @@ class Pacer:
 
     Args:
         send: Sends a response; may raise RosError.
+        probes: Asks the clients' nodes.
     """
 
     def __init__(
-        self, send: Callable[[Any, bytes], None], clock: Callable[[], float] = time.monotonic
+        self,
+        send: Callable[[Any, bytes], None],
+        probes: Probes | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._send = send
+        self._probes = probes or NoProbes()
         self._clock = clock
-        self._paces: dict[bytes, Pace] = {}
-        self._held: dict[bytes, Pace] = {}  # those whose responses wait
-        self._again: list[tuple[Any, bytes, float]] = []  # with when to give up
+        self._pace = Pace()
+        self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
+        self._asked: dict[bytes, float] = {}  # those whose nodes may answer probes: until when
         self._wake = threading.Condition()
-        self._thread: threading.Thread | None = None  # made when the first response waits
+        self._thread: threading.Thread | None = None  # made when there is something to wait for
         self._closed = False
 
     @property
     def clients(self) -> int:
         """How many clients are remembered."""
-        return len(self._paces)
+        return len(self._pace.clients)
 
-    def requested(self, handle: Any) -> None:
-        """Note a request as it is taken."""
+    def requested(self, handle: Any, *, together: bool = False) -> None:
+        """Note a request as it is taken; `together` with the one before it."""
         now = self._clock()
-        client = _client(handle)
+        id = _client(handle)
         with self._wake:
-            pace = self._paces.get(client) or self._new(client, now)
-            pace.requested(now)
-            if pace.waiting:
+            client = self._pace.client(id, now)
+            client.requested(now, together=together)
+            if client.probing is Probing.ASKED and id not in self._asked:
+                self._asked[id] = now + _ASK_LIMIT_S
+                self._begin()
+            elif client.waiting:
                 self._wake.notify()
 
     def respond(self, handle: Any, payload: bytes) -> None:
@@ -152,38 +101,31 @@ class Pacer:
             RosError: It was sent now, and ROS refused it.
         """
         now = self._clock()
-        client = _client(handle)
+        id = _client(handle)
         with self._wake:
-            pace = self._paces.get(client) or self._new(client, now)
-            if (pace.waiting or not pace.take(now)) and pace.hold(handle, payload):
-                self._held[client] = pace
-                self._begin()
-                return
-        self.try_now(handle, payload, now + _FIND_LIMIT_S)
+            client = self._pace.client(id, now)
+            if client.waiting or client.finding_until or not self._pace.take(client, now):
+                if client.hold(handle, payload):
+                    self._held[id] = client
+                    self._begin()
+                    return
+                self._pace.send(client)
+        self._try(id, client, handle, payload)
 
-    def try_now(self, handle: Any, payload: bytes, give_up_at: float) -> None:
-        """Send now; once more later if the client is not found yet, until a time.
-
-        Raises:
-            NotFoundYet: It was not found in time.
-        """
+    def _try(self, id: bytes, client: ClientPace, handle: Any, payload: bytes) -> None:
+        """Send now; have it wait if the client is not found yet. Raises RosError."""
         try:
             self._send(handle, payload)
         except NotFoundYet:
-            if self._clock() >= give_up_at:
-                raise
+            now = self._clock()
             with self._wake:
-                self._again.append((handle, payload, give_up_at))
-                self._begin()
-
-    def _new(self, client: bytes, now: float) -> Pace:
-        if len(self._paces) >= _CLIENTS_KEPT:
-            idle = [c for c, p in self._paces.items() if not p.waiting]
-            idle.sort(key=lambda c: self._paces[c].asked_at)
-            for gone in idle[: _CLIENTS_KEPT // 2]:
-                del self._paces[gone]
-        pace = self._paces[client] = Pace(now)
-        return pace
+                if client.finding_until is None or now < client.finding_until:
+                    client.not_found(handle, payload, now)
+                    self._held[id] = client
+                    self._begin()
+                    return
+            raise
+        client.finding_until = None
 
     def _begin(self) -> None:
         if self._thread is None:
@@ -194,29 +136,70 @@ class Pacer:
     def _run(self) -> None:
         while True:
             with self._wake:
-                if self._again and not self._closed:
-                    self._wake.wait(EVERY_S)
-                while not (due := self._due()) and not self._closed:
-                    now = self._clock()
-                    waits = [pace.wait_s(now) for pace in self._held.values()]
-                    self._wake.wait(min(waits, default=None))
+                due, probed, wait_s = self._step(self._clock())
+                if not due and not probed and not self._closed:
+                    self._wake.wait(wait_s)
+                    due, probed, wait_s = self._step(self._clock())
+                asked = list(self._asked)
                 if self._closed:
                     return
-            for handle, payload, give_up_at in due:
+            for id, client, handle, payload in due:
                 try:
-                    self.try_now(handle, payload, give_up_at)
+                    self._try(id, client, handle, payload)
                 except RosError as error:
                     log.warning("response_refused reason=%r", error.message)
+            for id, count in probed:
+                for _ in range(count):
+                    self._probes.send(id, partial(self._answered, id))
+            for id in asked:
+                self._ask(id)
 
-    def _due(self) -> list[tuple[Any, bytes, float]]:
+    def _step(
+        self, now: float
+    ) -> tuple[list[tuple[bytes, ClientPace, Any, bytes]], list[tuple[bytes, int]], float | None]:
+        """Return what to send now, whom to probe how often, and how long to wait if nothing."""
+        due: list[tuple[bytes, ClientPace, Any, bytes]] = []
+        in_the_way: dict[bytes, ClientPace] = {}
+        for id, client in list(self._held.items()):
+            finding = client.finding_until is not None
+            if finding and now < client.find_again_at:
+                continue
+            while client.waiting and self._pace.take(client, now):
+                due.append((id, client, *client.next()))
+                if finding:
+                    break
+            if client.waiting:
+                in_the_way.update(self._pace.in_the_way(client, now))
+            else:
+                del self._held[id]
+        probed = []
+        for id, client in in_the_way.items():
+            count = client.probes_due(now, self._pace.sent)
+            if count:
+                probed.append((id, count))
+        if self._asked:
+            return due, probed, _ASK_EVERY_S
+        by_time = any(not client.strict for client in in_the_way.values())
+        if by_time or any(client.finding_until for client in self._held.values()):
+            return due, probed, EVERY_S
+        return due, probed, _LOOK_EVERY_S if self._held else None
+
+    def _ask(self, id: bytes) -> None:
+        """Find out whether a client's node answers probes."""
+        answers = self._probes.answers(id)
         now = self._clock()
-        due, self._again = self._again, []
-        for client, pace in list(self._held.items()):
-            while pace.waiting and pace.take(now):
-                due.append((*pace.next(), now + _FIND_LIMIT_S))
-            if not pace.waiting:
-                del self._held[client]
-        return due
+        with self._wake:
+            until = self._asked.get(id, now)
+            if answers is None and now < until:
+                return
+            self._asked.pop(id, None)
+            self._pace.client(id, now).probing = Probing.YES if answers else Probing.NO
+
+    def _answered(self, id: bytes) -> None:
+        now = self._clock()
+        with self._wake:
+            self._pace.client(id, now).answered_probe(now)
+            self._wake.notify()
 
     def close(self) -> None:
         """Send no more; what waits is dropped. Repeatable."""

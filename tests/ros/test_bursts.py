@@ -43,7 +43,7 @@ def serving(waiting: list[Any], heard: list[Any], fails: bool = False) -> Server
         if fails:
             raise ValueError("of the application")
 
-    return Server(Service(), End(waiting), on_request, lambda server: None, heard.append)
+    return Server(Service(), End(waiting), on_request, lambda server: None, on_burst=heard.append)
 
 
 def numbered(count: int) -> list[tuple[bytes, bytes]]:

@@ -2,29 +2,157 @@
 
 from __future__ import annotations
 
+import random
 import threading
+import time
+from collections import deque
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import RosError
-from fogft.ros.pacing import (
+from fogft.ros.pace import (
     EVERY_S,
+    PROBED_WINDOW,
+    QUEUE,
     WAITING_BYTES_LIMIT,
     WAITING_LIMIT,
     WINDOW,
     WINDOW_LIMIT,
+    ClientPace,
     Pace,
-    Pacer,
+    Probing,
 )
+from fogft.ros.pacing import Pacer
 from fogft.ros.port import NotFoundYet
+from tests.nightly import by_day
 
-ORDINARY = 10  # responses that a client with the default quality of service keeps
+
+class Probed:
+    """An ordinary client whose node answers probes: a turn takes one response, answers one probe.
+
+    A service's responses go into every client's queue, which keeps the last ten.
+    """
+
+    def __init__(self, pace: Pace, id: bytes, *, answers_first: bool) -> None:
+        self.pace = pace.client(id, 0.0)
+        self.pace.probing = Probing.YES
+        self.id = id
+        self.answers_first = answers_first  # as C++ executors do
+        self.queue: deque[tuple[bytes, int]] = deque(maxlen=QUEUE)
+        self.probes = 0
+        self.answered: set[int] = set()
+
+    def turn(self, now: float) -> None:
+        if self.answers_first:
+            self.answer(now)
+        if self.queue:
+            id, number = self.queue.popleft()
+            if id == self.id:
+                self.answered.add(number)
+        if not self.answers_first:
+            self.answer(now)
+
+    def answer(self, now: float) -> None:
+        if self.probes:
+            self.probes -= 1
+            self.pace.answered_probe(now)
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    counts=st.lists(st.integers(1, by_day(60, at_night=300)), min_size=1, max_size=4),
+    answers_first=st.booleans(),
+    slow=st.sampled_from([0.0, 0.5, 0.9]),
+)
+def test_a_client_whose_node_answers_probes_loses_nothing(seed, counts, answers_first, slow):
+    """Whatever it asks at once, however slowly it takes, and whoever else calls the service."""
+    chance, now, pace = random.Random(seed), 0.0, Pace()
+    clients = [
+        Probed(pace, bytes([n]) * 16, answers_first=answers_first) for n in range(len(counts))
+    ]
+    waiting = []
+    for client, count in zip(clients, counts, strict=True):
+        for number in range(count):
+            client.pace.requested(now)
+            waiting.append((client, number))
+    chance.shuffle(waiting)
+    while waiting:
+        assert now < 60.0, "what waits is not sent"
+        now += 1e-4
+        client, number = waiting[0]
+        if pace.take(client.pace, now):
+            for each in clients:
+                each.queue.append((client.id, number))
+            waiting.pop(0)
+        else:
+            for id, other in pace.in_the_way(client.pace, now):
+                clients[id[0]].probes += other.probes_due(now, pace.sent)
+        if chance.random() >= slow:
+            chance.choice(clients).turn(now)
+    for client in clients:
+        for _ in range(QUEUE):
+            client.turn(now)
+    assert [len(client.answered) for client in clients] == counts
+
+
+def test_who_does_not_take_gets_no_more_than_its_queue_holds():
+    """It is held up, in a callback of ten seconds: no answer to a probe, no response."""
+    pace = Pace()
+    client = pace.client(b"c", 0.0)
+    client.probing = Probing.YES
+    for _ in range(100):
+        client.requested(0.0)
+    sent = sum(pace.take(client, n / 100) for n in range(1000))
+    assert sent == PROBED_WINDOW < QUEUE
+    assert client.probes_due(10.0, pace.sent)
+    assert not client.probes_due(10.1, pace.sent)
+    assert client.probes_due(11.5, pace.sent), "the first were lost"
+
+
+def test_who_answers_no_probe_holds_up_nobody_else_for_long():
+    pace = Pace()
+    dead, other = pace.client(b"d", 0.0), pace.client(b"o", 0.0)
+    dead.probing = other.probing = Probing.YES
+    for client in (dead, other):
+        for _ in range(20):
+            client.requested(0.0)
+    while pace.take(dead, 0.0):
+        pass
+    assert not pace.take(other, 0.0)
+    assert [id for id, _ in pace.in_the_way(other, 0.0)] == [b"d"]
+    dead.probes_due(0.0, pace.sent)
+    assert not pace.take(other, 0.1)
+    assert pace.take(other, 0.3)
+    assert not pace.take(dead, 29.0)
+
+
+def test_a_lone_caller_is_never_probed():
+    """Its next request shows that it took the last response."""
+    pace = Pace()
+    for n in range(1000):
+        client = pace.client(b"c", n * 1e-4)
+        client.requested(n * 1e-4)
+        assert pace.take(client, n * 1e-4)
+    assert client.probing is Probing.UNASKED
+
+
+class Alone:
+    """The only client of a service, whose node answers no probes."""
+
+    def __init__(self) -> None:
+        self.service = Pace()
+        self.client: ClientPace = self.service.client(b"c", 0.0)
+        self.client.probing = Probing.NO
+        self.requested = self.client.requested
+
+    def take(self, now: float) -> bool:
+        return self.service.take(self.client, now)
 
 
 def test_a_burst_is_answered_a_window_at_once_and_then_one_by_one():
-    pace = Pace(0.0)
+    pace = Alone()
     for n in range(200):
         pace.requested(n * 1e-5)
     now, sent = 0.002, 0
@@ -45,7 +173,7 @@ def test_a_client_that_takes_nothing_while_it_asks_never_overflows(
     bursts, pauses, latency, spacing
 ):
     """It asks in bursts and takes one a millisecond otherwise; answers come slower than it asks."""
-    now, pace, untaken = 0.0, Pace(0.0), 0
+    now, pace, untaken = 0.0, Alone(), 0
     asked: list[float] = []
 
     def answer(most: int = 1000) -> int:
@@ -62,19 +190,19 @@ def test_a_client_that_takes_nothing_while_it_asks_never_overflows(
             now += spacing
             if n % 2:
                 untaken += answer(1)
-            assert untaken <= ORDINARY
+            assert untaken <= QUEUE
         while asked or untaken:
             untaken = max(untaken - 1, 0)
             now += 0.001
             untaken += answer()
-            assert untaken <= ORDINARY
+            assert untaken <= QUEUE
         now += pauses
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 9, 64])
 def test_a_client_that_asks_again_for_each_answer_is_hardly_held_up(at_once):
     """A caller in a closed loop, however fast, waits only until what it has open is usual."""
-    now, pace, waits = 0.0, Pace(0.0), 0
+    now, pace, waits = 0.0, Alone(), 0
     for _ in range(at_once):
         pace.requested(now)
     for _ in range(5000):
@@ -87,7 +215,7 @@ def test_a_client_that_asks_again_for_each_answer_is_hardly_held_up(at_once):
 
 
 def test_a_client_that_proved_quick_must_prove_it_again_after_a_pause():
-    pace = Pace(0.0)
+    pace = Alone()
     now = 0.0
     for _ in range(1000):
         pace.requested(now)
@@ -101,7 +229,7 @@ def test_a_client_that_proved_quick_must_prove_it_again_after_a_pause():
 
 def test_a_client_that_asks_more_than_is_answered_is_not_starved():
     """It asks five thousand times a second for long, and takes: that is no burst, but its use."""
-    now, pace, sent = 0.0, Pace(0.0), 0
+    now, pace, sent = 0.0, Alone(), 0
     for n in range(10_000):
         pace.requested(now)
         now += 2e-4
@@ -200,15 +328,44 @@ def test_a_response_to_a_client_that_is_not_found_yet_is_sent_again():
     assert sorted(sent) == [b"early", b"other"]
 
 
-def test_a_client_that_is_never_found_is_given_up():
-    """And whoever wants to know is told."""
-    now = 0.0
+def test_a_client_that_is_never_found_is_given_up(caplog):
+    """What waited for it goes after a while, each with a line in the log."""
+    now, refused = 0.0, threading.Event()
 
     def send(handle: bytes, payload: bytes) -> None:
         nonlocal now
-        now += 1.0
+        now += 11.0
+        if payload == b"2":
+            refused.set()
         raise NotFoundYet("client will not receive response")
 
-    pacer = Pacer(send, clock=lambda: now)
-    with pytest.raises(NotFoundYet):
-        pacer.try_now(bytes(24), b"early", 0.5)
+    pacer = Pacer(send, clock=lambda: now + time.monotonic())
+    pacer.respond(bytes(24), b"1")
+    pacer.respond(bytes(24), b"2")
+    assert refused.wait(30)
+    pacer.close()
+    assert "response_refused" in caplog.text
+
+
+def test_what_waits_for_a_client_to_be_found_does_not_come_all_at_once():
+    """It was asked 64 times before discovery had found it, and keeps ten like any other."""
+    tries, sent, all_sent = 0, [], threading.Event()
+
+    def send(handle: bytes, payload: bytes) -> None:
+        nonlocal tries
+        tries += 1
+        if tries < 5:
+            assert payload == b"0"
+            raise NotFoundYet("client will not receive response")
+        sent.append(time.monotonic())
+        if len(sent) == 64:
+            all_sent.set()
+
+    pacer = Pacer(send)
+    for n in range(64):
+        pacer.requested(handle(1, n))
+    for n in range(64):
+        pacer.respond(handle(1, n), b"%d" % n)
+    assert all_sent.wait(30)
+    pacer.close()
+    assert all(n <= WINDOW + (at - sent[0]) / EVERY_S + 1 for n, at in enumerate(sent))

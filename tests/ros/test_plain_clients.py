@@ -1,0 +1,91 @@
+"""A client with ROS's default settings loses no response, whatever it asks at once.
+
+It keeps ten that it has not taken: an ordinary service would lose most of these. The answers come
+a millisecond after the requests, as replicas' do. Real rclpy clients, in processes of their own.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import pytest
+
+from fogft.ros.node import SerialisedNode
+from fogft.ros.types import default_response
+
+pytestmark = pytest.mark.ros
+
+TYPE = "std_srvs/srv/SetBool"
+PROGRAM = str(Path(__file__).with_name("plain_client.py"))
+
+
+@pytest.fixture
+def service(ros_domain: int) -> Iterator[None]:
+    """Offer ``/burst``, as a proxy does."""
+    node = SerialisedNode("fogft_burst", ros_domain)
+    response = default_response(TYPE)
+    waiting: SimpleQueue[Any] = SimpleQueue()
+    server = node.serve("/burst", TYPE, lambda _, handle: waiting.put(handle))
+
+    def answer() -> None:
+        while (handle := waiting.get()) is not None:
+            time.sleep(0.001)
+            server.respond(handle, response)
+
+    answering = threading.Thread(target=answer, daemon=True)
+    answering.start()
+    yield
+    waiting.put(None)
+    answering.join(30)
+    node.close()
+
+
+@pytest.fixture
+def call(ros_domain: int) -> Callable[..., list[int]]:
+    """Return what runs clients in the service's domain."""
+    return partial(answers, ros_domain)
+
+
+def answers(domain: int, *clients: tuple[int, float, int]) -> list[int]:
+    """Run clients beside each other; return how many answers each got."""
+    started = [
+        subprocess.Popen(
+            [sys.executable, PROGRAM, f"plain_{n}", *map(str, client)],
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for n, client in enumerate(clients)
+    ]
+    assert all(one.stdout.readline() == "ready\n" for one in started)
+    time.sleep(1.0)
+    for one in started:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    return [int(one.communicate(timeout=120)[0]) for one in started]
+
+
+@pytest.mark.parametrize(
+    ("count", "callback_s", "rounds"), [(50, 0.0, 10), (200, 0.03, 1), (1000, 0.0, 2)]
+)
+@pytest.mark.usefixtures("service")
+def test_a_burst_of_requests_loses_none(
+    call: Callable[..., list[int]], count: int, callback_s: float, rounds: int
+) -> None:
+    assert call((count, callback_s, rounds)) == [count * rounds]
+
+
+@pytest.mark.usefixtures("service")
+def test_two_clients_of_one_service_lose_none(call: Callable[..., list[int]]) -> None:
+    """They share its topic of responses: a burst of one fills the other's queue, too."""
+    assert call((50, 0.0, 10), (10, 0.005, 20)) == [500, 200]
