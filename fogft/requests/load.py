@@ -68,7 +68,8 @@ class ReplicaLoad:
     """
 
     __slots__ = (
-        *("_at_work", "_avoided_s", "_avoided_until", "_others", "_others_until", "_rtt_s"),
+        *("_at_work", "_avoided_s", "_avoided_until", "_delay_holds_until", "_delay_s"),
+        *("_others", "_others_until", "_rtt_s"),
         *("_service_s", "_slots", "asked_at", "doubted", "ended_at", "latencies"),
     )
 
@@ -85,6 +86,8 @@ class ReplicaLoad:
         self._others_until = -NEVER
         self._avoided_s = 0.0
         self._avoided_until = -NEVER
+        self._delay_s = UNKNOWN_DELAY_S
+        self._delay_holds_until = 0
 
     # -- what is believed -----------------------------------------------------------------
 
@@ -124,9 +127,13 @@ class ReplicaLoad:
 
     def delay_s(self) -> float:
         """Return after how long an attempt takes unusually long."""
-        if self.latencies.samples < _SAMPLES_NEEDED:
+        samples = self.latencies.samples
+        if samples < _SAMPLES_NEEDED:
             return UNKNOWN_DELAY_S
-        return max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
+        if samples >= self._delay_holds_until:  # of many, one more makes little difference
+            self._delay_holds_until = samples + 1 + min(samples // 16, 15)
+            self._delay_s = max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
+        return self._delay_s
 
     def doubtful_at(self, begun: float) -> float:
         """Return when an attempt that began then is long overdue.
