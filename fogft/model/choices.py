@@ -77,16 +77,10 @@ class Middleware:
 
 @dataclass(frozen=True)
 class Correlation:
-    """How much replicas are down together. Each in [0, 1], and none above the one before.
+    """How much replicas are down together: in one zone, in one region, in one cloud.
 
-    The defaults for a region and a cloud were measured in public traces of AWS's V100 spot
-    machines: 9 zones, 45 days (over all pairs of zones 0.22). That for a zone is assumed, above
-    them. docs/design/availability.md has the source.
-
-    Attributes:
-        zone: Between two replicas in one zone.
-        region: Between two in different zones of one region.
-        cloud: Between two in different regions of one cloud.
+    Each is in [0, 1], and none above the one before. Those for a region and a cloud were measured
+    (docs/design/availability.md); that for a zone is assumed, above them.
     """
 
     zone: float = 0.5

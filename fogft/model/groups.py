@@ -38,7 +38,6 @@ class Group:
         name: Empty where the pool file names no groups.
         offers: The name that offers for it carry: another group's for `CRITICAL`.
         block: Which slots are its own.
-        services: What its replicas carry.
     """
 
     name: str

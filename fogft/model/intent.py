@@ -28,10 +28,8 @@ class Intent:
             another number, the file decides again.
         drained: Slot -> the highest generation there that is to be replaced.
         excluded: Locations (``cloud``, ``cloud/region`` or all three) to keep out of.
-        stopping: `down` was asked for: end everything.
-        began_at: When the hours of `max_hours` began anew, in seconds since the epoch; 0 as
-            long as they count from the pool's creation.
-        retried_at: When `retry` was last asked for, in seconds since the epoch.
+        began_at: When the hours of `max_hours` began anew; 0 as long as they count from the
+            pool's creation.
     """
 
     target: Count | None = None

@@ -202,8 +202,6 @@ class Key:
     """What is said of one key.
 
     Attributes:
-        form: What may stand there.
-        help: What it does, for people.
         name: The key, where the field is called otherwise.
         usual: The default in words, where the value says nothing to people.
         advanced: Whether it stands under `advanced`.

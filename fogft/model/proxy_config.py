@@ -44,18 +44,14 @@ class ClientProxyConfig:
         membership: Which replicas there are; written by the manager.
         status: What the proxy reports to the manager.
         lease: Its beat tells that a manager lives.
-        lock: Held while the proxy lives.
         suspect_after_s: Nothing more is sent to a replica after so long without a probe reply.
         tell_losers: Whether replicas are told which requests were answered elsewhere.
         domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
-        rendezvous: Where rendezvous listen.
         records: What was learned from rendezvous, for the next start.
         revocations: The manager's signed revocations, to be passed on to replicas.
-        dial_in: Address that replicas which cannot be reached are given.
-        dial_in_listen: Where to listen for them, if not on that port of all addresses.
+        dial_in: Address that replicas which cannot be reached are given; `dial_in_listen` is where
+            to listen for them, if not on that port of all addresses.
         uplinks: Network interfaces to use at once, the preferred one first.
-        metrics: Where to answer Prometheus.
-        rmw: How the proxy speaks ROS.
         listen: Where a gateway listens for robots.
     """
 
@@ -88,20 +84,14 @@ class ServerProxyConfig:
     """All that `fogft serve` needs to know. Its options override the file.
 
     Attributes:
-        run: Command that starts the services; empty where they are started otherwise.
-        workdir: Folder in which `run` starts.
-        envs: Environment of `run`.
+        run: Command that starts the services in `workdir`; empty where they are started otherwise.
         domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
         orphan_after_s: It shuts down after so long without a sign of a manager.
         notice: Where preemption notices come from.
         max_in_flight: Most requests held at once.
         advertise: Address at which this replica is reached, where it differs.
-        rendezvous: Where rendezvous listen.
         records: What was learned from rendezvous, for the next start.
-        revocations: The manager's signed revocations, as they stood when this was launched.
         dial_out: Robots that this replica dials, where it cannot be reached.
-        metrics: Where to answer Prometheus.
-        rmw: How the proxy speaks ROS.
     """
 
     pool: str

@@ -124,7 +124,6 @@ class Reason:
     """A cause with its data. What does not belong to the cause keeps its default.
 
     Attributes:
-        slot: Of the pool.
         replica: ``slot.generation``.
         location: ``cloud``, ``cloud/region`` or ``cloud/region/zone``.
         name: Of a service, a gateway or a file.
