@@ -24,7 +24,6 @@ from zenoh import handlers
 
 from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
-from fogft.link.compression import unpack
 from fogft.link.counters import Counters
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import sockets, threads
@@ -38,6 +37,7 @@ from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
+from fogft.link.zenoh.unpacking import Unpacker
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths
@@ -93,6 +93,7 @@ class ZenohListener:
         self._turns = QueryTurns()
         self._queues = ReplyQueues(self._counters, self._turns)
         self._work_queue = WorkQueue(self._counters)
+        self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
         self.streams = Streams(slow=self._slow)
@@ -240,28 +241,40 @@ class ZenohListener:
             self._refuse_all(requests, stream, Refusal.NOT_READY)
             return
         for header, payload in requests:
-            try:
-                request = unpack(payload) if header.packed else payload
-            except ValueError as error:
-                self._malformed(error)
-                self._refuse(header, stream, Refusal.MALFORMED)
-                continue
-            incoming = ZenohIncoming(
-                service,
-                header,
-                request,
-                stream=stream,
-                queues=self._queues,
-                work=self._work_queue,
-                thin=self._thin,
-            )
-            try:
-                on_request(incoming)
-            except Exception:  # the others that came with it go on
-                self._counters.add("failed")
-                log.exception("request_not_taken service=%s", service)
-                incoming.refuse(Refusal.LOST)
+            hand_over = partial(self._hand_over, on_request, service, header, stream)
+            if not header.packed:
+                hand_over(payload)
+            elif not self._unpacker.put(self._sessions.holder(token), payload, hand_over):
+                self._refuse(header, stream, Refusal.OVERLOADED)
         stream.seen(requests[0][0].seen)
+
+    def _hand_over(
+        self,
+        on_request: Callable[[Incoming], None],
+        service: str,
+        header: frame.RequestHeader,
+        stream: Stream,
+        request: bytes | None,
+    ) -> None:
+        if request is None:
+            self._malformed("a payload that cannot be decompressed")
+            self._refuse(header, stream, Refusal.MALFORMED)
+            return
+        incoming = ZenohIncoming(
+            service,
+            header,
+            request,
+            stream=stream,
+            queues=self._queues,
+            work=self._work_queue,
+            thin=self._thin,
+        )
+        try:
+            on_request(incoming)
+        except Exception:  # the others that came with it go on
+            self._counters.add("failed")
+            log.exception("request_not_taken service=%s", service)
+            incoming.refuse(Refusal.LOST)
 
     def _refuse_all(
         self, requests: Sequence[tuple[frame.RequestHeader, bytes]], stream: Stream, reason: str
@@ -274,7 +287,7 @@ class ZenohListener:
             header.token, header.robot, Reply(stream, header.request_id, b"", reason), more=True
         )
 
-    def _malformed(self, error: ValueError) -> None:
+    def _malformed(self, error: ValueError | str) -> None:
         self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
 
     def _cancel(self, on_cancel: Callable[[Sequence[bytes]], None], sample: zenoh.Sample) -> None:

@@ -14,10 +14,8 @@ import zenoh
 
 from fogft.errors import FrameError
 from fogft.link import batch_frames, frame
-from fogft.link.compression import unpack
 from fogft.link.port import Answer
 from fogft.model import refusal
-from fogft.model.refusal import Refusal
 from fogft.requests.load import Handling
 
 
@@ -30,6 +28,7 @@ class OpenAttempt:
         size: Bytes of its payload.
         offered: When, and until when it is of use, in monotonic seconds.
         mark: What the connection had sent once this was sent (`credit`).
+        reads_packed: The answer may be compressed.
     """
 
     service: str
@@ -40,10 +39,11 @@ class OpenAttempt:
     deadline: float
     handling: Handling = Handling.NORMAL
     mark: int = 0
+    reads_packed: bool = False
 
 
-def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:
-    """Return a reply's stamp, and what it answers to requests: a payload or a refusal to each.
+def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer], bool]:
+    """Return a reply's stamp, what it answers to each request, and whether the payload is packed.
 
     Raises:
         FrameError: It does not say to which.
@@ -54,20 +54,15 @@ def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer]]:
         content = b"" if err is None else err.payload.to_bytes()
         stamp, id, said, load = frame.decode_refusal(content)
         kind, detail = refusal.read(said)
-        return stamp, (Answer(id, refusal=kind, detail=detail, load=load),)
+        return stamp, (Answer(id, refusal=kind, detail=detail, load=load),), False
     attachment = ok.attachment
     if attachment is None:
         raise FrameError("an answer without a header")
     header, payload = attachment.to_bytes(), ok.payload.to_bytes()
     if batch_frames.is_batch(header):
-        return batch_frames.decode_answers(header, payload)
+        return *batch_frames.decode_answers(header, payload), False
     stamp, id, load, packed = frame.decode_answer(header)
-    if packed:
-        try:
-            payload = unpack(payload)
-        except ValueError:
-            return stamp, (Answer(id, None, Refusal.MALFORMED),)
-    return stamp, (Answer(id, payload, load=load),)
+    return stamp, (Answer(id, payload, load=load),), packed
 
 
 LIMIT = 8192  # the window holds 512; a replica that never answers what was forgotten holds no more
@@ -83,12 +78,22 @@ class Unanswered:
     def __init__(self, limit: int = LIMIT) -> None:
         self._limit = limit
         self._attempts: dict[bytes, OpenAttempt] = {}
+        self._lock = threading.Lock()
+        self._sent = 0
+        self._answered = 0  # counted by one thread, Zenoh's
+
+    @property
+    def owed(self) -> int:
+        """How many more requests were sent than answers came, those to unknown ids included."""
+        return self._sent - self._answered
 
     def __len__(self) -> int:
         return len(self._attempts)
 
     def add(self, attempt: OpenAttempt) -> None:
         """Note an attempt that is about to be sent; it takes the place of one of its request."""
+        with self._lock:
+            self._sent += 1
         self._attempts[attempt.request_id] = attempt
         if len(self._attempts) > self._limit:
             for id in list(self._attempts)[: self._limit // 8]:
@@ -96,6 +101,7 @@ class Unanswered:
 
     def answered(self, request_id: bytes) -> OpenAttempt | None:
         """Return whom an answer is for, once; None if nobody awaits it."""
+        self._answered += 1
         return self._attempts.pop(request_id, None)
 
 

@@ -29,6 +29,7 @@ from fogft.link.zenoh.flow_watch import FlowWatch
 from fogft.link.zenoh.robot.attempt import BatchBuffer, OpenAttempt, Unanswered
 from fogft.link.zenoh.robot.send_queue import SendQueue
 from fogft.link.zenoh.threads import join_at_exit
+from fogft.link.zenoh.unpacking import Unpacker
 from fogft.model.refusal import Refusal
 from fogft.requests.load import Handling
 
@@ -138,6 +139,7 @@ class Attempts:
         self._seen = frame.NO_STAMP  # the stamp of the last answer
         self._telling = False
         self._unanswered = Unanswered()
+        self._unpacker = Unpacker()
         self._batch = BatchBuffer()
         self._credit = Credit()
         self._queue = SendQueue(options.latest)
@@ -351,6 +353,9 @@ class Attempts:
         packed = None
         if compression is not None:
             packed = compression.pack(payload, self._flow.bytes_per_s)
+        may_pack = compression is not None and self._flow.thin
+        reads_packed = compression is not None and self.packs_answers
+        attempt.reads_packed = may_pack or reads_packed
         self._unanswered.add(attempt)
         header = frame.encode_request(
             attempt.request_id,
@@ -358,8 +363,8 @@ class Attempts:
             self._origin,
             seen=self._seen,
             packed=packed is not None,
-            may_pack=compression is not None and self._flow.thin,
-            reads_packed=self.packs_answers and compression is not None,
+            may_pack=may_pack,
+            reads_packed=reads_packed,
             handling=attempt.handling,
         )
         content = payload if packed is None else packed
@@ -367,18 +372,41 @@ class Attempts:
 
     # -- what came (Zenoh's threads) ------------------------------------------------------
 
-    def heard(self, stamp: bytes, answers: Iterable[Answer]) -> None:
-        """Take answers to requests, and the stamp that they came with."""
+    def heard(self, stamp: bytes, answers: Iterable[Answer], *, packed: bool = False) -> None:
+        """Take answers to requests, and the stamp that they came with.
+
+        Args:
+            packed: The payload is compressed; then there is one.
+        """
         self._seen = stamp
         for answer in answers:
-            self._take_answer(answer)
+            self._take_answer(answer, packed=packed)
 
-    def _take_answer(self, answer: Answer) -> None:
+    def _take_answer(self, answer: Answer, *, packed: bool) -> None:
         attempt = self._unanswered.answered(answer.request_id)
+        if self._unanswered.owed < 0:
+            self._outlet.lose("it answers more than it was asked")
         if attempt is None:
             return  # it was answered before
         if answer.payload is not None:
             self._credit.heard(attempt.mark)  # requests of one connection arrive in order
+        if packed and self.window.holds(attempt):
+            self._unpack(attempt, answer)
+        else:
+            self._take_plain(attempt, answer)
+
+    def _unpack(self, attempt: OpenAttempt, answer: Answer) -> None:
+        """Decompress an answer that is still wanted, and was asked to be packed."""
+
+        def done(payload: bytes | None) -> None:
+            refusal = Refusal.MALFORMED if payload is None else None
+            self._take_plain(attempt, answer._replace(payload=payload, refusal=refusal))
+
+        packed = answer.payload or b""
+        if not attempt.reads_packed or not self._unpacker.put("answers", packed, done):
+            done(None)
+
+    def _take_plain(self, attempt: OpenAttempt, answer: Answer) -> None:
         if self.window.holds(attempt):
             self._close(attempt, answer)
             return

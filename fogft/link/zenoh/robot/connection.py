@@ -194,11 +194,11 @@ class Connection:
     def _heard(self, reply: zenoh.Reply) -> None:
         threads.note()
         try:
-            stamp, answers = read_reply(reply)
+            stamp, answers, packed = read_reply(reply)
         except FrameError as error:
             self.lose(f"its answers cannot be read: {error}")
             return
-        self.attempts.heard(stamp, answers)
+        self.attempts.heard(stamp, answers, packed=packed)
 
     def _link_event(self, event: zenoh.LinkEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:

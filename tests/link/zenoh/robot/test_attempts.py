@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,9 +16,10 @@ from fogft.link.cancellations import Cancellations
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
 from fogft.link.port import Answer
 from fogft.link.send_options import DEFAULT_OPTIONS
+from fogft.link.zenoh import unpacking
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.model.refusal import Refusal
-from tests.link.wire_pool import request_id
+from tests.link.wire_pool import request_id, wait_for
 
 SERVICE = "/s"
 
@@ -178,3 +181,41 @@ def test_an_answer_after_it_was_forgotten_is_late() -> None:
     scene.attempts.heard(b"once", [Answer(request_id(1), b"y")])
     scene.close()
     assert (scene.answers, scene.late) == ([], [request_id(1)])
+
+
+def _thin(scene: Scene) -> None:
+    """Have its requests say that their answers may be compressed."""
+    scene.attempts.packs = scene.attempts.packs_answers = True
+
+
+def test_a_packed_answer_is_unpacked_where_it_was_asked_for() -> None:
+    """It ends its attempt as any other does; one that cannot be unpacked is the replica's fault."""
+    scene = Scene()
+    _thin(scene)
+    for number, packed in enumerate((zlib.compress(b"answer"), b"no zlib"), 1):
+        assert scene.attempts.offer(SERVICE, request_id(number), b"x", 60.0)
+        scene.attempts.heard(b"once", [Answer(request_id(number), packed)], packed=True)
+    wait_for(lambda: len(scene.answers) == 2)
+    assert {one.request_id: (one.payload, one.refusal) for one in scene.answers} == {
+        request_id(1): (b"answer", None),
+        request_id(2): (None, Refusal.MALFORMED),
+    }
+    scene.close()
+
+
+def test_nothing_is_unpacked_that_was_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither for an unknown id, nor for one that is not wanted, nor where no request allows it."""
+    monkeypatch.setattr(unpacking, "unpack", lambda packed: pytest.fail("it was unpacked"))
+    scene = Scene()
+    bomb = zlib.compress(bytes(1 << 20))
+    for number in (1, 2):
+        assert scene.attempts.offer(SERVICE, request_id(number), b"x", 60.0)
+    scene.attempts.forget(request_id(2))
+    for number in (1, 2):
+        scene.attempts.heard(b"once", [Answer(request_id(number), bomb)], packed=True)
+    assert [one.refusal for one in scene.answers] == [Refusal.MALFORMED]
+    assert scene.late == [request_id(2)]
+    assert not scene.outlet.lost
+    scene.attempts.heard(b"once", [Answer(request_id(3), bomb)], packed=True)
+    assert scene.outlet.lost == ["it answers more than it was asked"]
+    scene.close()

@@ -1,0 +1,150 @@
+"""Few bytes that become many: whoever sends them, the links of all others go on as before."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import statistics
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import zenoh
+
+from fogft.link import frame
+from fogft.link.zenoh import settings as config
+from fogft.link.zenoh.robot.link import ZenohLink
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model import names
+from fogft.model.credentials import CredentialPaths
+from fogft.records.signing import Signer
+from tests.link.wire_pool import (
+    POOL_UID,
+    SERVICE,
+    Authority,
+    Owner,
+    ReplicaProcess,
+    hears,
+    keys,
+    knows,
+    peer,
+    request_id,
+    wait_for,
+)
+
+BOMB = zlib.compress(bytes(63 << 20), 9)
+# Beside the calm run's, and beside one bomb in Zenoh's thread: 63 MiB take 40 ms and more.
+NO_SLOWER, ANY_CASE_S = 3.0, 0.02
+
+
+@contextlib.contextmanager
+def hostile_replica(files: CredentialPaths, slot: int) -> Iterator[str]:
+    """A scripted replica's process; its endpoint."""
+    command = [sys.executable, "-m", "tests.hostile.replica"]
+    with subprocess.Popen(
+        [*command, str(files.ca), str(files.certificate), str(files.key), str(slot)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[2],
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield json.loads(process.stdout.readline())["endpoint"]
+        finally:
+            process.kill()
+
+
+def round_trip_s(link: ZenohLink, owner: Owner, first: int, count: int = 200) -> float:
+    """Return the median of so many calls, one after another; each is answered rightly."""
+    took_s = []
+    for number in range(first, first + count):
+        began = time.perf_counter()
+        assert link.offer(SERVICE, request_id(number), b"x%d" % number, 20.0)
+        while not (answers := owner.of(number)):
+            time.sleep(0.0002)
+        took_s.append(time.perf_counter() - began)
+        assert [one.payload for one in answers] == [b"x%d" % number]
+        time.sleep(0.005)
+    return statistics.median(took_s)
+
+
+def test_a_replica_that_answers_with_bombs_slows_no_other_link(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+) -> None:
+    """Its link is closed and says why; nothing that nobody asked for was ever unpacked."""
+    good = dial(start_replica().endpoint)
+    wait_for(lambda: good.usable)
+    calm_s = round_trip_s(good, owner, 0)
+    with hostile_replica(authority.replica(1), 1) as endpoint:
+        bad = dial(endpoint, slot=1, owner=Owner())
+        said = set[str]()
+        wait_for(lambda: bad.usable)
+        wait_for(lambda: said.add(bad.status().detail) or bad.status().reopened > 1)
+        attacked_s = round_trip_s(good, owner, 1000)
+    print(f"calm {calm_s * 1e3:.2f} ms, attacked {attacked_s * 1e3:.2f} ms, {said}")
+    assert "it answers more than it was asked" in said
+    assert attacked_s < max(NO_SLOWER * calm_s, ANY_CASE_S)
+    assert good.status().reopened == 0
+
+
+def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+) -> None:
+    """Its requests are unpacked in a thread of its own; others' probes and requests go on."""
+    replica = start_replica()
+    good = dial(replica.endpoint)
+    wait_for(lambda: good.usable)
+    calm_s = round_trip_s(good, owner, 0)
+    files = authority.robot("eve")
+    settings = config.robot_settings(peer(replica.endpoint), files, LinkSettings())
+    session = zenoh.open(config.to_zenoh(settings))
+    try:
+        token = _greets(session, files)
+        origin = frame.origin("eve", token)
+        thrown = 0
+
+        def throw() -> None:
+            nonlocal thrown
+            thrown += 1
+            header = frame.encode_request(request_id(1 << 64 | thrown), 20.0, origin, packed=True)
+            # Cut short: it is unpacked to its end, and then refused.
+            session.put(keys(0)[SERVICE], BOMB[:-1], attachment=header)
+
+        took_s = []
+        for number in range(1000, 1050):
+            throw()
+            took_s.append(round_trip_s(good, owner, number, 1))
+            time.sleep(0.05)
+        wait_for(lambda: replica.count("malformed") == thrown)
+    finally:
+        session.close()
+    print(f"calm {calm_s * 1e3:.2f} ms, attacked {statistics.median(took_s) * 1e3:.2f} ms")
+    assert statistics.median(took_s) < max(NO_SLOWER * calm_s, ANY_CASE_S)
+    assert good.status().reopened == 0
+
+
+def _greets(session: zenoh.Session, files: CredentialPaths) -> bytes:
+    """Have a robot's bare session let in, and return its token."""
+    hears(session, keys(0)[SERVICE])
+    knows(session, 0)
+    token = bytes(range(8))
+    replica = peer("h:1").certificate_name
+    signed = Signer(files.certificate, files.key)(frame.greeted_bytes(token, replica))
+    greeting = frame.encode_greeting(frame.Greeting(token, *signed))
+    probe = b'{"v":%d,"robot":"eve"}' % frame.VERSION
+    (said,) = session.get(names.probe_key(POOL_UID, 0), payload=probe, attachment=greeting)
+    assert said.ok is not None
+    bare = frame.encode_greeting(frame.Greeting(token))
+    session.get(names.answers_key(POOL_UID, 0), lambda reply: None, attachment=bare, timeout=1e6)
+    time.sleep(0.3)
+    return token
