@@ -47,7 +47,7 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "Run one part by hand": {
         "proxy": ("parts", "--config ~/.local/state/fogft/pools/planner/proxy.yaml"),
-        "serve": ("parts", "--config replica.yaml --listen 0.0.0.0:7447"),
+        "serve": ("parts", "--config replica.yaml --listen 0.0.0.0:7448"),
         "manager": ("parts", "planner"),
         "rendezvous": ("parts", "--config rendezvous.yaml --listen 0.0.0.0:7450"),
         "gateway": ("parts", "--config gateway.yaml --listen 0.0.0.0:7470"),

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+from fogft.model.names import LINK_PORT
 from fogft.model.replica import Machine, Offer, Placement, ReplicaId
 
 
@@ -31,6 +32,8 @@ class Launch:
     # ``ca.crt``, ``replica.crt`` and ``replica.key``; the configuration names the others
     # relative to its own folder. Kept 0600.
     files: Mapping[str, bytes] = field(default_factory=dict)
+    # Where the server proxy listens, on a cloud whose machines have addresses of their own.
+    link_port: int = LINK_PORT
     # The replica dials its robots: nobody reaches it, so no port need be open.
     dials_out: bool = False
 
@@ -88,7 +91,7 @@ class Accounts(Protocol):
     def check_task(self, task: Mapping[str, Any]) -> None:
         """Raise `SpecError` for what cannot be honoured on these clouds, before it is ordered."""
 
-    def exposures(self, clouds: Sequence[str], *, open_port: bool) -> Sequence[str]:
+    def exposures(self, clouds: Sequence[str], *, open_port: int | None) -> Sequence[str]:
         """Return, in sentences, what machines there are given or open to that they need not be.
 
         Raises CloudError: it cannot be told now.

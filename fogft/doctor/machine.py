@@ -16,6 +16,7 @@ from pathlib import Path
 
 import fogft
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
+from fogft.model.names import LINK_PORT
 
 _PYTHON_FIRST, _PYTHON_LAST = (3, 10), (3, 13)
 _NEEDED_MODULES = {"zenoh": "eclipse-zenoh", "cryptography": "cryptography", "yaml": "pyyaml"}
@@ -23,7 +24,6 @@ _SHARED_MEMORY = Path("/dev/shm")
 # One segment of the shipped Fast DDS profile for each process, and a pool has a handful.
 _SHARED_MEMORY_WANTED_BYTES = 256 << 20
 _DISK_WANTED_BYTES = 200 << 20
-_DEFAULT_PORT = 7447
 
 
 def python(_: Situation) -> Iterator[Finding]:
@@ -115,16 +115,16 @@ def ports(_: Situation) -> Iterator[Finding]:
     try:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(("0.0.0.0", _DEFAULT_PORT))
+            probe.bind(("0.0.0.0", LINK_PORT))
     except OSError:
         yield warn(
             "ports",
-            f"TCP port {_DEFAULT_PORT} is taken; `fogft serve` uses it unless told otherwise",
+            f"TCP port {LINK_PORT} is taken; `fogft serve` uses it unless told otherwise",
             "pass `--listen HOST:PORT` when you run `fogft serve` here; pools on the local "
             "cloud choose free ports themselves",
         )
     else:
-        yield ok("ports", f"TCP ports can be bound on loopback; {_DEFAULT_PORT} is free")
+        yield ok("ports", f"TCP ports can be bound on loopback; {LINK_PORT} is free")
 
 
 def clock(situation: Situation) -> Iterator[Finding]:

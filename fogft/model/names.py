@@ -133,3 +133,6 @@ EndpointOrEmpty = Annotated[str, only(lambda text: not text or is_endpoint(text)
 SETUP_LIMIT_S = 3600
 """How long from its launch a machine's set-up may take. Kept by the machine itself on a real cloud,
 by who follows its launch, and by the planner. Seconds."""
+
+LINK_PORT = 7448
+"""Where a server proxy listens unless told otherwise; 7447 is the port of `rmw_zenoh`'s router."""

@@ -10,7 +10,14 @@ from typing import Annotated
 from fogft.model.choices import Speaks
 from fogft.model.credentials import CredentialPaths
 from fogft.model.keys import LONGEST_S, only
-from fogft.model.names import NOTICE_SOURCES, ROBOT_BYTES_LIMIT, Endpoint, EndpointOrEmpty, PoolUid
+from fogft.model.names import (
+    LINK_PORT,
+    NOTICE_SOURCES,
+    ROBOT_BYTES_LIMIT,
+    Endpoint,
+    EndpointOrEmpty,
+    PoolUid,
+)
 from fogft.model.plain import Generation, within
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
@@ -101,7 +108,7 @@ class ServerProxyConfig:
     services: tuple[ServiceSpec, ...]
     credentials: CredentialPaths
     run: str = ""
-    listen: Endpoint = "0.0.0.0:7447"
+    listen: Endpoint = f"0.0.0.0:{LINK_PORT}"
     workdir: Path = Path()
     envs: Mapping[str, str] = field(default_factory=dict)
     domain_id: DomainId | None = None

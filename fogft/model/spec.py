@@ -41,7 +41,7 @@ from fogft.model.keys import (
     key,
     only,
 )
-from fogft.model.names import is_endpoint
+from fogft.model.names import LINK_PORT, is_endpoint
 from fogft.model.ros_names import (
     absolute_service_name,
     is_field_name,
@@ -383,6 +383,12 @@ class PoolSpec:
         "Robot's own address, for replicas that cannot be reached: they dial the robot.",
         default="",
     )
+    link_port: int = key(
+        Whole(1024, 65535),
+        "Port of a replica's VM that robots connect to. Not 7447, which is `rmw_zenoh`'s router's.",
+        default=LINK_PORT,
+        advanced=True,
+    )
     topology: Topology = key(
         Map(Topology),
         "Gateways, and who uses them. Needs a `rendezvous`.",
@@ -469,6 +475,8 @@ class PoolSpec:
             asked["topics"] = sorted(str(topic) for topic in self.topics)
         if self.rendezvous or self.dial_in:
             asked["connectivity"] = [self.rendezvous, self.dial_in]
+        if self.link_port != LINK_PORT:
+            asked["link_port"] = self.link_port
         if self.rmw.replica is not Speaks.RCLPY:
             asked["rmw"] = self.rmw.replica.value
         kinds = _kinds_of_machine(resources)

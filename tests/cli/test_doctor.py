@@ -51,12 +51,12 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_finding_is_a_line_and_its_advice_another(monkeypatch, capsys):
-    findings = [ok("clock", "2026-11-21"), warn("ports", "7447 is taken", "free it")]
+    findings = [ok("clock", "2026-11-21"), warn("ports", "7448 is taken", "free it")]
     monkeypatch.setattr(checks, "examine", lambda _: iter(findings))
     assert main.run(["doctor"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "ok    clock               2026-11-21",
-        "warn  ports               7447 is taken",
+        "warn  ports               7448 is taken",
         "                          -> free it",
     ]
 

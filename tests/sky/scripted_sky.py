@@ -97,6 +97,7 @@ class ScriptedSky:
         self.unreachable = False
         self.credentials = {"aws": "", "gcp": "run `gcloud auth login`"}
         self.uploaded: list[str] | None = []
+        self.mapped: dict[str, str] = {}  # cluster -> where its port is reached
         self.launched: list[_Launch] = []
         self.errors: dict[str, list[CloudError]] = {}
         self._counter = itertools.count(1)
@@ -149,6 +150,12 @@ class ScriptedSky:
     def job(self, name: str, number: int | None) -> JobState:
         self._meet("job", name)
         return self.jobs.get(name, JobState.MISSING)
+
+    def endpoint(self, name: str, port: int) -> str:
+        self._meet("endpoint", name)
+        if name not in self.mapped:
+            raise RefusedError("ValueError", ["not exposed"])
+        return self.mapped[name]
 
     def job_log(self, name: str, number: int | None, lines: int) -> str:
         return self.job_logs.get(name, "")

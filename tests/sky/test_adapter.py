@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import MachinePhase
+from fogft.model.replica import MachinePhase, Placement
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import EAST, WEST, replica
 
@@ -46,7 +47,7 @@ def test_a_launch_is_listed_at_once_and_becomes_a_running_machine(scene: Scene):
     machine = scene.machine()
     assert (machine.phase, machine.progress) == (MachinePhase.RUNNING, "")
     assert machine.endpoint is not None
-    assert machine.endpoint.endswith(":7447")
+    assert machine.endpoint.endswith(":7448")
     assert (machine.usd_per_hour, machine.spec_hash, machine.placement) == (0.021, "abcd", EAST)
 
 
@@ -641,13 +642,58 @@ def test_secrets_stay_private_on_disk(scene: Scene):
 
 
 def test_what_a_machine_need_not_have_is_told(scene: Scene):
-    assert scene.cloud.exposures(["aws"], open_port=False) == []
+    assert scene.cloud.exposures(["aws"], open_port=None) == []
     scene.sky.uploaded = ["~/.lambda_cloud/lambda_keys"]
     scene.provider.mighty = "the role may do anything"
-    role, files, port = scene.cloud.exposures(["aws"], open_port=True)
+    role, files, port = scene.cloud.exposures(["aws"], open_port=7448)
     assert role == "the role may do anything"
     assert "`~/.lambda_cloud/lambda_keys`" in files
-    assert "port 7447 of every VM is open to the world" in port
-    assert scene.cloud.exposures(["gcp"], open_port=False) == [files], "of the clouds asked about"
+    assert "port 7448 of every VM is open to the world" in port
+    assert scene.cloud.exposures(["gcp"], open_port=None) == [files], "of the clouds asked about"
     scene.sky.uploaded = None
-    assert "the API server elsewhere decides" in scene.cloud.exposures(["gcp"], open_port=False)[0]
+    assert "the API server elsewhere decides" in scene.cloud.exposures(["gcp"], open_port=None)[0]
+
+
+# -- ports ------------------------------------------------------------------------------------
+
+MAPPED = Placement("runpod", "CA", "CA-MTL-1", "1x_A40")
+
+
+def test_the_links_port_is_the_orders_and_survives_a_lost_journal(scene: Scene):
+    scene.cloud.launch(scene.order(link_port=9000))
+    scene.sky.finish(NAME)
+    scene.work()
+    assert (scene.machine().endpoint or "").endswith(":9000")
+    shutil.rmtree(scene.folder / "state")
+    assert (scene.machines(scene.another_process())[0].endpoint or "").endswith(":9000")
+
+
+def test_where_a_cloud_maps_ports_skypilot_says_how_a_machine_is_reached(scene: Scene):
+    """Its own address and port are of no use; until the mapping is known there is no endpoint."""
+    scene.cloud.launch(scene.order(place=MAPPED))
+    scene.sky.finish(NAME)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.RUNNING
+    assert scene.machine().endpoint is None
+    scene.sky.jobs[NAME] = JobState.SETTING_UP
+    scene.sky.mapped[NAME] = "203.0.113.9:31022"
+    scene.pass_s(JOB_PAUSE_S)
+    scene.work()
+    assert scene.machine().endpoint == "203.0.113.9:31022"
+    assert scene.machines(scene.another_process())[0].endpoint == "203.0.113.9:31022"
+
+
+def test_a_replica_that_dials_out_needs_no_mapped_port(scene: Scene):
+    scene.cloud.launch(scene.order(place=MAPPED, dials_out=True))
+    scene.sky.finish(NAME)
+    scene.work()
+    assert scene.sky.asked("endpoint") == []
+
+
+def test_a_cloud_that_opens_no_port_is_told_with_what_helps(scene: Scene):
+    refused = RefusedError("NotSupportedError", ["Opening ports is not supported on Hyperbolic."])
+    scene.sky.fail_next("launch", refused)
+    with pytest.raises(CloudError) as caught:
+        scene.cloud.launch(scene.order())
+    assert "Opening ports is not supported" in caught.value.message
+    assert "`fogft.dial_in`" in caught.value.hint

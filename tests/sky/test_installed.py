@@ -148,6 +148,8 @@ def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any,
     assert installed.job("c", 3) is JobState.SETUP_FAILED
     sdk.get.return_value = {None: None}
     assert installed.job("c", None) is JobState.MISSING
+    sdk.get.return_value = {7448: "http://203.0.113.9:31022"}
+    assert installed.endpoint("c", 7448) == "203.0.113.9:31022"
     installed.job_log("c", 3, 10)
     installed.provision_log("c", 10)
     installed.down("c")
@@ -155,7 +157,7 @@ def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any,
     assert installed.check(["aws", "gcp"]) == {"aws": "", "gcp": "SkyPilot may not use it"}
     called = {call[0] for call in sdk.method_calls}
     assert called >= {
-        *("launch", "api_status", "api_cancel", "status", "job_status", "tail_logs"),
+        *("endpoints", "launch", "api_status", "api_cancel", "status", "job_status", "tail_logs"),
         *("tail_provision_logs", "down", "check", "stream_and_get", "get"),
     }
 
@@ -344,7 +346,7 @@ def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: P
     (resources,) = made.resources
     assert (resources.region, resources.zone) == ("us-east-1", "us-east-1a")
     assert (resources.instance_type, resources.use_spot) == ("m6i.large", True)
-    assert resources.ports == ["7447"]
+    assert resources.ports == ["7448"]
     assert resources.autostop_config.down
     assert resources.disk_size == 100
     assert made.envs["A"] == "b"
@@ -365,7 +367,7 @@ def test_an_image_of_the_users_own_is_one_that_skypilot_takes(home: Path, tmp_pa
         container = image.removeprefix("docker:") if image.startswith("docker:") else None
         assert resources.extract_docker_image() == container
         assert container or resources.image_id == {"us-east-1": image}
-        assert resources.ports == ["7447"], "SkyPilot's containers share the machine's network"
+        assert resources.ports == ["7448"], "SkyPilot's containers share the machine's network"
 
 
 @needs("skypilot")

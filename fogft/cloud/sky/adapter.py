@@ -104,7 +104,10 @@ class SkyCloud:
             owner=self.owner,
             base=self.base,
         )
-        begun = Entry(order.id, order.placement, order.usd_per_hour, order.spec_hash, self.clock())
+        begun = Entry(
+            *(order.id, order.placement, order.usd_per_hour, order.spec_hash, self.clock()),
+            port=0 if order.dials_out else order.link_port,
+        )
         if not self.journal.open(begun, order.files):
             return
         try:
@@ -159,7 +162,7 @@ class SkyCloud:
         """See `Accounts`."""
         refuse_what_cannot_be_honoured(task)
 
-    def exposures(self, clouds: Sequence[str], *, open_port: bool) -> Sequence[str]:
+    def exposures(self, clouds: Sequence[str], *, open_port: int | None) -> Sequence[str]:
         """See `Accounts`."""
         files = self.sky.uploaded_credentials(clouds)
         found = [one.warning() for one in self.providers if one.cloud in clouds or not clouds]
@@ -176,7 +179,7 @@ class SkyCloud:
             )
         if open_port:
             found.append(
-                f"port {task.LINK_PORT} of every VM is open to the world (mutual TLS), as is ssh's "
+                f"port {open_port} of every VM is open to the world (mutual TLS), as is ssh's "
                 "(keys only): SkyPilot cannot say who may connect. `fogft.dial_in` opens no port"
             )
         return [one for one in found if one]
@@ -252,4 +255,7 @@ def _refusal(error: RefusedError, order: Launch) -> CloudError:
             f"the account's quota is used up in {where}: {failure.words}",
             "ask the cloud for a higher quota, or name other regions",
         )
-    return CloudError(f"SkyPilot refuses to launch in {where}: {failure.words}")
+    hint = ""
+    if not order.dials_out and error.kind == "NotSupportedError":
+        hint = "where a cloud opens no port the replica can dial the robot: `fogft.dial_in`"
+    return CloudError(f"SkyPilot refuses to launch in {where}: {failure.words}", hint)

@@ -116,18 +116,23 @@ class Aws:
 
     def warning(self) -> str:
         """See `Provider`. Reads the policies of SkyPilot's role, where the account may."""
+
+        def policies(iam: Any) -> list[str] | None:
+            try:
+                found = iam.list_attached_role_policies(RoleName=ROLE)["AttachedPolicies"]
+            except iam.exceptions.NoSuchEntityException:
+                return None
+            return sorted(str(policy["PolicyName"]) for policy in found)
+
         try:
-            answer = self._ask(_ROLE_OF, lambda iam: iam.list_attached_role_policies(RoleName=ROLE))
-        except NotAllowedError:
+            names = self._ask(_ROLE_OF, policies)
+        except (NotAllowedError, CloudUnreachable):
             return ""
-        except CloudUnreachable as error:
-            if "NoSuchEntity" not in str(error):
-                return ""
+        if names is None:
             return (
                 f"AWS has no role `{ROLE}`: at the first launch SkyPilot makes one for every VM, "
                 "with full access to EC2 and S3. Make the one of docs/clouds.md before"
             )
-        names = sorted(str(policy["PolicyName"]) for policy in answer["AttachedPolicies"])
         mighty = [f"`{n}`" for n in names if n.endswith("FullAccess") or n in _MIGHTY]
         if not mighty:
             return ""

@@ -18,7 +18,7 @@ from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.failures import tail
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import UNDER_WAY, Entry, Journal, Stage
-from fogft.cloud.sky.naming import cluster_name
+from fogft.cloud.sky.naming import MAPPING_CLOUDS, cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.errors import CloudError
 from fogft.model.names import SETUP_LIMIT_S
@@ -95,6 +95,18 @@ class Following:
                 self._fail(entry, self._refused(entry, error))
             else:
                 self._move(entry, stage=Stage.SETTING_UP, job=job)
+                self._find_endpoint(entry)
+
+    def _find_endpoint(self, entry: Entry) -> None:
+        """Ask where a machine is reached whose cloud maps its port, until that is known."""
+        if entry.endpoint or not entry.port or entry.placement.cloud not in MAPPING_CLOUDS:
+            return
+        try:
+            found = self.sky.endpoint(cluster_name(entry.id), entry.port)
+        except RefusedError as error:  # it is not mapped yet
+            log.info("endpoint_unknown replica=%s reason=%r", entry.id.short, str(error))
+        else:
+            self._move(entry, endpoint=found)
 
     def _lost(self, entry: Entry) -> None:
         """SkyPilot lost the request (its database, or a server that was put in place of it)."""
@@ -108,6 +120,7 @@ class Following:
         asked_at = self.clock()
         if asked_at < self._job_not_before.setdefault(entry.id, asked_at + JOB_PAUSE_S):
             return
+        self._find_endpoint(entry)
         try:
             job = self.sky.job(cluster_name(entry.id), entry.job)
         except RefusedError as error:  # the cluster is gone, or not up: its absence will tell

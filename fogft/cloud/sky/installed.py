@@ -19,7 +19,7 @@ from typing import Any, TypeVar, cast
 
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
 from fogft.cloud.sky.calls import Calls
-from fogft.cloud.sky.sdk import Cluster, JobState, Request
+from fogft.cloud.sky.sdk import Cluster, JobState, RefusedError, Request
 from fogft.cloud.sky.settings import Settings, report_nothing
 from fogft.errors import CloudError
 from fogft.model.replica import Offer, Placement
@@ -129,6 +129,17 @@ class InstalledSky:
         states = sdk.get(sdk.job_status(name, None if number is None else [number]))
         state = next(iter(states.values()), None)
         return JobState.MISSING if state is None else JOBS.get(state.value, JobState.ENDED)
+
+    @_limited(ASK_LIMIT_S, "the address of `{0}`")
+    def endpoint(self, name: str, port: int) -> str:
+        """Return ``host:port`` where a port of a cluster is reached; refused until it is mapped."""
+        _, sdk = self._sky()
+        with as_answer():
+            found = sdk.get(sdk.endpoints(name, port))
+        told = {int(key): str(value) for key, value in found.items()}
+        if not told.get(port):
+            raise RefusedError("ValueError", [f"port {port} of `{name}` is not mapped"])
+        return told[port].rpartition("//")[2]
 
     def job_log(self, name: str, number: int | None, lines: int) -> str:
         """Return the end of a job's log; empty when there is none."""

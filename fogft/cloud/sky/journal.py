@@ -22,6 +22,7 @@ from typing import Any
 
 from fogft.cloud.sky.naming import cluster_name, replica_of
 from fogft.disk import locked, make_folder, read_json, write_json, write_whole
+from fogft.model.names import LINK_PORT
 from fogft.model.plain import stored, to_plain
 from fogft.model.reason import Reason
 from fogft.model.replica import Placement, ReplicaId
@@ -58,6 +59,8 @@ class Entry:
     job: int | None = None
     failure: Reason | None = None  # as in `Machine.failure`
     set_up_at: float = 0.0  # when the job was seen to run
+    port: int = LINK_PORT  # the link's; 0 where the replica dials out
+    endpoint: str = ""  # `host:port`, on a cloud that maps ports; empty until it is known
 
 
 class Journal:

@@ -10,7 +10,6 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.journal import Entry, Stage
 from fogft.cloud.sky.provider import Instance
 from fogft.cloud.sky.sdk import Cluster, ClusterState
-from fogft.cloud.sky.task import LINK_PORT
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 
@@ -42,7 +41,7 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         placement=placement,
         phase=phase,
         launched_at=entry.launched_at,
-        endpoint=f"{ip}:{LINK_PORT}" if ip and phase is not MachinePhase.FAILED else None,
+        endpoint=_endpoint(entry, ip) if phase is not MachinePhase.FAILED else None,
         usd_per_hour=entry.usd_per_hour,
         spec_hash=entry.spec_hash,
         failure=failure,
@@ -62,13 +61,15 @@ def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
     else:
         said = f"SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}"
         failure = _error(said)
-    running = phase is MachinePhase.RUNNING and cluster.head_ip
+    cloud = cluster.placement.cloud if cluster.placement else ""
+    known = cluster.head_ip and cloud not in naming.MAPPING_CLOUDS
+    running = phase is MachinePhase.RUNNING and known
     return Machine(
         id=id,
         placement=cluster.placement or NOWHERE,
         phase=phase,
         launched_at=cluster.launched_at,
-        endpoint=f"{cluster.head_ip}:{LINK_PORT}" if running else None,
+        endpoint=f"{cluster.head_ip}:{naming.link_port(cluster.labels)}" if running else None,
         usd_per_hour=naming.usd_per_hour(cluster.labels),
         spec_hash=cluster.labels.get(naming.SPEC, ""),
         failure=failure,
@@ -87,6 +88,12 @@ def of_instance(instance: Instance) -> Machine:
         spec_hash=instance.labels.get(naming.SPEC, ""),
         failure=_error(f"SkyPilot does not know {instance.placement.cloud} `{instance.key}`"),
     )
+
+
+def _endpoint(entry: Entry, ip: str) -> str | None:
+    if entry.placement.cloud in naming.MAPPING_CLOUDS and entry.port:
+        return entry.endpoint or None
+    return f"{ip}:{entry.port}" if ip else None
 
 
 def _error(words: str) -> Reason:

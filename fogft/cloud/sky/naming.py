@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from fogft.model.names import POOL_UID_PATTERN
+from fogft.model.names import LINK_PORT, POOL_UID_PATTERN
 from fogft.model.replica import Placement, ReplicaId
 
 PREFIX = "fogft-"
@@ -20,6 +20,9 @@ GENERATION = "fogft-generation"
 OWNER = "fogft-owner"
 SPEC = "fogft-spec"
 PRICE = "fogft-microusd"
+PORT = "fogft-port"
+MAPPING_CLOUDS = frozenset({"runpod", "vast", "yotta"})
+"""Clouds whose machines are reached at another address and port than their own."""
 
 _NAME = re.compile(r"fogft-([0-9a-f]{16})-(\d{1,9})-(\d{1,9})")
 _NUMBER = re.compile(r"\d{1,9}")
@@ -44,7 +47,13 @@ def replica_of(name: str) -> ReplicaId | None:
 
 
 def labels(
-    id: ReplicaId, *, pool: str, owner: str, spec_hash: str, usd_per_hour: float
+    id: ReplicaId,
+    *,
+    pool: str,
+    owner: str,
+    spec_hash: str,
+    usd_per_hour: float,
+    port: int = LINK_PORT,
 ) -> dict[str, str]:
     """Return the labels of a replica's machine, in characters that every cloud takes."""
     return {
@@ -54,6 +63,7 @@ def labels(
         OWNER: label_value(owner),
         SPEC: label_value(spec_hash),
         PRICE: str(round(usd_per_hour * 1e6)),
+        PORT: str(port),
         "fogft-name": label_value(pool),
     }
 
@@ -70,6 +80,12 @@ def usd_per_hour(found: Mapping[str, str]) -> float:
     """Return the price that the labels carry; 0 where they carry none."""
     text = found.get(PRICE, "")
     return int(text) / 1e6 if text.isascii() and text.isdigit() else 0.0
+
+
+def link_port(found: Mapping[str, str]) -> int:
+    """Return the link's port that the labels carry; the usual one where they carry none."""
+    text = found.get(PORT, "")
+    return int(text) if _NUMBER.fullmatch(text) else LINK_PORT
 
 
 def label_value(text: str) -> str:

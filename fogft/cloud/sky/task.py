@@ -22,7 +22,6 @@ from fogft.model.names import NO_VM_CLOUDS, SETUP_LIMIT_S
 from fogft.model.replica import Placement
 from fogft.poolfile.resources import alternatives, place
 
-LINK_PORT = 7447
 OURS = "~/.fogft"
 _CHOICES = (
     *("infra", "cloud", "region", "zone", "any_of", "ordered"),
@@ -87,8 +86,8 @@ def build(
     marks = {
         "@FILES@": str(files),
         "@WHEEL@": str(wheel),
-        "@PORT@": str(LINK_PORT),
-        "@LISTEN@": f"{'127.0.0.1' if order.dials_out else '0.0.0.0'}:{LINK_PORT}",
+        "@PORT@": str(order.link_port),
+        "@LISTEN@": f"{'127.0.0.1' if order.dials_out else '0.0.0.0'}:{order.link_port}",
         "@SETUP_LIMIT_S@": str(SETUP_LIMIT_S),
         "@SETUP@": setup,  # the user's text last, as it is
     }
@@ -124,6 +123,7 @@ def _resources(order: Launch, owner: str) -> dict[str, Any]:
         owner=owner,
         spec_hash=order.spec_hash,
         usd_per_hour=order.usd_per_hour,
+        port=order.link_port,
     )
     return out
 

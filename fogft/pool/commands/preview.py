@@ -116,7 +116,9 @@ def order(
             notes += found
             usable = [name for name, problem in accounts.items() if not problem]
             try:
-                notes += concrete.exposures(usable, open_port=not spec.dial_in)
+                notes += concrete.exposures(
+                    usable, open_port=None if spec.dial_in else spec.link_port
+                )
             except CloudError as error:
                 notes.append(f"what a VM is given cannot be told now: {error.message}")
         try:

@@ -190,6 +190,7 @@ def build_order(
             "replica.key": issued.key_pem,
             **({paths.revocations.name: revocations} if revocations else {}),
         },
+        link_port=spec.link_port,
         dials_out=bool(spec.dial_in),
     )
 

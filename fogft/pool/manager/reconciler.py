@@ -93,6 +93,7 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
         usd_per_hour=planned.offer.usd_per_hour,
         spec_hash=replica_hash(spec, planned.slot),
         task=task_at(spec, planned.slot),
+        link_port=spec.link_port,
         dials_out=bool(spec.dial_in),
     )
 

@@ -127,7 +127,7 @@ def what_the_machine_has(pool: Pool) -> None:
     machine = machine_of(name)
     assert open_ports(machine["region"], "sky-sg-") == {22}
     assert reaches(machine["ip"], 22)
-    assert not reaches(machine["ip"], 7447)
+    assert not reaches(machine["ip"], 7448)
     disk = disk_of(machine)
     assert list(disk.glob("opt/ros/proof/lib/python3*/site-packages/rclpy"))
     (packages,) = disk.glob("home/ubuntu/.fogft/venv/lib/python3*/site-packages")

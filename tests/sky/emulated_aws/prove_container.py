@@ -62,7 +62,7 @@ def main() -> int:
         (name,) = pool.replicas()
         machine = machine_of(name)
         cluster = f"fogft-{pool.status()['uid']}-{name.replace('.', '-')}"
-        assert open_ports(machine["region"], f"sky-sg-{cluster}") == {22, 7447}
+        assert open_ports(machine["region"], f"sky-sg-{cluster}") == {22, 7448}
         home = disk_of(machine) / "home/ubuntu"
         assert not (home / "setup-ran").exists(), "the set-up ran beside the container"
         assert not (home / ".fogft").exists(), "fogft is beside the container"

@@ -149,7 +149,7 @@ class Proof:
             assert not left, left
             # To the world: ssh, which is SkyPilot's, and the link.
             cluster = f"fogft-{status['uid']}-{name.replace('.', '-')}"
-            assert open_ports(instance["region"], f"sky-sg-{cluster}") == {22, 7447}
+            assert open_ports(instance["region"], f"sky-sg-{cluster}") == {22, 7448}
 
     def preempted_without_notice_and_a_region_is_full(self) -> None:
         lost = next(n for n, r in self.pool.replicas().items() if region_of(r) == "us-east-1")

@@ -336,7 +336,7 @@ class ZenohListener:
 def _with_port(listen: str) -> str:
     host, separator, port = listen.rpartition(":")
     if not separator or not host or not port.isdigit() or int(port) > 65535:
-        raise WireError(f"`{listen}` is not `host:port`", "for instance `0.0.0.0:7447`")
+        raise WireError(f"`{listen}` is not `host:port`", "for instance `0.0.0.0:7448`")
     if int(port) != 0:
         return listen
     # Zenoh does not tell which port it was given, so we ask the kernel for a free one first.
