@@ -109,7 +109,7 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
     settings = config.robot_settings(peer(replica.endpoint), files, LinkSettings())
     session = zenoh.open(config.to_zenoh(settings))
     try:
-        token = _greets(session, files)
+        token = greets(session, files)
         origin = frame.origin("eve", token)
         thrown = 0
 
@@ -133,7 +133,7 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
     assert good.status().reopened == 0
 
 
-def _greets(session: zenoh.Session, files: CredentialPaths) -> bytes:
+def greets(session: zenoh.Session, files: CredentialPaths) -> bytes:
     """Have a robot's bare session let in, and return its token."""
     hears(session, keys(0)[SERVICE])
     knows(session, 0)

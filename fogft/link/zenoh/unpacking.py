@@ -10,6 +10,7 @@ may be packed at all (`attempts`, `listener`).
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections import deque
@@ -56,10 +57,8 @@ class Unpacker:
                     return
                 packed, done = self._waiting[peer].popleft()
             payload: bytes | None = None
-            try:
+            with contextlib.suppress(ValueError):  # whose payload it was counts it, and logs some
                 payload = unpack(packed)
-            except ValueError as error:
-                log.warning("payload_not_unpacked peer=%s reason=%r", peer, str(error))
             try:
                 done(payload)
             except Exception:  # the next ones go on

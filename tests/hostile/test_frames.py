@@ -1,0 +1,182 @@
+"""Every frame that a robot or a replica with a good certificate may send, damaged by seed.
+
+Ten thousand by day, a million at night. One party that sends them costs nothing but itself:
+others' requests are answered, once and rightly, on the links that they had.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import zenoh
+
+from fogft.errors import FrameError
+from fogft.link import batch_frames, frame, probe_frames
+from fogft.link.frame import NO_LOAD
+from fogft.link.port import Answer, Probe
+from fogft.link.zenoh import settings as config
+from fogft.link.zenoh.robot.attempt import read_reply
+from fogft.link.zenoh.robot.link import ZenohLink
+from fogft.link.zenoh.settings import LinkSettings
+from fogft.model import names
+from tests.fuzz.mutation import damaged
+from tests.hostile.test_bombs import greets
+from tests.link.wire_pool import (
+    POOL_UID,
+    SERVICE,
+    Authority,
+    Owner,
+    ReplicaProcess,
+    keys,
+    peer,
+    request_id,
+    wait_for,
+)
+from tests.link.zenoh.robot.test_attempts import SERVICE as ASKED
+from tests.link.zenoh.robot.test_attempts import Scene
+from tests.nightly import by_day
+
+CASES = by_day(10_000, at_night=1_000_000)
+OURS = 1 << 100  # ids of the good robot's requests, which nobody guesses
+STAMP = b"seen"
+
+
+def sends(session: zenoh.Session, token: bytes, dice: random.Random) -> Callable[[], None]:
+    """Return what sends one damaged frame: at any key that a replica hears."""
+    origin = frame.origin("eve", token)
+    header, content = batch_frames.encode_requests(
+        [(request_id(1), 1.0, False, b"x"), (request_id(2), 1.0, True, b"y")], origin
+    )
+    requests = frame.encode_request(request_id(3), 1.0, origin), header
+    packed = frame.encode_request(request_id(4), 1.0, origin, packed=True)
+    cancel = frame.encode_cancel([request_id(1), request_id(2)])
+    greeting = frame.encode_greeting(frame.Greeting(token))
+    probe = probe_frames.encode_probe(Probe("eve", 1.0, describe=True))
+    asked = [(names.probe_key, probe), (names.records_key, b"{}"), (names.answers_key, b"")]
+
+    def send() -> None:
+        kind = dice.randrange(10)
+        if kind < 8:
+            to = names.cancel_key(POOL_UID, 0) if kind == 0 else keys(0)[SERVICE]
+            payload = damaged((cancel if kind == 0 else content,), dice)
+            head = dice.choice((*requests, packed))
+            attachment = damaged((head,), dice) if kind < 6 else head
+            session.put(to, payload, attachment=attachment)
+        else:
+            hello = damaged((greeting,), dice) if kind == 8 else greeting
+            # Not the last as it should be: who asks for answers anew ends those to himself.
+            key, payload = dice.choice(asked[:-1] if hello == greeting else asked)
+            session.get(
+                key(POOL_UID, 0),
+                lambda reply: None,
+                payload=damaged((payload,), dice),
+                attachment=hello,
+                timeout=5.0,
+            )
+
+    return send
+
+
+def test_a_robot_that_sends_damaged_frames_costs_nobody_else_anything(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+) -> None:
+    """Under its flood each request of another robot is answered: none wrong, none lost."""
+    replica = start_replica()
+    good = dial(replica.endpoint)
+    wait_for(lambda: good.usable)
+    files = authority.robot("eve")
+    settings = config.robot_settings(peer(replica.endpoint), files, LinkSettings())
+    session = zenoh.open(config.to_zenoh(settings))
+    try:
+        send, done = sends(session, greets(session, files), random.Random(25)), threading.Event()
+
+        def flood() -> None:
+            for _ in range(CASES):
+                send()
+            done.set()
+
+        threading.Thread(target=flood, daemon=True).start()
+        asked = 0
+        while not done.wait(0.005):
+            asked += good.offer(SERVICE, request_id(OURS + asked), b"x%d" % asked, 30.0)
+        wait_for(lambda: good.status().in_flight == 0)
+    finally:
+        session.close()
+    assert asked > 0
+    came = sorted((one.request_id, one.payload) for _, one in owner.answers)
+    assert came == [(request_id(OURS + number), b"x%d" % number) for number in range(asked)]
+    assert replica.count("failed") == 0
+    assert replica.count("malformed") > CASES / 10
+    assert good.status().reopened == 0
+
+
+@dataclass
+class Bytes:
+    content: bytes
+
+    def to_bytes(self) -> bytes:
+        return self.content
+
+
+@dataclass
+class Sample:
+    payload: Bytes
+    attachment: Bytes | None
+
+
+@dataclass
+class Reply:
+    """Stands in for one of Zenoh's."""
+
+    ok: Sample | None
+    err: Sample | None = None
+
+
+def replies(ids: Sequence[bytes], dice: random.Random) -> Reply:
+    """Return a damaged answer, refusal or batch to requests."""
+    one = dice.choice(ids)
+    kind = dice.randrange(4)
+    if kind == 0:
+        refused = damaged((frame.encode_refusal(STAMP, one, "overloaded"),), dice)
+        return Reply(None, Sample(Bytes(refused), None))
+    header = frame.encode_answer(STAMP, one, packed=kind == 1)
+    payload = b"x\x9c" + dice.randbytes(20)
+    if kind == 3:
+        header, payload = batch_frames.encode_answers(
+            STAMP, [(id, NO_LOAD, b"ok", "") for id in ids[:5]]
+        )
+        payload = damaged((payload,), dice)
+    attachment = Bytes(damaged((header,), dice)) if dice.random() < 0.9 else None
+    return Reply(Sample(Bytes(payload), attachment))
+
+
+def test_a_replica_that_sends_damaged_answers_ends_each_request_once_at_most() -> None:
+    """Nothing but a refusal to read them comes out, and only who was asked is answered."""
+    dice, taken = random.Random(25), 0
+    for _ in range(CASES // 100):
+        scene = Scene()
+        scene.attempts.packs = scene.attempts.packs_answers = True
+        ids = [request_id(dice.randrange(1 << 64)) for _ in range(20)]
+        for id in ids:
+            assert scene.attempts.offer(ASKED, id, b"x", 60.0)
+        for _ in range(100):
+            try:
+                stamp, answers, packed = read_reply(replies(ids, dice))  # type: ignore[arg-type]
+            except FrameError:
+                continue
+            taken += len(answers)
+            scene.attempts.heard(stamp, answers, packed=packed)
+        scene.close()
+        _each_once(scene.answers, ids)
+    assert taken > CASES / 20
+
+
+def _each_once(answers: Sequence[Answer], ids: Sequence[bytes]) -> None:
+    ended = [one.request_id for one in answers]
+    assert sorted(ended) == sorted(ids)
