@@ -32,7 +32,10 @@ TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare co
 _DOUBTED_TRIAL_EVERY_S = 1.0
 FEWEST_SPARES = 0.01
 _CUT = 0.5
-_RECOVERED_AFTER = 1000.0  # service times without a wait, until every request has spares again
+# Spares come back while nothing is asked: a pause counts beyond so many service times, and after so
+# many of these every request has spares again.
+_PAUSE = 3.0
+_RECOVERED_AFTER = 300.0
 _MEMORY = 0.98  # of what spares saved and cost, from one request to the next
 _RETRY_S = 0.02
 
@@ -91,8 +94,8 @@ class Spares:
         self._saved_s *= _MEMORY
         self._cost_s *= _MEMORY
         if self._at is not None and self.share < 1.0:
-            passed = (now - self._at) / max(service_s, 1e-4) / _RECOVERED_AFTER
-            self.share = min(1.0, self.share + passed)
+            paused = (now - self._at) / max(service_s, 1e-4) - _PAUSE
+            self.share = min(1.0, self.share + max(0.0, paused) / _RECOVERED_AFTER)
         self._at = now
 
     def chosen(self, request: bytes) -> bool:

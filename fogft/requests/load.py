@@ -22,7 +22,7 @@ _SAMPLES_NEEDED = 5
 # What a replica said of other robots' requests holds for so long.
 _WORD_HOLDS_S = 1.0
 _RTT_GAIN = 0.1
-_ALIKE = 2.0
+_ALIKE = 4.0
 _DOUBT_AFTER = 2.0
 _UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
 # A replica that fails is left alone: at first so long, then doubling, while another is able.
@@ -111,8 +111,8 @@ class ReplicaLoad:
 
         Args:
             now: Seconds.
-            typical_s: The service time of most replicas. One that is not twice as slow or as quick
-                is taken for equal: of services whose times vary, a few answers say no more.
+            typical_s: The service time of most replicas. One that is not four times as slow or
+                as quick is taken for equal: where times vary, a few answers say no more.
         """
         service_s = self.service_s()
         if typical_s / _ALIKE < service_s < typical_s * _ALIKE:
