@@ -42,8 +42,15 @@ def stranger(endpoint: str, kind: str, source: str = ELSEWHERE) -> Iterator[subp
             process.kill()
 
 
-def joins(dial: Callable[..., ZenohLink], endpoint: str, open_link: ZenohLink) -> list[float]:
-    """Have three robots join, 1.5 s apart, while a request a 10 ms is sent; how long each took."""
+def joins(
+    dial: Callable[..., ZenohLink], replica: ReplicaProcess, open_link: ZenohLink
+) -> tuple[list[float], int]:
+    """Have three robots join, 1.5 s apart, while a request a 10 ms is sent.
+
+    Returns:
+        How long each took, in seconds, and the most descriptors that the replica had open.
+    """
+    most = 0
     took_s: list[float] = []
     sent = 0
     for robot in ("first", "second", "third"):
@@ -53,11 +60,12 @@ def joins(dial: Callable[..., ZenohLink], endpoint: str, open_link: ZenohLink) -
             assert open_link.offer(SERVICE, request_id(sent), b"x", 30.0)
             sent += 1
             time.sleep(0.01)
+            most = max(most, replica.descriptors())
             assert time.monotonic() < begins + 30.0, "it was kept out"
             if late is None and time.monotonic() >= begins:
-                late = dial(endpoint, robot=robot, owner=Owner())
+                late = dial(replica.endpoint, robot=robot, owner=Owner())
         took_s.append(time.monotonic() - begins)
-    return took_s
+    return took_s, most
 
 
 @pytest.mark.parametrize("kind", SAYS)
@@ -74,12 +82,14 @@ def test_a_flood_from_elsewhere_keeps_no_robot_out_and_stops_no_request(
     replica = start_replica()
     link = dial(replica.endpoint)
     wait_for(lambda: link.usable)
+    before = replica.descriptors()
     with stranger(replica.endpoint, kind):
-        took_s = joins(dial, replica.endpoint, link)
+        took_s, descriptors = joins(dial, replica, link)
     wait_for(lambda: link.status().in_flight == 0)
     let_in = replica.count("handshakes_refused") + replica.count("unauthenticated")
-    print(f"{kind}: joined within {[round(one, 2) for one in took_s]} s, let_in={let_in}")
+    print(f"{kind}: joined within {[round(one, 2) for one in took_s]} s, {let_in=} {descriptors=}")
     assert let_in < COUNT / 50
+    assert descriptors < before + COUNT / 50
     assert sorted(took_s)[1] < JOINS_WITHIN_S
     assert max(took_s) < JOINS_WITHIN_S + 0.1 * let_in
     assert replica.count("kept_out") > 0

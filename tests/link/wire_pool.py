@@ -185,6 +185,10 @@ class ReplicaProcess:
         self._process.stdin.flush()
         return self._read()
 
+    def descriptors(self) -> int:
+        """Return how many files and sockets it has open."""
+        return len(list(Path(f"/proc/{self._process.pid}/fd").iterdir()))
+
     def count(self, event: str) -> int:
         return int(self.ask().get(event, 0))  # type: ignore[call-overload]
 
