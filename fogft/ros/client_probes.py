@@ -18,7 +18,7 @@ from fogft.ros.port import RosClient
 
 _SERVICE, _TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTypes"
 _OF_NO_PARAMETER = b"\x00\x01\x00\x00" + bytes(4)  # a list of names, which is empty
-_KEPT = 64
+KEPT = 64
 
 
 class Graph(Protocol):
@@ -54,11 +54,9 @@ class NodeProbes:
         with self._lock:
             end = self._ends.get(asked)
             if end is None:
-                for old in list(self._ends)[: len(self._ends) - _KEPT + 1]:
-                    self._ends.pop(old).close()
+                if len(self._ends) >= KEPT:
+                    self._ends.pop(next(iter(self._ends))).close()
                 end = self._ends[asked] = self._graph.client(asked, _TYPE)
-        if end.servers() > 1:
-            return False  # two nodes of one name: either would answer
         return end if end.available() else None
 
 
@@ -78,6 +76,8 @@ class ServiceProbes:
             return False
         if isinstance(end, bool) or end is None:
             return end
+        if len(self._ends) >= 4 * KEPT:  # long gone: a service remembers fewer clients
+            self._ends.pop(next(iter(self._ends)))
         self._ends[client] = end
         return True
 

@@ -1,0 +1,111 @@
+"""Whose executor is asked for a turn, and how often that was."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from fogft.errors import RosError
+from fogft.ros.client_probes import KEPT, NodeProbes, ServiceProbes
+
+CLIENT = b"c" * 16
+
+
+class End:
+    """A client of a node's parameter service."""
+
+    def __init__(self) -> None:
+        self.found = True
+        self.closed = False
+        self.asked: list[Callable[[bytes], None]] = []
+
+    def available(self) -> bool:
+        return self.found
+
+    def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
+        if self.closed:
+            raise RosError("closed")
+        self.asked.append(on_response)
+        return len(self.asked)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Graph:
+    def __init__(self) -> None:
+        self.nodes: dict[bytes, tuple[str, str]] = {CLIENT: ("arm", "/left")}
+        self.services = ["/left/arm/get_parameter_types"]
+        self.ends: dict[str, Any] = {}
+
+    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
+        assert service == "/detect"
+        return self.nodes.get(client)
+
+    def services_of(self, name: str, namespace: str) -> list[str]:
+        return self.services
+
+    def client(self, name: str, type_name: str) -> End:
+        self.ends[name] = End()
+        return self.ends[name]
+
+
+def test_a_node_with_parameters_answers_probes():
+    graph = Graph()
+    probes = ServiceProbes("/detect", NodeProbes(graph))
+    assert probes.answers(CLIENT) is True
+    answers = []
+    for _ in range(3):
+        probes.send(CLIENT, lambda: answers.append(1))
+    (end,) = graph.ends.values()
+    for on_response in end.asked:
+        on_response(b"")
+    assert len(answers) == 3
+
+
+def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
+    graph = Graph()
+    probes = ServiceProbes("/detect", NodeProbes(graph))
+    assert probes.answers(b"?" * 16) is None
+    graph.client = lambda name, type_name: _missing()
+    assert probes.answers(CLIENT) is None
+
+
+def _missing() -> End:
+    end = End()
+    end.found = False
+    return end
+
+
+def test_a_node_without_parameters_answers_none():
+    graph = Graph()
+    graph.services = ["/left/arm/move"]
+    assert ServiceProbes("/detect", NodeProbes(graph)).answers(CLIENT) is False
+    assert not graph.ends
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_probe_that_cannot_be_sent_is_not_answered(known: bool):
+    graph = Graph()
+    probes = ServiceProbes("/detect", NodeProbes(graph))
+    if known:
+        assert probes.answers(CLIENT)
+        graph.ends["/left/arm/get_parameter_types"].closed = True
+    answered = threading.Event()
+    probes.send(CLIENT, answered.set)
+    assert not answered.is_set()
+
+
+def test_of_many_nodes_the_first_are_let_go():
+    graph = Graph()
+    nodes = NodeProbes(graph)
+    probes = ServiceProbes("/detect", nodes)
+    for n in range(KEPT + 10):
+        client = n.to_bytes(16, "big")
+        graph.nodes[client] = (f"n{n}", "/")
+        graph.services = [f"/n{n}/get_parameter_types"]
+        assert probes.answers(client)
+    assert sum(end.closed for end in graph.ends.values()) == 10
