@@ -111,7 +111,7 @@ def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -
 
 
 def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
-    """Run a gateway: robots ask it once, and it asks all replicas.
+    """Run a gateway: robots ask it once, and it asks the replicas.
 
     Run it where the uplink is wide: on a machine of its own, or on a replica's.
     """

@@ -148,7 +148,6 @@ class Dispatcher:
             chosen = requests.begin(request, item, able, deadline=now + timeout_s, now=now)
             if item.trace is not None:
                 item.trace.asked.update(dict.fromkeys(chosen, now))
-            outcomes.count["sent"] += len(chosen)
             soon = requests.choose.look_at
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))

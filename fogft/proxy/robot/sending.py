@@ -54,13 +54,17 @@ class Sender:
     ) -> None:  # fmt: skip
         """Offer a new request to those that were chosen for it."""
         name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
+        taken = 0
         for replica in chosen:
             spare = is_spare(request, replica)
             handling = Handling.DROP_IF_BUSY if spare else Handling.NORMAL
-            if not links[replica].offer(
+            if links[replica].offer(
                 name, request, payload, timeout_s, more=self._in_burst, handling=handling
             ):
+                taken += 1
+            else:
                 self._declined(request, replica, is_copy=True)
+        self._count(taken)
         if len(chosen) > 1 and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)
@@ -112,18 +116,14 @@ class Sender:
             pending = requests.attempt(request, replica, now)
             if pending is None:
                 return True
-            self._ledger.outcomes.count["sent"] += 1
             if pending.item.trace is not None:
                 pending.item.trace.asked.setdefault(replica, now)
             handling = Handling.ALONE if pending.deaths else Handling.NORMAL
-        payload, remaining_s, name = (
-            pending.item.payload,
-            pending.deadline - now,
-            self._ledger.spec.name,
-        )
-        if not link.offer(name, request, payload, remaining_s, handling=handling):
+        name, remaining_s = self._ledger.spec.name, pending.deadline - now
+        if not link.offer(name, request, pending.item.payload, remaining_s, handling=handling):
             self._declined(request, replica, is_copy=True)
             return False
+        self._count(1)
         if request not in requests:  # it was answered meanwhile
             self.forget(request, (replica,))
         return True
@@ -137,16 +137,21 @@ class Sender:
             with ledger.lock:
                 links = self.links
                 sends = replication.take(ledger.clock(), ledger.spec.timeout_s)
-                ledger.outcomes.count["sent"] += sum(send.is_copy for send in sends)
             for replica, id, payload, timeout_s, is_copy in sends:
                 link = links.get(replica)
                 if link is None or not link.offer(ledger.spec.name, id, payload, timeout_s):
                     self._declined(id, replica, is_copy=is_copy)
+                else:
+                    self._count(is_copy)
+
+    def _count(self, taken: int) -> None:
+        """Count attempts that links have taken: a counter that only goes up."""
+        with self._ledger.lock:
+            self._ledger.outcomes.count["sent"] += taken
 
     def _declined(self, id: bytes, replica: int, *, is_copy: bool) -> None:
         """A link did not take an attempt."""
         with self._ledger.lock:
-            self._ledger.outcomes.count["sent"] -= is_copy
             pending = self._ledger.requests.get(id)
             if pending is not None and pending.item.trace is not None:
                 pending.item.trace.declined(replica, pending.open.get(replica))
