@@ -22,6 +22,7 @@ _SAMPLES_NEEDED = 5
 # What a replica said of other robots' requests holds for so long.
 _WORD_HOLDS_S = 1.0
 _RTT_GAIN = 0.1
+NEARLY = 0.8  # of what it usually takes
 _ALIKE = 4.0
 _DOUBT_AFTER = 2.0
 _UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
@@ -96,8 +97,17 @@ class ReplicaLoad:
         return len(self._at_work) + (self._others if now < self._others_until else 0)
 
     def free(self, now: float) -> bool:
-        """Whether a request that comes now is believed to begin at once."""
-        return not self.doubted and self.ahead(now) < max(1, self._slots)
+        """Whether a request that comes now is believed to begin at once, or nearly."""
+        if self.doubted:
+            return False
+        ahead = self.ahead(now)
+        if ahead < max(1, self._slots):
+            return True
+        if not ahead == len(self._at_work) == 1:
+            return False
+        # One of ours that is nearly over: callers ask again as soon as the first has answered.
+        [begun] = self._at_work.values()
+        return now - begun >= NEARLY * ((self._rtt_s or 0.0) + self.service_s())
 
     def avoided(self, now: float) -> bool:
         """Whether others are to be asked, where there are any: it is doubted, or has failed."""

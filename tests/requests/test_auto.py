@@ -180,12 +180,12 @@ def test_while_replicas_are_busy_a_request_goes_to_one():
     assert len(policy.first(B, (1, 2), 31.01)) == 1
 
 
-def test_a_loser_is_busy_until_it_says_that_it_has_ended():
+def test_a_loser_is_busy_until_it_is_nearly_over_or_says_that_it_has_ended():
     policy = learned(r1=0.1, r2=0.1)
     first, other = policy.first(A, (1, 2), 31.0)
-    policy.answered(A, {1: 31.0, 2: 31.0}, first, idle(0.1), 31.1)
-    assert policy.first(B, (1, 2), 31.11) == [first]
-    policy.answered(B, {first: 31.11}, first, idle(0.1), 31.2)
+    policy.answered(A, {1: 31.0, 2: 31.0}, first, idle(0.1), 31.04)
+    assert policy.first(B, (1, 2), 31.05) == [first]
+    policy.answered(B, {first: 31.05}, first, idle(0.1), 31.2)
     policy.late(A, other, 31.25, answered=True)
     assert set(policy.first(A, (1, 2), 31.3)) == {1, 2}
 

@@ -186,7 +186,7 @@ class Responder:
         if not self._is_ready(service) or service not in self._clients:
             return Refusal.NOT_READY, None
         queue = self._queue(service)
-        if incoming.handling is Handling.DROP_IF_BUSY and not queue.has_free_slot:
+        if incoming.handling is Handling.DROP_IF_BUSY and not queue.has_free_slot(now):
             return Refusal.BUSY, None
         deadline = now + remaining_s
         hopeless = not queue.open and queue.hopeless(incoming.robot, deadline, remaining_s)

@@ -12,10 +12,11 @@ from __future__ import annotations
 from collections import deque
 
 from fogft.link.port import Incoming
+from fogft.model.keys import LONGEST_S
 from fogft.model.spec import ServiceSpec
 from fogft.requests.admission import AdmissionQueue
 from fogft.requests.concurrency import ConcurrencyLimit
-from fogft.requests.load import Handling, Load
+from fogft.requests.load import NEARLY, Handling, Load
 
 # Job whose deadline has passed is still in the service's hands and takes its room. After so
 # long its response is taken for lost.
@@ -38,7 +39,7 @@ class Job:
             "payload",
             "robot",
         ),
-        *("service", "size", "ticket", "unwanted", "waiting"),
+        *("service", "size", "spare", "ticket", "unwanted", "waiting"),
     )
 
     def __init__(self, arrived: float, first: Incoming) -> None:
@@ -50,6 +51,7 @@ class Job:
         self.payload = first.payload
         self.size = len(first.payload)
         self.alone = first.handling is Handling.ALONE
+        self.spare = first.handling is Handling.DROP_IF_BUSY
         self.passed_on = False
         self.begun = 0.0  # when it was passed on, and
         self.level = 0  # how many were at work then, itself included
@@ -72,6 +74,7 @@ class ServiceQueue:
         self._waiting: AdmissionQueue[Job] = AdmissionQueue(latest=latest)
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
+        self._begun_last = 0.0
         self._alone = False  # the job at work is to have no other beside it
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
@@ -80,7 +83,9 @@ class ServiceQueue:
 
     def put(self, job: Job) -> None:
         """Let a job wait for its turn."""
-        self._waiting.put(job.id, job.robot, job.deadline, job)
+        # A spare copy that waits for what is nearly over goes after all that is none.
+        deadline = job.deadline + (LONGEST_S if job.spare else 0.0)
+        self._waiting.put(job.id, job.robot, deadline, job)
 
     @property
     def open(self) -> bool:
@@ -92,10 +97,12 @@ class ServiceQueue:
         """Whether the service may have one more beside what it has."""
         return self.at_work < self.limit.limit and not self._alone
 
-    @property
-    def has_free_slot(self) -> bool:
-        """Whether nothing waits, and the service can surely begin with one more at once."""
-        return self.open and self.at_work < max(1, self.limit.known)
+    def has_free_slot(self, now: float) -> bool:
+        """Whether nothing waits, and the service can begin with one more at once, or nearly."""
+        if len(self._waiting) or self._alone:
+            return False
+        nearly_over = now - self._begun_last >= NEARLY * self.limit.takes_s > 0.0
+        return self.at_work < max(1, self.limit.known) or (self.at_work == 1 and nearly_over)
 
     def takes(self, job: Job) -> bool:
         """Whether a job that comes now is passed on at once."""
@@ -144,6 +151,7 @@ class ServiceQueue:
         """Job is passed on. Job that comes while the line is `open` need not wait before."""
         self.at_work += 1
         self._alone = job.alone
+        self._begun_last = now
         job.passed_on, job.begun, job.level = True, now, self.at_work
 
     def remove(self, job: Job) -> bool:

@@ -80,6 +80,23 @@ def test_a_spare_copy_is_dropped_where_it_would_have_to_wait_and_that_is_told():
     assert spare.outcome == [b"r"]
 
 
+def test_a_spare_copy_waits_for_what_is_nearly_over_and_never_before_what_is_none():
+    """A caller asks again as soon as the first has answered: the others are about to."""
+    scene = Scene(limits={"/s": 1})
+    scene.ask(A)
+    scene.clock.now += 1.0
+    scene.answer(0)  # it takes a second
+    scene.ask(B)
+    scene.clock.now += 0.9
+    spare = scene.ask(C, handling=Handling.DROP_IF_BUSY)
+    first = scene.ask(D)
+    scene.answer(1)
+    scene.answer(2)
+    assert (first.outcome, spare.outcome) == ([b"r"], [])
+    scene.answer(3)
+    assert spare.outcome == [b"r"]
+
+
 def test_a_spare_copy_of_what_is_at_work_joins_it():
     scene = Scene()
     first = scene.ask(A)

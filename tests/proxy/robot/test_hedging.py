@@ -96,15 +96,19 @@ def test_copies_become_fewer_with_load():
     assert ran[-1] < 1.05
 
 
-def test_a_lone_caller_is_answered_by_all_and_no_loss_is_seen():
-    """Idle: every replica has each request, so a replica that vanishes costs no time at all."""
+@pytest.mark.parametrize("pause_s", [0.001, 0.2])
+def test_a_lone_caller_is_answered_by_all_and_no_loss_is_seen(pause_s):
+    """Idle: every replica has each request, so a replica that vanishes costs no time at all.
+
+    Also where it asks again at once, while the others are just ending the request before.
+    """
     world = World(AUTO)
     for _ in range(3):
-        world.replica(constant(0.05))
-    world.calls(20, pause_s=0.2)
+        world.replica(constant(0.05), serial=True)
+    world.calls(20, pause_s=pause_s)
     world.links[0].frozen = True
     before = len(world.asked)
-    world.calls(5, pause_s=0.2)
+    world.calls(5, pause_s=pause_s)
     assert max(world.latencies(before)) == pytest.approx(max(world.latencies()[:before]), abs=0.002)
 
 
