@@ -192,10 +192,11 @@ class Relay:
             side.setblocking(False)
             side.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         while True:
+            reached = self.reached  # before: meanwhile another connection may find it listening
             try:
                 await self._loop.sock_connect(server, self._upstream)
             except OSError:
-                if self.reached or _has_left(client):
+                if reached or _has_left(client):
                     raise
                 await asyncio.sleep(RETRY_S)
             else:
