@@ -14,7 +14,7 @@
 
 Laws: a request always has a copy that is no spare; late hedges <= capacity + share * requests.
 
-Owns: the choice, the budget, and how many requests get spare copies.
+Owns: the choice, the budget, how many requests get spare copies; which policy a service has.
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 

@@ -4,8 +4,9 @@ A policy is asked when a request comes (`first`) and again while it is open (`mo
 told how each attempt ended. It never sends anything; the dispatcher does as it says, and
 checks nothing but that a replica may be asked.
 
-Owns: `all` and `failover`; the interface of every policy; which one a service has.
-Not here: `auto` (`fogft.requests.auto`), which answer wins (`fogft.requests.decide`).
+Owns: `all` and `failover`; the interface of every policy.
+Not here: `auto`, and which policy a service has (`fogft.requests.auto`), which answer wins
+(`fogft.requests.decide`).
 """
 
 from __future__ import annotations

@@ -286,10 +286,20 @@ class PendingRequests(Generic[T]):
         """Take out every request whose deadline has come, oldest first."""
         expired = self._table.expire(now)
         for request, pending in expired:
-            self.choose.stopped(request, pending.open, now, expired=True)
-            self.held_bytes -= len(pending.item.payload)
-            self.decide.closed(request, pending)
+            self._given_up(request, pending, now, expired=True)
         return expired
+
+    def give_up(self, request: bytes, now: float) -> Pending[T] | None:
+        """Take a request out that no replica is to have any more; the fallback still may."""
+        pending = self._table.close(request)
+        if pending is not None:
+            self._given_up(request, pending, now, expired=False)
+        return pending
+
+    def _given_up(self, request: bytes, pending: Pending[T], now: float, *, expired: bool) -> None:
+        self.choose.stopped(request, pending.open, now, expired=expired)
+        self.held_bytes -= len(pending.item.payload)
+        self.decide.closed(request, pending)
 
     def fallback_answered(
         self, request: bytes, now: float, *, ok: bool

@@ -27,19 +27,8 @@ class Job:
     """A request that was accepted: who waits for it, and its answer once there is one."""
 
     __slots__ = (
-        *(
-            "alone",
-            "answer",
-            "arrived",
-            "begun",
-            "deadline",
-            "id",
-            "level",
-            "passed_on",
-            "payload",
-            "robot",
-        ),
-        *("service", "size", "spare", "ticket", "unwanted", "waiting"),
+        *("alone", "answer", "arrived", "begun", "deadline", "id", "level", "passed_on"),
+        *("payload", "robot", "service", "size", "spare", "ticket", "unwanted", "waiting"),
     )
 
     def __init__(self, arrived: float, first: Incoming) -> None:

@@ -77,20 +77,15 @@ class Delivery:
 
     def poisoned(self, request: bytes, pending: Pending[Request]) -> None:
         """Services died over a request: it ends now, as its policy says for a deadline."""
-        spec, ledger = self._ledger.spec, self._ledger
-        ledger.outcomes.poisoned_at = time.time()
-        if spec.on_timeout is OnTimeout.FALLBACK and ledger.requests.fallback is not None:
-            self._await_fallback(request, pending)
-            return
-        with ledger.lock:
-            ledger.end(request, pending, Outcome.POISON)
-        if spec.on_timeout is OnTimeout.EMPTY and self._empty_response is not None:
-            self.give(pending, self._empty_response)
+        self._ledger.outcomes.poisoned_at = time.time()
+        empty = self._ledger.spec.on_timeout is OnTimeout.EMPTY
+        outcome = Outcome.FALLBACK if self._falls_back else Outcome.POISON
+        self._end(request, pending, outcome, self._empty_response if empty else None)
 
     def expired(self, request: bytes, pending: Pending[Request]) -> None:
         """A request's deadline has come."""
         spec, response = self._ledger.spec, pending.rejection
-        if self._ledger.requests.fallback is not None and spec.on_timeout is OnTimeout.FALLBACK:
+        if self._falls_back:
             outcome = Outcome.FALLBACK
         elif response is not None:
             outcome = Outcome.ANSWERED
@@ -102,6 +97,18 @@ class Delivery:
             "request_timed_out service=%s outcome=%s waited_s=%.3f open=%s request=%s",
             spec.name, outcome.value, spec.timeout_s, sorted(pending.open), request.hex(),
         )  # fmt: skip
+        self._end(request, pending, outcome, response)
+
+    @property
+    def _falls_back(self) -> bool:
+        """Whether the fallback has the last word."""
+        falls_back = self._ledger.spec.on_timeout is OnTimeout.FALLBACK
+        return falls_back and self._ledger.requests.fallback is not None
+
+    def _end(
+        self, request: bytes, pending: Pending[Request], outcome: Outcome, response: bytes | None
+    ) -> None:
+        """End a request that no replica has answered, or leave it to the fallback."""
         if outcome is Outcome.FALLBACK:
             self._await_fallback(request, pending)
             return

@@ -285,7 +285,7 @@ class Dispatcher:
     def _end_poison(self, request: bytes, now: float) -> None:
         """End a request over which services died: only the fallback may still answer it."""
         with self._lock:
-            pending = self._requests.stop(request, now)
+            pending = self._requests.give_up(request, now)
         if pending is None:
             return
         log.error(

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import RosError
 from fogft.model.choices import FallbackSpec
+from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
 from tests.proxy.fakes import Clock, FakeClient, FakeLink
@@ -105,6 +106,23 @@ def test_raced_and_not_answered_it_is_awaited_past_the_deadline_and_not_asked_tw
     assert len(scene.local.calls) == 1
     scene.local.calls[0][1](b"at last")
     assert scene.responses == [("caller", b"at last")]
+
+
+@pytest.mark.parametrize("after_s", [0.5, None])
+def test_a_request_that_kills_services_is_left_to_the_fallback_which_is_asked_once(after_s):
+    """At once when it is given up, unless it was asked before."""
+    scene = Scene(after_s=after_s, limit_s=2.0)
+    scene.ask()
+    scene.pass_time(1.0)
+    assert len(scene.local.calls) == (0 if after_s is None else 1)
+    [link] = scene.links
+    for _ in range(2):
+        scene.dispatcher.answered(link, link.refusal(Refusal.CRASHED))
+        scene.pass_time(0.1)
+    assert len(scene.local.calls) == 1
+    scene.local.calls[0][1](b"from here")
+    assert scene.responses == [("caller", b"from here")]
+    assert scene.count("fallback", "poison", "silent", "pending") == [1, 0, 0, 0]
 
 
 def test_at_once_while_no_replica_is_ready():
