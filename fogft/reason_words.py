@@ -45,13 +45,13 @@ def _replaces(reason: Reason) -> str:
 
 def _all_backing_off(reason: Reason) -> str:
     places = ", ".join(f"`{one.location}`: {_name(one)}" for one in reason.because)
-    return f"every location rests after failures ({places})"
+    return f"every location is backing off after failures ({places})"
 
 
 def _backing_off(reason: Reason) -> str:
     if reason.seconds is None:
         return f"waiting after {reason.count} failed launches ({_names(reason)})"
-    return f"rests {reason.seconds:.0f} s more after {reason.count} x {_names(reason)}"
+    return f"backing off for {reason.seconds:.0f} s more after {reason.count} x {_names(reason)}"
 
 
 def _more_errors(reason: Reason) -> str:
@@ -71,10 +71,10 @@ def _clock_set(reason: Reason) -> str:
 
 def _impossible_price(reason: Reason) -> str:
     if reason.usd_per_hour is not None:
-        return f"its price, {reason.usd_per_hour:g}, cannot be"
+        return f"its price, {reason.usd_per_hour:g}, is invalid"
     if reason.location:
-        return f"offers with impossible prices are ignored, such as `{reason.location}`"
-    return "every offer has an impossible price"
+        return f"offers with invalid prices are ignored, such as `{reason.location}`"
+    return "every offer has an invalid price"
 
 
 def _over_budget(reason: Reason) -> str:
@@ -88,7 +88,10 @@ def _over_cap(reason: Reason) -> str:
     if reason.usd_per_hour is None:
         return "`max_usd_per_hour` allows no more"
     cap = f"${reason.limit_usd_per_hour:g}/h"
-    return f"${reason.usd_per_hour:.3f}/h is over the cap of {cap}: the dearest go, one by one"
+    return (
+        f"${reason.usd_per_hour:.3f}/h is over the cap of {cap}: the most "
+        "expensive replicas are ended one by one"
+    )
 
 
 def _other_market(reason: Reason) -> str:
@@ -102,7 +105,7 @@ def _worse_score(reason: Reason) -> str:
     far, near = reason.seconds, chosen.seconds
     said, better = [], False
     if ours != theirs:
-        word = "dearer" if ours > theirs else "cheaper"
+        word = "more expensive" if ours > theirs else "cheaper"
         said.append(f"{word}: ${ours:.3f}/h, not ${theirs:.3f}/h")
         better = ours < theirs
     if far != near:
@@ -110,7 +113,7 @@ def _worse_score(reason: Reason) -> str:
         said.append(f"{'farther' if is_farther else 'nearer'}: {_ms(far)}, not {_ms(near)}")
         better = better or not is_farther
     if not said:
-        return f"as good as `{chosen.location}`, and later by name (slot {reason.slot})"
+        return f"as good as `{chosen.location}`, which is first by name (slot {reason.slot})"
     return f"{(' but ' if better else ', ').join(said)} (slot {reason.slot})"
 
 
@@ -128,9 +131,9 @@ def _never_ready(reason: Reason) -> str:
 
 def _max_hours(reason: Reason) -> str:
     if reason.seconds is None:
-        return "`max_hours` is over"
+        return "`max_hours` has passed"
     hours = reason.seconds / 3600
-    return f"its {hours:g} hours (`max_hours`) are over: the pool ends by itself"
+    return f"`max_hours` ({hours:g}) has passed: the pool is shutting down"
 
 
 _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
@@ -138,17 +141,18 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.NOT_READY: "not ready after {r.seconds:.0f} s",
     Cause.NOT_SET_UP: "still setting up after {r.seconds:.0f} s",
     Cause.NOTICE: "preemption notice",
-    Cause.DRAINS_ITSELF: "it asked to be left alone",
+    Cause.DRAINS_ITSELF: "the replica is draining",
     Cause.SILENT: "silent for {r.seconds:.0f} s",
-    Cause.DISAGREES: "its answers differ from those of the others",
+    Cause.DISAGREES: "its answers differ from the other replicas'",
+    Cause.MISREAD: "its answers cannot be read as responses of the service's type",
     Cause.AT_RISK: "the cloud recommends to move it (rebalance)",
-    Cause.SERVICE_AWAY: "its service has been away for {r.seconds:.0f} s",
+    Cause.SERVICE_AWAY: "its service has been unavailable for {r.seconds:.0f} s",
     Cause.DRAINED: "drained by the user",
     Cause.EXCLUDED: lambda r: (
         f"excluded location {r.location}" if r.location else "excluded by `fogft exclude`"
     ),
     Cause.NO_GROUP: "its group is not in the pool file",
-    Cause.OUTDATED: "outdated by another version",
+    Cause.OUTDATED: "runs an outdated version",
     Cause.SUPERSEDED: "superseded by {r.replica}",
     Cause.BETTER_SPREAD: "moves to {r.location}: better spread",
     Cause.BETTER_SCORE: "moves to {r.location}: {r.share:.0%} better",
@@ -164,10 +168,10 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.FOLLOWS: lambda r: _launch(f"follows {r.replica}", r.because),
     Cause.NEW_SLOT: lambda r: _launch("fills a new slot", r.because),
     Cause.STANDS_IN: "stands in until enough spot machines are ready",
-    Cause.FAILED_LONGEST_AGO: "all rest, and this location longest",
-    Cause.NOTHING_OFFERED: "nothing is offered for these resources now",
+    Cause.FAILED_LONGEST_AGO: "all locations are backing off, this one longest",
+    Cause.NOTHING_OFFERED: "no cloud offers these resources at the moment",
     Cause.IMPOSSIBLE_PRICE: _impossible_price,
-    Cause.LOCATION_FULL: "a location must not hold more of the replicas",
+    Cause.LOCATION_FULL: "a location may not hold more of the replicas",
     Cause.ALL_EXCLUDED: "every offered location is excluded",
     Cause.BACKING_OFF: _backing_off,
     Cause.ALL_BACKING_OFF: _all_backing_off,
@@ -176,27 +180,27 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
         f"waiting to {'replace' if r.replica else 'launch'} slot {r.slot}: "
         "`max_surge` allows no more machines now"
     ),
-    Cause.WAITS: "slot {r.slot} waits{after}",
+    Cause.WAITS: "slot {r.slot} is waiting{after}",
     Cause.NO_ROOM_TO_UPDATE: (
-        "slot {r.slot} is not updated: there is no room for both, and no other one that "
-        "answers meanwhile; raise `max_usd_per_hour` or `max_surge`"
+        "slot {r.slot} is not updated: there is no room for both, and no other replica "
+        "to answer meanwhile; raise `max_usd_per_hour` or `max_surge`"
     ),
     Cause.OLD_BEFORE_NEW: "slot {r.slot}: no room for both, so old before new",
-    Cause.OTHER_KIND: "nothing of its kind is launched",
+    Cause.OTHER_KIND: "no machine of this kind is needed",
     Cause.OTHER_MARKET: _other_market,
     Cause.WORSE_SCORE: _worse_score,
-    Cause.LOST_THERE: ("avoided for {minutes:.0f} min more: a replica was lost there"),
-    Cause.CROWDED: ("spread: `{r.location}` has {r.count} already when slot {r.slot} is placed"),
+    Cause.LOST_THERE: ("avoided for {minutes:.0f} min more after a replica was lost there"),
+    Cause.CROWDED: ("spread: `{r.location}` already has {r.count} when slot {r.slot} is placed"),
     Cause.NEVER_READY: _never_ready,
     Cause.LAUNCH_LIMIT: (
-        "{r.count} machines were launched within an hour, which is the most: the next one waits"
+        "{r.count} machines were launched within an hour, which is the limit: the next one waits"
     ),
-    Cause.SCHEDULED_AHEAD: "launching ahead of the schedule's next window",
+    Cause.SCHEDULED_AHEAD: "launching ahead of the next schedule window",
     Cause.TARGET_UNMET: (
         "`availability: {r.target:g}` cannot be met: {r.count} replicas are expected "
         "to reach {r.share:.6g}, and {main}"
     ),
-    Cause.MOST_REPLICAS: "{r.count} is the most",
+    Cause.MOST_REPLICAS: "{r.count} is the maximum",
     Cause.OVER_CAP: _over_cap,
     Cause.UPDATING: ("update in progress: {r.count} of {r.of} replicas run the new version"),
     Cause.UPDATE_STOPPED: (
@@ -205,32 +209,35 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     ),
     Cause.ROLLED_BACK: ("update rolled back, {main}: the pool runs the last good file"),
     Cause.REPLICA_FAILS: "replica {r.replica}{after}",
-    Cause.TYPES_DIFFER: lambda r: r.words or "its types are not the same on both sides",
-    Cause.RUN_ENDS: "`run` ended {r.count} times{in_brackets}",
+    Cause.TYPES_DIFFER: lambda r: r.words or "its types differ between robot and replica",
+    Cause.RUN_ENDS: "`run` exited {r.count} times{in_brackets}",
     Cause.MORE_ERRORS: _more_errors,
     Cause.LAUNCHES_FAIL: "{r.count} launches failed ({names}), and none served",
-    Cause.CLOUD_UNREACHABLE: "the cloud cannot be reached: nothing is changed",
+    Cause.CLOUD_UNREACHABLE: "the cloud cannot be reached: nothing is launched or ended",
     Cause.NO_ANSWER: "the cloud did not answer: {r.words}",
-    Cause.NO_PRICES: "no prices can be had: {r.words}",
-    Cause.UPLINK_SUSPECTED: "all links are silent together: the robot's uplink is suspected",
+    Cause.NO_PRICES: "no prices are available: {r.words}",
+    Cause.UPLINK_SUSPECTED: "all links are silent at once: the robot's uplink is suspected",
     Cause.NOBODY_HEARD: "nothing is ended while no replica can be heard",
-    Cause.ENDS_SOON: ("the pool ends by itself in {minutes:.0f} min (`max_hours`)"),
+    Cause.ENDS_SOON: ("the pool shuts down in {minutes:.0f} min (`max_hours`)"),
     Cause.CLOCK_SET: _clock_set,
     Cause.CLOCK_DOUBTED: (
-        "the clock was set by {r.seconds:+.0f} s: nothing is launched or ended for it; "
-        "schedules follow once it has stood for a minute"
+        "the clock was set by {r.seconds:+.0f} s: nothing is launched or ended because of it; "
+        "schedules follow in a minute"
     ),
     Cause.SLEPT: "this machine slept for {r.seconds:.0f} s",
-    Cause.NO_MANAGER: "no manager runs: the cloud was asked directly",
+    Cause.NO_MANAGER: "no manager is running: asked the cloud directly",
     Cause.NO_PROXY_REPORT: "the client proxy has not reported yet",
     Cause.STALE_PROXY_REPORT: "the client proxy has not reported lately",
     Cause.PROXY_KEEPS_ENDING: (
-        "the client proxy has ended {r.count} times in a row; its log is `{r.name}`"
+        "the client proxy exited {r.count} times in a row; its log is `{r.name}`"
     ),
     Cause.NO_CERTIFICATE: (
         "gateway `{r.name}` has no certificate: `fogft credentials issue gateway {r.name}`"
     ),
     Cause.NO_RENDEZVOUS: "no rendezvous can be reached: {r.words}",
     Cause.NOT_OFFERED: "`{r.name}` is not offered here: {r.words}",
+    Cause.OUTVOTED: (
+        "`{r.name}` is not offered here: not more than half of {r.of} replicas offer it"
+    ),
     Cause.TROUBLE: "{r.words}",
 }

@@ -19,7 +19,7 @@ def folder() -> Path:
             return candidate
     raise FogftError(
         f"the templates are missing from the installation in `{package}`",
-        "install fogft again",
+        "reinstall fogft",
     )
 
 

@@ -12,6 +12,7 @@ import importlib.util
 import os
 import shutil
 import socket
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ from tests.link.namespaces import can_make_namespaces
 from tests.nightly import NIGHTLY
 
 WEIGHTS = Path(__file__).parents[1] / "templates" / "detect" / "weights"
+FAST_DDS = "rmw_fastrtps_cpp"
 SKYPILOT_QUEUE_PORT = 50011  # of every API server: it cannot be chosen
 
 
@@ -52,19 +54,44 @@ def _queue_port_is_free() -> bool:
         return one.connect_ex(("127.0.0.1", SKYPILOT_QUEUE_PORT)) != 0
 
 
+def _commit_of(version: str) -> str:
+    """Return the commit that set a version; empty where the history does not have it."""
+    wanted = ["log", "--format=%H", "--reverse", f'-S__version__ = "{version}"', "--"]
+    try:
+        found = subprocess.run(
+            ["git", *wanted, "fogft/__init__.py"],
+            cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    except FileNotFoundError:
+        return ""
+    return found.stdout.partition("\n")[0]
+
+
+BEFORE = _commit_of("0.2.0")  # what this version has to work with
 NEEDS = {
     "apriltags": Need(_installed("pupil_apriltags"), "scripts/setup demo"),
     "arm64": Need(lambda: "FOGFT_ARM64" in os.environ, "scripts/test-arm64"),
     "build": Need(_can_build, "scripts/setup ros-test, apt install g++ cmake ninja-build"),
+    "browser": Need(
+        lambda: bool(shutil.which("chromedriver") and importlib.util.find_spec("selenium")),
+        "scripts/setup docs, apt install chromium-driver",
+    ),
     "colcon": Need(_installed("colcon_core"), "scripts/setup ros-test"),
     "cores": Need(lambda: len(os.sched_getaffinity(0)) > 1, "a second processor"),
+    "cyclonedds": Need(_installed("cyclonedds"), "pip install cyclonedds"),
     "egl": Need(
         lambda: bool(ctypes.util.find_library("EGL")), "apt install libegl1 libgl1-mesa-dri"
     ),
     "etcd": Need(lambda: bool(shutil.which("etcd")), "apt install etcd-server"),
+    "fastdds": Need(
+        lambda: os.environ.get("RMW_IMPLEMENTATION", FAST_DDS) == FAST_DDS,
+        f"RMW_IMPLEMENTATION={FAST_DDS}: it looks at what Fast DDS alone does",
+    ),
+    "history": Need(lambda: bool(BEFORE), "a clone with the commit that set version 0.2.0"),
     "launch": Need(_installed("launch", "launch_ros"), "a ROS 2 installation with launch_ros"),
     "litert": Need(_installed("ai_edge_litert"), "scripts/setup vision"),
     "matplotlib": Need(_installed("matplotlib"), "scripts/setup plot"),
+    "mkdocs": Need(_installed("mkdocs", "material"), "scripts/setup docs"),
     "moto": Need(_installed("moto", "boto3", "flask"), "scripts/test-sky --quick"),
     "mujoco": Need(_installed("mujoco"), "scripts/setup vision"),
     "namespaces": Need(can_make_namespaces, "root and `ip`, for network namespaces"),
@@ -73,12 +100,14 @@ NEEDS = {
     "numpy": Need(_installed("numpy"), "scripts/setup demo"),
     "ompl": Need(_installed("ompl"), "scripts/setup demo"),
     "pillow": Need(_installed("PIL"), "scripts/setup demo"),
+    "prometheus": Need(lambda: bool(shutil.which("prometheus")), "apt install prometheus"),
     "promtool": Need(lambda: bool(shutil.which("promtool")), "apt install prometheus"),
     "pyzeros": Need(_installed("pyzeros"), "Python 3.11 and scripts/setup ros-test"),
     "rclpy": Need(_installed("rclpy"), "scripts/setup ros, or a sourced ROS 2 installation"),
     "ros2service": Need(_installed("ros2service"), "a ROS 2 installation with ros2service"),
     "skypilot": Need(_installed("sky"), "scripts/test-sky --quick"),
     "skypilot-port": Need(_queue_port_is_free, "no other API server of SkyPilot's here"),
+    "systemd": Need(lambda: bool(shutil.which("systemd-analyze")), "apt install systemd"),
     "test_msgs": Need(_installed("test_msgs"), "scripts/setup ros-test"),
     "tomllib": Need(_installed("tomllib"), "Python 3.11"),
     "torch": Need(_installed("torch", "transformers"), "scripts/setup vision"),

@@ -39,20 +39,20 @@ def test_every_cause_has_words(cause: Cause) -> None:
                 replica="1.2",
                 because=(Reason(Cause.SILENT, seconds=8.2), Reason(Cause.FAILED_LONGEST_AGO)),
             ),
-            "replaces 1.2: silent for 8 s; all rest, and this location longest",
+            "replaces 1.2: silent for 8 s; all locations are backing off, this one longest",
         ),
         (
             Reason(
                 Cause.ALL_BACKING_OFF, because=(Reason(Cause.QUOTA, location="aws/us-west-2/a"),)
             ),
-            "every location rests after failures (`aws/us-west-2/a`: quota)",
+            "every location is backing off after failures (`aws/us-west-2/a`: quota)",
         ),
         (
             Reason(Cause.LOST_THERE, seconds=240.0),
-            "avoided for 4 min more: a replica was lost there",
+            "avoided for 4 min more after a replica was lost there",
         ),
-        (Reason(Cause.RUN_ENDS, count=4, words="exit 1"), "`run` ended 4 times (exit 1)"),
-        (Reason(Cause.ENDS_SOON, seconds=300.0), "the pool ends by itself in 5 min (`max_hours`)"),
+        (Reason(Cause.RUN_ENDS, count=4, words="exit 1"), "`run` exited 4 times (exit 1)"),
+        (Reason(Cause.ENDS_SOON, seconds=300.0), "the pool shuts down in 5 min (`max_hours`)"),
         (
             Reason(Cause.CLOCK_SET, seconds=-3600.0, because=(Reason(Cause.SLEPT, seconds=60.0),)),
             "the clock was set back by 3600 s and this machine slept for 60 s",

@@ -33,7 +33,7 @@ class TestFolder:
         monkeypatch.setattr(template_files, "__file__", str(tmp_path / "fogft" / "x.py"))
         with pytest.raises(FogftError, match=r"^the templates are missing") as caught:
             template_files.folder()
-        assert caught.value.hint == "install fogft again"
+        assert caught.value.hint == "reinstall fogft"
 
 
 def contents(folder):
@@ -128,14 +128,14 @@ class TestRefusals:
         (tmp_path / "pool.yaml").mkdir()
         assert self.refuse(tmp_path, "echo", tmp_path, force=force) == (
             f"`{tmp_path}/pool.yaml` is a folder",
-            "choose another place with `--into DIR`",
+            "choose another folder with `--into DIR`",
         )
 
     def test_the_target_is_a_file(self, tmp_path):
         (tmp_path / "a").write_text("x")
         assert self.refuse(tmp_path, "echo", tmp_path / "a") == (
             f"`{tmp_path}/a` is not a folder",
-            "choose another with `--into DIR`",
+            "choose another folder with `--into DIR`",
         )
         assert self.refuse(tmp_path, "echo", tmp_path / "a" / "b")[0].endswith(
             "cannot be written: Not a directory"

@@ -19,9 +19,9 @@ from fogft.cli.options import PoolOption, Slot
 if TYPE_CHECKING:
     from fogft.pool.folder.store import PoolStore
 
-Count = Annotated[int, typer.Argument(min=1, max=16, metavar="N", help="How many.")]
+Count = Annotated[int, typer.Argument(min=1, max=16, metavar="N", help="Number of replicas.")]
 
-Wait = Annotated[bool, typer.Option("--wait", help="Return once it is done.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Wait until it is done.")]
 
 
 scale = group("Add or remove replicas.")
@@ -31,7 +31,7 @@ scale = group("Add or remove replicas.")
 def scale_up(count: Count, wait: Wait = False, pool: PoolOption = None) -> None:
     """Add N replicas.
 
-    This holds until `replicas` changes in the pool file.
+    In effect until `replicas` changes in the pool file.
     """
     _scale(pool, count, wait=wait)
 
@@ -40,7 +40,7 @@ def scale_up(count: Count, wait: Wait = False, pool: PoolOption = None) -> None:
 def scale_down(count: Count, wait: Wait = False, pool: PoolOption = None) -> None:
     """Remove N replicas; at least one stays.
 
-    This holds until `replicas` changes in the pool file. Replicas that are removed finish
+    In effect until `replicas` changes in the pool file. Replicas that are removed finish
     their requests first.
     """
     _scale(pool, -count, wait=wait)
@@ -63,7 +63,7 @@ def drain(slot: Slot, wait: Wait = False, pool: PoolOption = None) -> None:
         progress.settle(store, Settled(since, (slot, generation)), f"has not replaced `{replica}`")
         output.done(f"replica `{replica}` of `{store.name}` is replaced")
         return
-    output.done(f"replica `{replica}` of `{store.name}` will be replaced")
+    output.done(f"replica `{replica}` of `{store.name}` is being replaced")
     _warn_without_manager(store)
 
 
@@ -78,7 +78,7 @@ def exclude(
     ],
     pool: PoolOption = None,
 ) -> None:
-    """Launch nothing in a location, and move replicas out of it."""
+    """Stop using a location, and move replicas out of it."""
     from fogft.pool.commands import change, composition
 
     store = composition.store_of(pool)
@@ -102,17 +102,17 @@ def include(
 
     store = composition.store_of(pool)
     change.include(store, location)
-    output.done(f"`{location}` may be used by `{store.name}` again")
+    output.done(f"`{location}` is allowed for `{store.name}` again")
     _warn_without_manager(store)
 
 
 def retry(pool: PoolOption = None) -> None:
-    """Launch replicas again after the pool has given up on its file."""
+    """Launch replicas again after a pool file was given up."""
     from fogft.pool.commands import change, composition
 
     store = composition.store_of(pool)
     change.retry(store, time.time())
-    output.done(f"`{store.name}` will launch replicas again")
+    output.done(f"`{store.name}` launches replicas again")
     _warn_without_manager(store)
 
 
@@ -128,11 +128,11 @@ def _scale(pool: str | None, by: int, *, wait: bool) -> None:
         progress.settle(store, Settled(since), f"does not have {after} replicas")
         output.done(f"`{store.name}` has {after} replicas (had {before})")
         return
-    output.done(f"`{store.name}` will have {after} replicas (was {before})")
+    output.done(f"`{store.name}` is scaling from {before} to {after} replicas")
     _warn_without_manager(store)
 
 
 def _warn_without_manager(store: PoolStore) -> None:
     if not disk.is_locked(store.paths.manager_lock):
-        output.warn(f"`{store.name}` has no manager: this takes effect once it has one")
+        output.warn(f"`{store.name}` has no manager: this takes effect once one is running")
         output.hint(f"start it with `fogft up {store.identity().file}`")

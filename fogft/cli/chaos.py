@@ -1,4 +1,4 @@
-"""``fogft chaos``: make things go wrong in a pool on the local cloud, on purpose."""
+"""``fogft chaos``: inject faults into a pool on the local cloud."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Duration = Annotated[
 ]
 
 
-chaos = group("Make things go wrong in a pool on the local cloud.")
+chaos = group("Inject faults into a pool on the local cloud.")
 
 
 @chaos.command(cls=Command, epilog="fogft chaos preempt 0")
@@ -41,10 +41,12 @@ def preempt(
     ] = None,
     pool: PoolOption = None,
 ) -> None:
-    """Preempt a replica's machine as a spot market does: a notice, then the end."""
+    """Preempt a replica's machine as a spot market does: a notice, then termination."""
     machine = _machine(pool, slot)
     left_s = _chaos().preempt(machine, notice)
-    output.done(f"replica `{machine.short}` got notice and ends in {left_s:.0f} s")
+    output.done(
+        f"replica `{machine.short}` received a preemption notice and ends in {left_s:.0f} s"
+    )
 
 
 @chaos.command(cls=Command, epilog="fogft chaos kill 0")
@@ -65,13 +67,13 @@ def freeze(slot: Slot, pool: PoolOption = None) -> None:
 
 @chaos.command(cls=Command, epilog="fogft chaos thaw 1")
 def thaw(slot: Slot, pool: PoolOption = None) -> None:
-    """Let a frozen machine continue."""
+    """Resume a frozen machine."""
     machine = _machine(pool, slot)
     count = _chaos().thaw(machine)
     if not count:
-        output.say(f"replica `{machine.short}` was not frozen: nothing was done")
+        output.say(f"replica `{machine.short}` was not frozen; nothing changed")
         return
-    output.done(f"replica `{machine.short}` continues ({count} processes)")
+    output.done(f"replica `{machine.short}` is running again ({count} processes)")
 
 
 @chaos.command(cls=Command, epilog="fogft chaos slow 1 80")
@@ -90,8 +92,8 @@ def slow(
     machine = _machine(pool, slot)
     bytes_per_s = None if rate is None else rate * 1e6 / 8
     _chaos().slow(machine, delay_ms / 1000, bytes_per_s, lasting)
-    limit = "" if rate is None else f" and passes {rate:g} Mbit/s"
-    output.done(f"the link to `{machine.short}` takes {delay_ms:g} ms longer each way{limit}")
+    limit = "" if rate is None else f" and limited to {rate:g} Mbit/s"
+    output.done(f"the link to `{machine.short}` is delayed by {delay_ms:g} ms each way{limit}")
 
 
 @chaos.command(cls=Command, epilog="fogft chaos blackhole 1")
@@ -104,27 +106,27 @@ def blackhole(slot: Slot, lasting: Duration = None, pool: PoolOption = None) -> 
 
 @chaos.command(cls=Command, epilog="fogft chaos outage local/us-west-2")
 def outage(location: Location, lasting: Duration = None) -> None:
-    """End all machines in a location, and launch none there."""
+    """End all machines in a location, and refuse launches there."""
     hit = _chaos().outage(location, lasting)
     names = ", ".join(f"`{machine.short}`" for machine in hit) or "no machine"
-    output.done(f"`{location}` is out; this ends {names}")
+    output.done(f"outage in `{location}`; this ends {names}")
 
 
 @chaos.command(cls=Command, epilog="fogft chaos capacity local/us-west-2 0")
 def capacity(
     location: Location,
-    machines: Annotated[int, typer.Argument(min=0, metavar="N", help="How many machines fit.")],
+    machines: Annotated[int, typer.Argument(min=0, metavar="N", help="Number of machines.")],
 ) -> None:
-    """Limit how many machines fit into a location."""
+    """Limit the capacity of a location."""
     _chaos().capacity(location, machines)
-    output.done(f"`{location}` has room for {machines} machines; those that run stay")
+    output.done(f"`{location}` now has capacity for {machines} machines; running ones stay")
 
 
 @chaos.command(cls=Command, epilog="fogft chaos clear")
 def clear() -> None:
-    """Undo slow and dead links, frozen machines, outages and capacity limits."""
+    """Clear all injected faults: links, frozen machines, outages and capacity limits."""
     _chaos().clear()
-    output.done("all faults made on purpose are undone")
+    output.done("all injected faults cleared")
 
 
 def _chaos() -> Chaos:
@@ -143,6 +145,6 @@ def _machine(pool: str | None, slot: int) -> ReplicaId:
     if not found:
         known = known_slots(machine.id.slot for machine in machines)
         raise FogftError(
-            f"no machine runs in slot {slot} of `{identity.name}`", f"slots with one: {known}"
+            f"no machine is running in slot {slot} of `{identity.name}`", f"slots in use: {known}"
         )
     return max(found)

@@ -7,6 +7,7 @@ group of commands.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
@@ -15,37 +16,43 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from fogft.errors import FogftError
+
 # Section -> command -> its module in this package, and the arguments of an example.
 SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
-    "Begin and end": {
+    "Start and stop": {
         "init": ("lifecycle", "planner --into my_pool"),
         "up": ("lifecycle", "pool.yaml"),
         "join": ("credentials", "ada.join"),
         "down": ("lifecycle", ""),
         "sweep": ("sweep", ""),
     },
-    "Look": {
+    "Inspect": {
         "check": ("plan", "pool.yaml"),
         "plan": ("plan", "pool.yaml"),
         "list": ("overview", ""),
         "status": ("status", "--watch"),
+        "top": ("screens.top", ""),
         "events": ("overview", "-n 20"),
+        "cost": ("overview", ""),
+        "report": ("screens.report", "planner --into planner.html"),
         "logs": ("status", "2 -f"),
         "doctor": ("doctor", "pool.yaml"),
     },
-    "Change what runs": {
+    "Change a running pool": {
         "scale": ("change", ""),
         "drain": ("change", "2"),
         "exclude": ("change", "local/us-west-2"),
         "include": ("change", "local/us-west-2"),
         "retry": ("change", ""),
         "credentials": ("credentials", ""),
+        "service": ("parts", ""),
     },
-    "Try what happens when": {
+    "Simulate and inject faults": {
         "simulate": ("simulate", "pool.yaml --traces recorded/ --plot report.png"),
         "chaos": ("chaos", ""),
     },
-    "Run one part by hand": {
+    "Run one part in the foreground": {
         "proxy": ("parts", "--config ~/.local/state/fogft/pools/planner/proxy.yaml"),
         "serve": ("parts", "--config replica.yaml --listen 0.0.0.0:7448"),
         "manager": ("parts", "planner"),
@@ -53,6 +60,7 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "gateway": ("parts", "--config gateway.yaml --listen 0.0.0.0:7470"),
     },
 }
+ANYWHERE = frozenset({"check", "init", "plan", "simulate"})  # the others need Linux
 _WHOLE = 1000  # of a description: it is folded, not cut
 _COMMANDS = {name: row for names in SECTIONS.values() for name, row in names.items()}
 
@@ -70,11 +78,29 @@ class _Loaded(Mapping[str, Any]):
 
 @cache
 def _load(name: str, module: str, example: str) -> Any:
+    if sys.platform != "linux" and name not in ANYWHERE:
+        return _elsewhere(name)
     found = getattr(import_module(f"fogft.cli.{module}"), name)
     if isinstance(found, typer.Typer):
         return typer.main.get_command(found)
     alone = typer.Typer(add_completion=False)
     alone.command(name, cls=Command, epilog=f"fogft {name} {example}")(found)
+    return typer.main.get_command(alone)
+
+
+def _elsewhere(name: str) -> Any:
+    """Return a command that says that it needs Linux, whatever it is given."""
+
+    def refuse() -> None:
+        raise FogftError(
+            f"`fogft {name}` needs Linux; this is {sys.platform}",
+            f"here work: {', '.join(f'`fogft {one}`' for one in sorted(ANYWHERE))}; in WSL, in a "
+            "container or on a Linux machine, everything does",
+        )
+
+    alone = typer.Typer(add_completion=False)
+    anything = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
+    alone.command(name, help="Needs Linux.", context_settings=anything)(refuse)
     return typer.main.get_command(alone)
 
 

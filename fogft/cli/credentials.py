@@ -43,21 +43,21 @@ credentials = group("Issue, list, revoke and rotate certificates.")
 @credentials.command(cls=Command, epilog="fogft credentials issue robot ada")
 def issue(
     role: RoleName,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Its name; a replica's slot.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name; for a replica, its slot.")],
     *,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="FILE", help="The file to write.")
     ] = None,
     hours: Annotated[
-        float, typer.Option(min=0.1, max=720, metavar="H", help="How long it can be used.")
+        float, typer.Option(min=0.1, max=720, metavar="H", help="Hours until it expires.")
     ] = DAY_H,
     passphrase_file: PassphraseFile = None,
     pool: PoolOption = None,
 ) -> None:
-    """Write a join bundle: one file that admits another machine to the pool, once.
+    """Write a join bundle: a file that lets another machine into the pool, once.
 
-    Without a passphrase of your own, one is generated and shown. Send it by another way than
-    the file.
+    Without a passphrase of your own, one is generated and shown. Send it separately from the
+    file.
     """
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import issue_credentials
@@ -110,7 +110,7 @@ def revoke(
     ],
     pool: PoolOption = None,
 ) -> None:
-    """Revoke certificates: every link to their holder is closed for good.
+    """Revoke certificates: every link to their holder is closed permanently.
 
     A replica whose certificate is revoked is replaced.
     """
@@ -120,10 +120,12 @@ def revoke(
     holders, told = revoke_credentials(composition.store_of(pool), _role(role), name)
     listed = ", ".join(f"`{holder.short}`" for holder in holders)
     if told:
-        output.done(f"{role} {listed} is no longer admitted")
+        output.done(f"{role} {listed} is revoked")
     else:
-        output.warn(f"{role} {listed} is revoked, but without a manager the others do not know")
-        output.hint("`fogft up` starts one")
+        output.warn(
+            f"{role} {listed} is revoked, but without a running manager other members are not told"
+        )
+        output.hint("start one with `fogft up`")
 
 
 @credentials.command(cls=Command, epilog="fogft credentials rotate robot")
@@ -134,11 +136,11 @@ def rotate(
     ] = "",
     pool: PoolOption = None,
 ) -> None:
-    """Give the robot or the replicas new keys and certificates, without losing a request.
+    """Renew keys and certificates of the robot or the replicas, without losing a request.
 
-    The robot's links go over to the new ones while requests flow; then the old ones are
-    taken back. Replicas are replaced, the new one first. For a robot or a gateway on another
-    machine issue a new bundle, join there with it, and revoke the old generation.
+    The robot's links switch to the new ones while requests flow; then the old ones are
+    revoked. Replicas are replaced, the new one first. For a robot or gateway on another
+    machine, issue a new bundle, join there, and revoke the old generation.
     """
     from fogft.model.credentials import Role
     from fogft.pool.commands import composition
@@ -161,13 +163,17 @@ def rotate(
     holder, old, in_use = rotate_robot(store)
     if not in_use:
         output.warn(
-            f"robot `{holder.short}` is certified, but its client proxy does not use it yet"
+            f"robot `{holder.short}` has a new certificate, but its "
+            "client proxy does not use it yet"
         )
         listed = " ".join(h.short for h in old)
-        output.hint(f"the old one stays valid; later run `fogft credentials revoke robot {listed}`")
+        output.hint(
+            "the old one stays valid; once the new one is in use, run `fogft "
+            f"credentials revoke robot {listed}`"
+        )
         return
     taken = f"; `{'`, `'.join(h.short for h in old)}` is revoked" if old else ""
-    output.done(f"all links use the keys of robot `{holder.short}`{taken}")
+    output.done(f"all links use the new keys of robot `{holder.short}`{taken}")
 
 
 def join(
@@ -176,11 +182,11 @@ def join(
     ],
     passphrase_file: PassphraseFile = None,
 ) -> None:
-    """Make this machine a robot, gateway or replica, from a join bundle.
+    """Join a pool as a robot, gateway or replica, with a join bundle.
 
-    The file is good for one time, on one machine: where the pool has a rendezvous, that is asked,
-    so one has to run. Then the file is destroyed. To give a robot new keys, join again with a
-    new bundle: a proxy that runs takes them into use without losing a request.
+    A bundle can be used once, on one machine; the file is then deleted. If the pool has a
+    rendezvous, one must be running. To give a robot new keys, join again with a new bundle: a
+    running proxy picks them up without losing a request.
     """
     from fogft.pool.commands import joining
     from fogft.pool.commands.credentials import join_here
@@ -191,7 +197,7 @@ def join(
     output.say(f"this bundle is for {whom}")
     joined = join_here(bundle, _read_passphrase(passphrase_file))
     output.data(str(joined.config))
-    output.done(f"this machine is {whom}")
+    output.done(f"this machine has joined as {whom}")
     if joined.alone:
         output.warn(_alone(joined.holder))
     output.hint(f"start it with `fogft {joined.command} --config {joined.config}`")

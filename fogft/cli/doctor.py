@@ -24,7 +24,7 @@ def doctor(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check this machine, ROS 2 and the pools, and say what to do.
+    """Check this machine, ROS 2 and the pools, and suggest fixes.
 
     Each finding comes with its remedy. Changes nothing. Exit status 1 when something does not work.
     """
@@ -40,7 +40,7 @@ def doctor(
         output.json_data([asdict(finding) for finding in found])
     failed = sum(f.verdict is Verdict.FAIL for f in found)
     warned = sum(f.verdict is Verdict.WARN for f in found)
-    output.say(f"\n{len(found)} checks: {failed} failed, {warned} to look at")
+    output.say(f"\n{len(found)} checks: {failed} failed, {warned} warnings")
     if failed:
         raise typer.Exit(1)
 

@@ -9,17 +9,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fogft import __version__
 from fogft.cli import options, output
 from fogft.cli.options import DEFAULT_FILE, PoolArgument, PoolFile, PoolOption
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from fogft.pool.commands.current import Seen
+    from fogft.pool.manager.status import PoolStatus
 
 
 def init(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Which example.", autocompletion=options.examples)
+        str,
+        typer.Argument(
+            metavar="NAME", help="Name of the example.", autocompletion=options.examples
+        ),
     ] = "",
     into: Annotated[
         Path | None,
@@ -27,7 +32,7 @@ def init(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
     schema: Annotated[
-        bool, typer.Option("--schema", help="Print the JSON Schema of pool files, and stop.")
+        bool, typer.Option("--schema", help="Print the JSON Schema of pool files and exit.")
     ] = False,
 ) -> None:
     """Write an example pool: its pool file and its nodes."""
@@ -53,26 +58,28 @@ def up(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Where to run; by default what the file's resources name, else `local`.",
+            help="Cloud to run on; by default the one in the file, else `local`.",
         ),
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask. The local cloud never asks.")
+        bool, typer.Option("--yes", "-y", help="Skip the confirmation. The local cloud never asks.")
     ] = False,
     timeout: Annotated[
         float | None,
         typer.Option(
-            min=1, metavar="S", help="How long to wait for the services; 300, on real clouds 1800."
+            min=1,
+            metavar="S",
+            help="Seconds to wait for the services; 300, or 1800 on real clouds.",
         ),
     ] = None,
 ) -> None:
-    """Start a pool, or apply a changed pool file to a running one.
+    """Start a pool, or apply a changed pool file to a running pool.
 
-    Returns once every service answers. Replicas that still start do so in the background. A
-    changed file whose replicas have to be replaced is waited for, also by an `up` that comes while
-    the update is under way: it fails where the update is stopped and rolled back.
+    Returns once every service answers; other replicas continue to start in the background. If a
+    changed file replaces replicas, waits for the update, even one that is already in progress,
+    and fails if it is rolled back.
     """
-    from fogft.cli import progress
+    from fogft.cli import progress, status_text
     from fogft.planning.rollout import UpdateState
     from fogft.pool.commands import preview, startup, status
     from fogft.pool.commands.outcome import Awaited, Outcome
@@ -80,22 +87,27 @@ def up(
 
     order = preview.order(file, cloud, told=output.say)
     paths = PoolPaths.of(order.spec.name)
-    update = None if order.preview.is_new else status.read(paths, time.time()).status.update
+    running = "" if order.preview.is_new else startup.manager_version(paths)
+    upgrades = running not in ("", __version__)
+    old = None if order.preview.is_new or upgrades else status.read(paths, time.time())
+    update = None if old is None else old.status.update
     under_way = update is not None and update.state != UpdateState.ROLLED_BACK.value
-    progress.announce(order.preview, update if under_way else None)
-    may_cost_more = order.preview.is_new or order.preview.changes
+    progress.announce(order.preview, update if under_way else None, upgrade_from=running)
+    may_cost_more = order.preview.is_new or order.preview.changes or upgrades
     if order.preview.costs_money and may_cost_more and not yes:
         count = len(order.preview.launches) if order.preview.is_new else 0
         machines = f"{count} machine{'' if count == 1 else 's'}"
         if not output.confirm(f"launch {machines} at these prices?" if count else "continue?"):
-            output.say("nothing was done")
+            output.say("aborted: nothing was changed")
             raise typer.Exit(1)
     limit_s = timeout or (progress.REAL_LIMIT_S if order.preview.costs_money else progress.LIMIT_S)
     applied_at = time.time()
-    if startup.start(order) and not order.preview.is_new:
-        output.say("it had no manager: a new one takes over what runs")
+    if startup.start(order) and not order.preview.is_new and not upgrades:
+        output.say("the pool had no manager: started a new one")
+    if upgrades:
+        applied_at = time.time()  # what the old manager saw says nothing of the new one's work
     name = order.spec.name
-    replaces = order.preview.replaces_replicas or order.preview.rolled_back or under_way
+    replaces = order.preview.replaces_replicas or order.preview.rolled_back or under_way or upgrades
     awaited = Awaited(
         frozenset(service.name for service in order.spec.services),
         applied_at,
@@ -104,23 +116,23 @@ def up(
     try:
         seen, outcome = progress.wait(paths, awaited, limit_s)
     except KeyboardInterrupt:
-        output.say(f"interrupted: `{name}` continues to start; `fogft down {name}` ends it")
+        output.say(f"interrupted: `{name}` continues to start; `fogft down {name}` shuts it down")
         raise typer.Exit(130) from None
     if outcome is Outcome.WITHDRAWN and seen.status.update is not None:
         raise FogftError(
             f"`{name}` was not updated: {seen.status.update.fault}",
-            "see `fogft logs`; change the file and `fogft up` it again: this one is not retried",
+            "see `fogft logs`; this file is not tried again: change it and run `fogft up`",
         )
     if outcome is not Outcome.ANSWERING:
         what = {
-            Outcome.RUN_KEEPS_ENDING: "does not answer: `run` keeps ending",
+            Outcome.RUN_KEEPS_ENDING: "does not answer: `run` keeps exiting",
             Outcome.NEVER_READY: "does not answer: no replica was ever ready",
             Outcome.TYPES_DIFFER: "cannot answer: robot and replicas define its type differently",
         }
         raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
     found = seen.status
     if not found.target:
-        output.done(f"`{name}` is set up; its schedule asks for no replica now")
+        output.done(f"`{name}` is set up; its schedule wants no replica now")
         return
     missing = max(0, found.target - found.ready)
     rest = f"; {missing} more starting, see `fogft status`" if missing else ""
@@ -128,7 +140,15 @@ def up(
         rest = "; the update continues, see `fogft status`"
     for service in () if awaited.services else found.services:
         output.say(f"offers {service.name} ({service.type})")
+    for trouble in status_text.troubles(found):
+        output.warn(trouble)
     output.done(f"`{name}` answers, with {found.ready} of {found.target} replicas ready{rest}")
+
+
+def services_at_fault(status: PoolStatus) -> list[str]:
+    """Return the services that cannot be answered; where types differ, those of such types."""
+    differing = {name for one in status.replicas for name in one.differing}
+    return sorted(differing) or [one.name for one in status.services if not one.ready_replicas]
 
 
 def not_answering(seen: Seen, what: str) -> FogftError:
@@ -138,8 +158,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     from fogft.pool.commands.outcome import is_given_up
 
     status = seen.status
-    silent = [service.name for service in status.services if not service.ready_replicas]
-    listed = ", ".join(f"`{name}`" for name in silent) or (
+    listed = ", ".join(f"`{name}`" for name in services_at_fault(status)) or (
         "the client proxy" if status.services else "`run`"
     )
     lines = [f"{listed} of `{status.pool}` {what}"]
@@ -152,33 +171,36 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     lines += [f"  {line}" for line in logfile.tail(path, lines=8).splitlines()]
     tries = "the manager keeps trying: see `fogft status` and `fogft logs`"
     if is_given_up(seen):
-        tries = "change the file and `fogft up` it again, or `fogft retry`; nothing costs money now"
+        tries = "change the file and run `fogft up` again, or `fogft retry`; nothing is running now"
     return FogftError("\n".join(lines), f"{tries}; `fogft down {status.pool}` ends it")
 
 
 def down(
     pool: PoolArgument = None,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask. Without a terminal, nothing is asked.")
+        bool,
+        typer.Option(
+            "--yes", "-y", help="Skip the confirmation. Without a terminal there is none."
+        ),
     ] = False,
     named: PoolOption = None,
 ) -> None:
-    """End a pool: its replicas, its client proxy and its manager.
+    """Shut down a pool: its replicas, client proxy and manager.
 
-    Works when the manager is dead, and is safe to repeat.
+    Works even if the manager is dead, and is safe to repeat.
     """
     from fogft.pool.commands import composition
     from fogft.pool.manager import shutdown
     from fogft.ros import shared_memory
 
     if not composition.pools():
-        output.say("nothing to end: there is no pool here")
+        output.say("no pools on this machine")
         return
     store = composition.store_of(pool or named)
     paid = store.identity().cloud != composition.LOCAL
     asks = paid and not yes and output.is_terminal(sys.stdin)
-    if asks and not output.confirm(f"end `{store.name}` and all its machines?"):
-        output.say("nothing was done")
+    if asks and not output.confirm(f"shut down `{store.name}` and all its machines?"):
+        output.say("aborted: nothing was changed")
         raise typer.Exit(1)
 
     def told(what: str) -> None:
@@ -187,6 +209,6 @@ def down(
     shutdown.end(store, composition.cloud_of, told=told, warned=output.warn)
     if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
         told(f"{len(swept)} shared-memory files of dead processes")
-    output.done(f"nothing of `{store.name}` is left")
+    output.done(f"`{store.name}` is shut down; nothing is left")
     if paid and not composition.pools():
-        output.hint("SkyPilot's own API server runs on; `sky api stop` ends one on this machine")
+        output.hint("SkyPilot's API server is still running; `sky api stop` ends it")

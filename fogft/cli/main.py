@@ -47,13 +47,13 @@ def root(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
-    """Keep ROS 2 services answering while the machines that run them come and go.
+    """Run ROS 2 services on cheap machines that come and go.
 
     \b
     fogft init          write an example pool
     fogft up            start the pool that a file describes
     fogft status        show its state
-    fogft down          end everything
+    fogft down          shut it down
     """
     if version:
         output.data(f"fogft {__version__}")

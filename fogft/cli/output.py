@@ -100,7 +100,10 @@ def confirm(question: str) -> bool:
         FogftError: There is nobody to ask.
     """
     if not is_terminal(sys.stdin):
-        raise FogftError("nobody is there to say yes", "add `--yes` to go on without being asked")
+        raise FogftError(
+            "cannot ask for confirmation: there is no terminal",
+            "add `--yes` to skip the confirmation",
+        )
     sys.stderr.write(f"{printable(question)} [y/N] ")
     sys.stderr.flush()
     return sys.stdin.readline().strip().lower() in ("y", "yes")

@@ -1,4 +1,4 @@
-"""``fogft list | events``: all pools at a glance, and what has happened to one."""
+"""``fogft list | events | cost``: all pools at a glance, what happened and what it has cost."""
 
 from __future__ import annotations
 
@@ -12,16 +12,20 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import AsJson, PoolArgument, PoolOption
-from fogft.errors import StateError
+from fogft.errors import PoolNotFound, StateError
 
 if TYPE_CHECKING:
     from rich.text import Text
+
+    from fogft.pool.folder.costs import Costs
+    from fogft.pool.folder.store import PoolStore
+    from fogft.pool.manager.status import EventStatus
 
 _ANSWERS = {True: ("yes", "green"), False: ("no", "bold red"), None: ("?", "yellow")}
 
 
 def list(as_json: AsJson = False) -> None:
-    """List the pools on this machine: which answer, and their price."""
+    """List the pools on this machine."""
     from fogft.cli.status_text import age, price
     from fogft.cli.table import table
     from fogft.pool.commands import composition
@@ -55,7 +59,7 @@ def list(as_json: AsJson = False) -> None:
         width = output.width(sys.stdout)
         output.show(table(names, rows, width=width, right=("$/H", "SEEN"), folds=("FILE",)))
     else:
-        output.say("there is no pool here")
+        output.say("no pools on this machine")
         output.hint("start one with `fogft up FILE`")
 
 
@@ -68,36 +72,111 @@ _KEYS = frozenset(
 def events(
     pool: PoolArgument = None,
     count: Annotated[
-        int, typer.Option("--lines", "-n", min=1, metavar="N", help="How many of the last ones.")
+        int, typer.Option("--lines", "-n", min=1, metavar="N", help="Number of events.")
     ] = 50,
     as_json: AsJson = False,
     named: PoolOption = None,
 ) -> None:
-    """Show what happened to a pool, when and why.
+    """Show the history of a pool.
 
-    Launches, losses, moves and updates, the oldest first. Of long ago only that is kept which a
-    decision may still need.
+    Launches, losses, moves and updates, oldest first. Old events are dropped once no decision
+    needs them.
     """
     from fogft.cli.table import table
     from fogft.model.plain import to_plain
     from fogft.pool.commands import composition
-    from fogft.pool.manager.status import event_status
 
     store = composition.store_of(pool or named)
+    if as_json:
+        output.json_data([to_plain(one) for one in _last_events(store, count)])
+        return
+    names = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
+    width = output.width(sys.stdout)
+    output.show(table(names, event_rows(store, count), width=width, folds=("LOCATION", "WHY")))
+
+
+def event_rows(store: PoolStore, count: int) -> Sequence[Sequence[str]]:
+    """Return the last events as rows of a table, the oldest first."""
+    found = _last_events(store, count)
+    return [[_when(one.at), one.event, one.replica, one.location, one.detail] for one in found]
+
+
+def _last_events(store: PoolStore, count: int) -> Sequence[EventStatus]:
+    from fogft.pool.manager.status import event_status
+
     history = store.recent(sys.maxsize)
     places = {(e.slot, e.generation): e.location for e in history if e.location}
-    found = [
+    return [
         replace(event_status(e), location=places.get((e.slot, e.generation), ""))
         for e in history[-count:]
     ]
-    if as_json:
-        output.json_data([to_plain(one) for one in found])
-        return
-    rows = [[_when(one.at), one.event, one.replica, one.location, one.detail] for one in found]
-    names = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
-    width = output.width(sys.stdout)
-    output.show(table(names, rows, width=width, folds=("LOCATION", "WHY")))
 
 
 def _when(at: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at))
+
+
+def cost(pool: PoolArgument = None, as_json: AsJson = False, named: PoolOption = None) -> None:
+    """Show what a pool has cost so far, by day (UTC) and replica.
+
+    Every look of the manager is charged at the price of that time: machines, and on real clouds
+    their disks, addresses and what leaves the cloud. Without a name, of all pools, also of those
+    that have ended.
+    """
+    from fogft.pool.folder.costs import read_all
+    from fogft.pool.folder.paths import home
+
+    name = pool or named
+    found = [one for one in read_all(home() / "costs") if name in (None, one.pool)]
+    if name is not None and not found:
+        raise PoolNotFound(f"no cost is known of a pool `{name}`", "`fogft cost` lists all of them")
+    if as_json:
+        output.json_data([_costs_json(one) for one in found])
+    elif not found:
+        output.say("nothing was spent from here")
+    else:
+        _show_costs(found)
+
+
+def _costs_json(costs: Costs) -> dict[str, Any]:
+    days: dict[str, MutableSequence[dict[str, Any]]] = {}
+    for one in costs.spent:
+        row = {key: value for key, value in vars(one).items() if key != "day"}
+        days.setdefault(one.day, []).append(row)
+    return {
+        "pool": costs.pool,
+        "uid": costs.uid,
+        "usd": costs.usd,
+        "earlier_usd": costs.before_usd,
+        "days": [
+            {"day": day, "usd": sum(row["usd"] for row in rows), "replicas": rows}
+            for day, rows in days.items()
+        ],
+    }
+
+
+def _show_costs(found: Sequence[Costs]) -> None:
+    from fogft.cli.table import table
+
+    rows: MutableSequence[Sequence[str]] = []
+    for costs in found:
+        if costs.before_usd:
+            rows.append([costs.pool, "earlier", "", "", "", "", f"{costs.before_usd:.2f}"])
+        rows.extend(
+            [
+                costs.pool,
+                one.day,
+                one.replica,
+                one.location,
+                f"{one.instance}{' spot' if one.spot else ''}",
+                f"{one.hours:.1f}",
+                f"{one.usd:.2f}",
+            ]
+            for one in costs.spent
+        )
+    names = ("POOL", "DAY", "REPLICA", "LOCATION", "INSTANCE", "HOURS", "$")
+    width = output.width(sys.stdout)
+    output.show(table(names, rows, width=width, right=("HOURS", "$"), folds=("LOCATION",)))
+    output.data("")
+    for costs in found:
+        output.data(f"{costs.pool}: ${costs.usd:.2f}")

@@ -6,11 +6,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft.cli import options
+from fogft.cli import options, output
+from fogft.cli.commands import Command, group
+from fogft.cli.options import PoolOption
+
+if TYPE_CHECKING:
+    from fogft.pool.commands.service import Unit
 
 
 def _endpoint(value: str | None) -> str | None:
@@ -23,31 +28,38 @@ def _endpoint(value: str | None) -> str | None:
 
 Listen = Annotated[
     str | None,
-    typer.Option(metavar="HOST:PORT", help="Where to listen; by default as the file says."),
+    typer.Option(metavar="HOST:PORT", help="Address to listen on; by default the one in the file."),
 ]
 
 Config = Annotated[
-    Path, typer.Option("--config", "-c", metavar="FILE", help="Its configuration (YAML).")
+    Path, typer.Option("--config", "-c", metavar="FILE", help="Configuration file (YAML).")
 ]
 
 Metrics = Annotated[
     str | None,
     typer.Option(
         metavar="HOST:PORT",
-        help="Where to serve metrics for Prometheus (GET /metrics).",
+        help="Address to serve Prometheus metrics on (GET /metrics).",
         callback=_endpoint,
     ),
 ]
 
 
-def proxy(config: Config, metrics: Metrics = None) -> None:
+def proxy(
+    config: Config,
+    metrics: Metrics = None,
+    *,
+    standby: Annotated[
+        bool, typer.Option("--standby", help="Where one runs, wait, and take its place at its end.")
+    ] = False,
+) -> None:
     """Run a client proxy: the robot's side of a pool.
 
     The manager writes its configuration to the pool's state folder as `proxy.yaml`.
     """
     from fogft.proxy.robot import process
 
-    process.run(config, metrics=metrics)
+    process.run(config, metrics=metrics, standby=standby)
 
 
 def serve(
@@ -58,21 +70,23 @@ def serve(
         int | None, typer.Option(min=0, max=232, metavar="N", help="ROS domain of the service.")
     ] = None,
     workdir: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where to start the `run` command.")
+        Path | None, typer.Option(metavar="DIR", help="Folder to start the `run` command in.")
     ] = None,
     notice_file: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A file that appears before this machine is preempted."),
+        typer.Option(metavar="FILE", help="File that appears before this machine is preempted."),
     ] = None,
     advertise: Annotated[
         str | None,
-        typer.Option(metavar="HOST:PORT", help="Where others reach it, when it is behind NAT."),
+        typer.Option(
+            metavar="HOST:PORT", help="Address at which others reach it, if it is behind NAT."
+        ),
     ] = None,
     metrics: Metrics = None,
 ) -> None:
     """Run a server proxy: a replica's side of a pool.
 
-    It starts the pool file's `run` command and restarts it when it dies.
+    Starts the pool file's `run` command and restarts it when it exits.
     """
     from fogft.proxy.replica import process
 
@@ -89,21 +103,30 @@ def serve(
 
 def manager(
     pool: Annotated[
-        str, typer.Argument(metavar="POOL", help="Its name.", autocompletion=options.pools)
+        str, typer.Argument(metavar="POOL", help="Pool name.", autocompletion=options.pools)
     ],
+    *,
     metrics: Metrics = None,
+    no_proxy: Annotated[
+        bool, typer.Option("--no-proxy", help="Start no client proxy: systemd does, for instance.")
+    ] = False,
 ) -> None:
-    """Run a pool's manager: it observes, plans and applies."""
+    """Run a pool's manager: it observes the pool, plans and launches."""
     from fogft.pool.commands import composition
     from fogft.pool.manager.manager import run
 
-    run(composition.make_store(pool), composition.cloud_of, metrics=metrics)
+    run(
+        composition.make_store(pool),
+        composition.cloud_of,
+        metrics=metrics,
+        keeps_proxy=not no_proxy,
+    )
 
 
 def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
     """Run a rendezvous, where robots and replicas find each other.
 
-    It needs a port that all can reach and carries no requests. Run two, on two machines.
+    Needs a port that everybody can reach, and carries no requests. Run two, on two machines.
     """
     from fogft.pool.commands.rendezvous import read_config, run
 
@@ -113,8 +136,104 @@ def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -
 def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
     """Run a gateway: robots ask it once, and it asks the replicas.
 
-    Run it where the uplink is wide: on a machine of its own, or on a replica's.
+    Run it where the network is wide: on a machine of its own, or on a replica's.
     """
     from fogft.proxy.gateway import process
 
     process.run(config, listen=listen, metrics=metrics)
+
+
+# -- started by systemd ------------------------------------------------------------------
+
+System = Annotated[
+    bool, typer.Option("--system", help="Units of the machine instead of this user's; as root.")
+]
+Gateway = Annotated[
+    Path | None,
+    typer.Option("--gateway", metavar="FILE", help="A gateway with this configuration instead."),
+]
+Rendezvous = Annotated[
+    Path | None,
+    typer.Option("--rendezvous", metavar="FILE", help="A rendezvous with this one instead."),
+]
+
+service = group("Have systemd start what a pool needs at boot, and restart it.")
+
+
+def _units(
+    pool: str | None, gateway: Path | None, rendezvous: Path | None, *, system: bool
+) -> list[Unit]:
+    from fogft.pool.commands import composition
+    from fogft.pool.commands import service as units
+
+    if gateway is not None:
+        return units.of_part("gateway", gateway, system=system)
+    if rendezvous is not None:
+        return units.of_part("rendezvous", rendezvous, system=system)
+    return units.of_pool(composition.paths_of(pool), system=system)
+
+
+@service.command(cls=Command, epilog="fogft service install")
+def install(
+    *,
+    pool: PoolOption = None,
+    gateway: Gateway = None,
+    rendezvous: Rendezvous = None,
+    system: System = False,
+) -> None:
+    """Write units for the manager and two client proxies, and start them.
+
+    They get the present environment: source ROS 2 first. What runs already hands over.
+    """
+    from fogft.pool.commands import composition
+    from fogft.pool.commands import service as units
+
+    where = units.services(system=system)
+    wanted = _units(pool, gateway, rendezvous, system=system)
+    part = gateway or rendezvous
+    paths = None if part is not None else composition.paths_of(pool)
+    if paths is not None:
+        units.yield_to(paths)
+        env_file = paths.folder / "service.env"
+    else:
+        assert part is not None
+        env_file = part.resolve().with_suffix(".env")
+    refused = units.install(where, wanted, env_file)
+    for unit in wanted:
+        output.data(str(where.folder / unit.name))
+    if refused:
+        output.warn(f"systemd did not start them: {'; '.join(refused)}")
+        return
+    if paths is not None:
+        units.hand_over(where, paths, wanted)
+    output.done("systemd starts them at boot, and restarts what dies")
+    if not system:
+        output.hint("`loginctl enable-linger` starts them before you log in")
+
+
+@service.command(cls=Command, epilog="fogft service status")
+def status(*, system: System = False) -> None:
+    """Show the units, and whether they run."""
+    from fogft.pool.commands import service as units
+
+    where = units.services(system=system)
+    for name, state in units.states(where, units.installed(where)).items():
+        output.data(f"{name}  {state}")
+
+
+@service.command(cls=Command, epilog="fogft service remove")
+def remove(
+    *,
+    pool: PoolOption = None,
+    gateway: Gateway = None,
+    rendezvous: Rendezvous = None,
+    system: System = False,
+) -> None:
+    """Stop the units, and delete them. Replicas go on; `fogft up` starts a manager."""
+    from fogft.pool.commands import service as units
+
+    where = units.services(system=system)
+    names = [unit.name for unit in _units(pool, gateway, rendezvous, system=system)]
+    found = units.installed(where, names)
+    units.remove(where, found)
+    output.done(f"removed {', '.join(found)}" if found else "there were none")

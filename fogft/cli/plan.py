@@ -17,29 +17,28 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Whose prices; by default what the file's resources name, else `local`.",
+            help="Cloud to take prices from; by default the one in the file, else `local`.",
         ),
     ] = None,
     prices: Annotated[
         Path | None,
-        typer.Option(
-            metavar="CSV", help="Prices from a table with SkyPilot's columns, not from a cloud."
-        ),
+        typer.Option(metavar="CSV", help="Take prices from a CSV file in SkyPilot's format."),
     ] = None,
     offline: Annotated[
-        bool, typer.Option("--offline", help="Measure no distances; use those known.")
+        bool, typer.Option("--offline", help="Do not measure round trips; use known ones.")
     ] = False,
     everything: Annotated[
-        bool, typer.Option("--all", help="Show every offer, not only the best of each region.")
+        bool, typer.Option("--all", help="Show every offer, not just the best of each region.")
     ] = False,
     as_json: AsJson = False,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Draw price against distance to a PNG, SVG or PDF file."),
+        typer.Option(metavar="FILE", help="Plot price over round trip to a PNG, SVG or PDF file."),
     ] = None,
 ) -> None:
-    """Show what a pool file would launch, why there, and what it costs. Launches nothing."""
-    from fogft.cli import plan_plot, plan_text
+    """Show what a pool file would launch, where, why, and at what price."""
+    from fogft.cli import plan_text
+    from fogft.cli.screens import plan_plot
     from fogft.pool.commands.plan import plan_file
     from fogft.reason_words import words
     from fogft.simulation.plot import check
@@ -55,13 +54,13 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         output.warn(note)
     if plot is not None:
         plan_plot.draw(shown, plot)
-        output.done(f"`{plot}` is drawn")
+        output.done(f"wrote `{plot}`")
 
 
 def check(file: PoolFile = DEFAULT_FILE, as_json: AsJson = False) -> None:
-    """Show all mistakes in a pool file. Changes nothing.
+    """Check a pool file and list all mistakes.
 
-    Types of services are looked up on this machine. Exit status 1 when something is wrong.
+    Looks up the services' types on this machine. Exits with 1 if there are mistakes.
     """
     from fogft.pool.commands.check import mistakes
 
@@ -76,7 +75,7 @@ def check(file: PoolFile = DEFAULT_FILE, as_json: AsJson = False) -> None:
     for one in () if as_json else found:
         output.data(one.message + (f"\n    {one.hint}" if one.hint else ""))
     if not found:
-        output.done(f"`{file}` is right")
+        output.done(f"`{file}` is valid")
         return
     output.say(f"\n{len(found)} {'mistake' if len(found) == 1 else 'mistakes'} in `{file}`")
     raise typer.Exit(1)

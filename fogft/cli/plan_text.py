@@ -58,6 +58,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
                 "instance": replica.offer.placement.instance,
                 "spot": replica.offer.placement.spot,
                 "usd_per_hour": replica.offer.usd_per_hour,
+                "extras_usd_per_hour": replica.offer.extras_usd_per_hour,
                 "rtt_s": replica.rtt_s,
                 "services": list(replica.services),
             }
@@ -71,6 +72,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
             "instance": plan.single[0].placement.instance,
             **_cost_json(plan.single[1]),
         },
+        "pool_is_cheapest": plan.is_cheapest,
         "availability": {
             "target": plan.target,
             "expected": plan.least_expected.correlated,
@@ -84,6 +86,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
             },
         },
         "traffic": {service.name: _traffic_json(shown, service) for service in shown.spec.services},
+        "ready_p90_s": shown.ready_p90_s,
         "first_response": {"round_trips_s": plan.round_trips_s},
         "notes": [*shown.notes, *map(words, plan.notes)],
     }
@@ -125,15 +128,20 @@ def _row(shown: PlanShown, one: Considered) -> list[str | Text]:
         place.instance,
         "spot" if place.spot else "on demand",
         f"{one.offer.usd_per_hour:.3f}",
-        price_source(one.offer, shown.now) or "made up",
+        price_source(one.offer, shown.now) or "simulated",
         "?" if one.rtt_s is None else f"{one.rtt_s * 1000:.0f} ms",
-        str(one.losses),
+        "-" if one.losses_per_hour is None else _lost(one),
         output.cell(words(one.why_not), "dim"),
     ]
 
 
+def _lost(one: Considered) -> str:
+    """Return how often spot machines are lost there; a `~` where that is assumed."""
+    return f"{'~' * one.losses_assumed}{one.losses_per_hour:.2f}/h"
+
+
 def price_source(offer: Offer, now: float) -> str:
-    """Return where an offer's price comes from and how old it is; empty where it is made up."""
+    """Return where an offer's price comes from and how old it is; empty where it is simulated."""
     if not offer.source or not offer.as_of:
         return offer.source
     return f"{offer.source}, {age(max(0.0, now - offer.as_of))} old"
@@ -150,6 +158,14 @@ def _summary(shown: PlanShown) -> list[str]:
             out.append(f"  slot {replica.slot}{group} carries {', '.join(replica.services)}")
     cap = "" if plan.cap is None else f"; the cap is ${plan.cap:.2f}/h"
     out.append(f"cost          {_money(plan.cost)}{cap}")
+    extras = sum(replica.offer.extras_usd_per_hour for replica in plan.replicas)
+    if extras:
+        out.append(f"  ${extras:.3f}/h of it for disks and addresses")
+    if shown.ready_p90_s is not None:
+        out.append(
+            f"ready         within {shown.ready_p90_s:.0f} s of the order (p90 of {shown.launches} "
+            "launches; taken for the time away below)"
+        )
     for name, one in shown.traffic.items():
         out.append(
             f"  {name} measured over {one.over_s / 3600:.3g} h: "
@@ -167,6 +183,7 @@ def _summary(shown: PlanShown) -> list[str]:
         where = f"{place.instance} at {place.location.rstrip('/')}"
         out.append(f"  one on-demand {where}: {_money(alone)}{compared}")
     out += _availability(shown)
+    out += _verdict(shown)
     trips = [f"{rtt_s * 1000:.0f} ms" for rtt_s in plan.round_trips_s]
     if trips:
         best = f"{trips[0]} and the service's own time"
@@ -176,6 +193,19 @@ def _summary(shown: PlanShown) -> list[str]:
     else:
         out.append("response      unknown: no distance is known (`fogft.placement.robot_at`)")
     return out
+
+
+def _verdict(shown: PlanShown) -> list[str]:
+    plan = shown.explanation
+    if plan.single is None:
+        return []
+    target = plan.least_expected.correlated if plan.target is None else plan.target
+    asked = f"for {100 * target:.6g} %"
+    if plan.is_cheapest is None:
+        return [f"cheapest      {asked} neither this pool nor one on-demand machine is enough"]
+    if plan.is_cheapest:
+        return [f"cheapest      {asked} this pool is"]
+    return [f"cheapest      {asked} one on-demand machine is, without fogft"]
 
 
 def _availability(shown: PlanShown) -> list[str]:
@@ -227,6 +257,8 @@ def _offer_json(shown: PlanShown, one: Considered) -> dict[str, Any]:
         "rtt_s": one.rtt_s,
         "rtt_source": None if distance is None else distance.source,
         "recent_losses": one.losses,
+        "losses_per_hour": one.losses_per_hour,
+        "losses_assumed": one.losses_assumed,
         "slots": list(slots),
         "why_not": words(one.why_not),
     }

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from fogft import logfile
+from fogft import __version__, logfile
 from fogft.cli import output
 from fogft.errors import FogftError
 
@@ -30,8 +30,16 @@ LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
 
 
-def announce(preview: Preview, joined: UpdateStatus | None = None) -> None:
-    """Say what will be done; `joined` is the update that is under way to this very file."""
+def announce(
+    preview: Preview, joined: UpdateStatus | None = None, *, upgrade_from: str = ""
+) -> None:
+    """Say what will be done.
+
+    Args:
+        preview: Of the file.
+        joined: The update that is under way to this very file.
+        upgrade_from: By which version of fogft the pool's manager runs, where it has one.
+    """
     spec = preview.spec
     for name, problem in preview.accounts.items():
         output.say(f"`{name}` " + (f"cannot be used: {problem}" if problem else "can be used"))
@@ -45,16 +53,21 @@ def announce(preview: Preview, joined: UpdateStatus | None = None) -> None:
             output.say(f"  {change}")
         if preview.replaces_replicas:
             order = "new before old" if preview.new_before_old else "old before new"
-            output.say(f"  so its replicas are replaced one after the other, {order}")
+            output.say(f"  replicas are replaced one at a time, {order}")
             if not preview.new_before_old:
                 output.say(f"  {_no_room(spec)}")
         if preview.costs_money and preview.launches:
-            output.say(f"  at today's prices the pool costs ${preview.usd_per_hour:.3f}/h")
+            output.say(f"  at current prices the pool costs ${preview.usd_per_hour:.3f}/h")
     elif joined is not None:
         count = f"{joined.done} of {joined.of} replicas run it"
-        output.say(f"pool `{spec.name}` is being updated to this file: {count}; waiting for it")
-    elif not preview.rolled_back:
-        output.say(f"pool `{spec.name}` already matches its file; nothing changes")
+        output.say(f"pool `{spec.name}` is already being updated to this file: {count}; waiting")
+    elif not preview.rolled_back and upgrade_from in ("", __version__):
+        output.say(f"pool `{spec.name}` already matches its file")
+    if upgrade_from not in ("", __version__):
+        output.say(
+            f"pool `{spec.name}` runs fogft {upgrade_from}: upgrading its manager, client proxy "
+            f"and replicas to {__version__}, one at a time"
+        )
     for note in preview.notes:
         output.warn(note)
 
@@ -64,10 +77,10 @@ def _no_room(spec: PoolSpec) -> str:
     if spec.max_surge == 0:
         why = "`max_surge` is 0"
     else:
-        why = f"${spec.max_usd_per_hour:g}/h (`max_usd_per_hour`) has no room for both"
+        why = f"${spec.max_usd_per_hour:g}/h (`max_usd_per_hour`) leaves no room for both"
     if spec.replicas == 1:
-        return f"{why}, and a lone replica is not ended first: it stays as it is"
-    return f"{why}: meanwhile one fewer answers"
+        return f"{why}, and the only replica is not ended first: it stays as it is"
+    return f"{why}: one replica fewer answers meanwhile"
 
 
 def _show_launches(preview: Preview) -> None:
@@ -86,7 +99,7 @@ def _show_launches(preview: Preview) -> None:
     ]
     if rows:
         output.show(table([""] * 5, rows, titled=False), stream=sys.stderr)
-        output.say(f"  together ${preview.usd_per_hour:.3f}/h")
+        output.say(f"  total ${preview.usd_per_hour:.3f}/h")
 
 
 def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tuple[Seen, Outcome]:
@@ -105,8 +118,8 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
             if not seen.manager_alive:
                 name, log = paths.folder.name, logfile.tail(paths.manager_log, lines=8)
                 raise FogftError(
-                    f"the manager of `{name}` has ended:\n{log}",
-                    f"start it again with `fogft up`; `fogft down {name}` ends what runs",
+                    f"the manager of `{name}` has exited:\n{log}",
+                    f"restart it with `fogft up`; `fogft down {name}` shuts the pool down",
                 )
             show(seen)
             outcome = awaited.outcome(seen)
@@ -134,7 +147,7 @@ def settle(store: PoolStore, settled: Settled, what: str) -> None:
         notes = "".join(f"\n  {note}" for note in seen.status.notes)
         raise FogftError(
             f"`{store.name}` {what} after {limit_s:.0f} s: {found}{notes}",
-            "the manager goes on with it: see `fogft status` and `fogft logs`",
+            "the manager continues: see `fogft status` and `fogft logs`",
         )
 
 

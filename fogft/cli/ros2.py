@@ -54,7 +54,7 @@ class Verb:
 
 
 class Up(Verb):
-    """Start a pool, or apply a changed pool file to a running one."""
+    """Start a pool, or apply a changed pool file to a running pool."""
 
 
 class Down(Verb):
@@ -74,7 +74,7 @@ class Plan(Verb):
 
 
 class Logs(Verb):
-    """Show what the manager, the client proxy and the replicas log."""
+    """Show the logs of the manager, the client proxy and the replicas."""
 
 
 class Doctor(Verb):

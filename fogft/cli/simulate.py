@@ -23,7 +23,7 @@ def simulate(
     *,
     traces: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Replay the spot traces recorded in this folder."),
+        typer.Option(metavar="DIR", help="Replay the spot traces in this folder."),
     ] = None,
     fit: Annotated[
         bool, typer.Option("--fit", help="Generate markets that resemble the traces.")
@@ -36,7 +36,7 @@ def simulate(
         ),
     ] = "",
     days: Annotated[
-        float, typer.Option(min=0.01, max=3650, metavar="N", help="Simulated days of each seed.")
+        float, typer.Option(min=0.01, max=3650, metavar="N", help="Simulated days per market.")
     ] = 7.0,
     seeds: Annotated[
         int, typer.Option(min=1, max=10_000, metavar="N", help="Number of markets.")
@@ -45,16 +45,18 @@ def simulate(
         int, typer.Option(min=0, metavar="N", help="Seed of the first market.")
     ] = 0,
     cloud: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Whose prices; else the pool file's cloud.")
+        str | None,
+        typer.Option(metavar="NAME", help="Cloud to take prices from; by default the pool file's."),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw a PNG, SVG or PDF file.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Plot the results to a PNG, SVG or PDF file."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a pool in spot markets, beside fixed policies.
+    """Simulate a pool in spot markets, next to fixed policies.
 
-    The planner is the real one. Launches nothing; the same seeds give the same figures.
+    Runs the real planner, and launches nothing. The same seeds give the same results.
     """
     from fogft.simulation import run
     from fogft.simulation.plot import check, draw
@@ -78,7 +80,7 @@ def simulate(
         output.say(f"note: {note}")
     if plot is not None:
         draw(report, plot)
-        output.done(f"`{plot}` is drawn")
+        output.done(f"wrote `{plot}`")
 
 
 HEADER = (
@@ -93,11 +95,17 @@ def _show(report: Report) -> None:
     width = output.width(sys.stdout)
     output.show(table(HEADER, map(_cells, report.rows), right=HEADER[1:], width=width))
     scenario = report.scenario
-    kind = "recorded" if scenario.recorded else "made up"
+    kind = "recorded" if scenario.recorded else "simulated"
     output.data(
         f"\n{report.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
         f"{scenario.days:.4g} days."
     )
+    best = report.cheapest
+    if best is None:
+        output.data(f"No policy reaches {percent(report.target)}.")
+    else:
+        costs = best.estimate("usd_per_hour").mean
+        output.data(f"Cheapest for {percent(report.target)}: {best.name}, at ${costs:.4f}/h.")
     if report.expected is not None:
         moving, staying = (percent(report.expected[k]) for k in ("moving", "staying"))
         output.data(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fogft import __version__
 from fogft.cli import options, output
 from fogft.cli.options import PoolArgument, PoolOption
 
@@ -30,23 +31,23 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
     ] = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Update every second.")] = False,
     refresh: Annotated[
-        bool, typer.Option("--refresh", "-r", help="Have the manager observe the pool first.")
+        bool, typer.Option("--refresh", "-r", help="Have the manager look at the cloud first.")
     ] = False,
     check: Annotated[
         bool,
         typer.Option(
             "--check",
-            help="Probe each link first; exit 1 if a request would not be answered.",
+            help="Probe each link first; exit with 1 if a request would not be answered.",
         ),
     ] = False,
     schema: Annotated[
-        bool, typer.Option("--schema", help="Print the JSON Schema of --json, and stop.")
+        bool, typer.Option("--schema", help="Print the JSON Schema of --json and exit.")
     ] = False,
     named: PoolOption = None,
 ) -> None:
-    """Show a pool: its replicas, their links, and the outcome of requests.
+    """Show a pool: its replicas, links, and request counters.
 
-    Each part comes from whoever knows it; what nobody knows now is `?`.
+    What is not known at the moment is shown as `?`.
     """
     if schema:
         from fogft.pool.commands.status_schema import status_schema
@@ -96,11 +97,24 @@ def _watch(paths: PoolPaths, *, as_json: bool) -> None:
 
 def _remark(seen: Seen) -> None:
     if seen.status.ended and not seen.manager_alive:
-        output.hint(f"start it again with `fogft up {seen.status.file}`; `fogft down` removes it")
+        output.hint(
+            f"restart it with `fogft up {seen.status.file}`, or remove it with `fogft down`"
+        )
     elif not seen.manager_alive:
+        from fogft.cli.status_text import age
+
         goes_on = "requests continue, but lost replicas are not replaced"
-        output.warn(f"no manager runs: {goes_on if seen.answers else 'nothing is replaced'}")
-        output.hint(f"start it with `fogft up {seen.status.file}`, or end it with `fogft down`")
+        if seen.lease_left_s is not None:
+            goes_on += f", and the others shut down in {age(seen.lease_left_s)}"
+        output.warn(f"no manager is running: {goes_on if seen.answers else 'nothing is replaced'}")
+        output.hint(
+            f"start one with `fogft up {seen.status.file}`, or shut the pool down with `fogft down`"
+        )
+    elif seen.status.manager_version not in ("", __version__):
+        output.warn(
+            f"the pool runs fogft {seen.status.manager_version}, this command is {__version__}"
+        )
+        output.hint(f"`fogft up {seen.status.file}` upgrades it while it serves")
     elif seen.age_s is not None and seen.stale:
         output.warn(f"the manager has not observed the pool for {seen.age_s:.0f} s")
         output.hint("see `fogft logs`")
@@ -111,20 +125,22 @@ def logs(
         str | None,
         typer.Argument(
             metavar="SLOT",
-            help="Only this replica's log, or the name of a pool; by default all logs.",
+            help="Slot of a replica, or name of a pool; by default all logs.",
             autocompletion=options.slots,
         ),
     ] = None,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Keep showing new lines.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Follow new lines.")] = False,
     lines: Annotated[
         int,
-        typer.Option("--lines", "-n", min=0, metavar="N", help="Lines of each log to begin with."),
+        typer.Option(
+            "--lines", "-n", min=0, metavar="N", help="Number of lines of each log to start with."
+        ),
     ] = 50,
     pool: PoolOption = None,
 ) -> None:
-    """Show what the manager, the client proxy and the replicas log.
+    """Show the logs of the manager, the client proxy and the replicas.
 
-    Each line begins with the name of its log: `manager`, `proxy` or `slot.generation`.
+    Each line starts with the name of its log: `manager`, `proxy` or `slot.generation`.
     """
     from fogft.cli.tail import Tail, in_order
     from fogft.pool.commands import composition

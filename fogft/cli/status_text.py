@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.tree import Tree
 
     from fogft.pool.commands.current import Seen
-    from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
+    from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus, TopicStatus
 
 PHASES = {
     "provisioning": "yellow",
@@ -24,17 +24,19 @@ PHASES = {
     "unready": "bold red",
 }
 LINKS = {"up": "green", "connecting": "yellow", "suspect": "bold red"}
-REPLICA_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "LINK", "RTT", "WON", "AGE")
+REPLICA_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "LINK", "RTT", "FIRST", "AGE")
 STARTING_COLUMNS = ("REPLICA", "PHASE", "LOCATION", "$/H", "AGE")
 SERVICE_COLUMNS = (
     *("SERVICE", "READY", "REQUESTS", "ANSWERED", "FALLBACK", "UNANSWERED", "LATE"),
     *("WAITING", "P50", "P99"),
 )
+TOPIC_COLUMNS = ("TOPIC", "FROM", "HEARD BY", "RATE", "MESSAGES", "PASSED", "DROPPED", "REFUSED")
 RARE = ("FALLBACK", "UNANSWERED", "LATE", "WAITING")
 DETAIL = "DETAIL"
 UNKNOWN = "?"
+_STRANGERS_SHOWN = 20  # fewer come of ports that are scanned, and of links that break off
 LOST = "unready"  # it has served, and does not now
-NUMBERS = ("$/H", "RTT", "WON", "AGE", *SERVICE_COLUMNS[1:])
+NUMBERS = ("$/H", "RTT", "FIRST", "AGE", *SERVICE_COLUMNS[1:], *TOPIC_COLUMNS[3:])
 
 
 def rendered(seen: Seen, *, width: int | None) -> Group:
@@ -47,6 +49,7 @@ def rendered(seen: Seen, *, width: int | None) -> Group:
         [services(status.services, width=width, links_known=seen.links_known)]
         if status.services
         else [],
+        [topics(status.topics, width=width, links_known=seen.links_known)] if status.topics else [],
         topology(status.topology),
         notes(status),
     ]
@@ -87,6 +90,7 @@ def headline(seen: Seen) -> Text:
             *_answering(seen),
             cell(f"{ready if seen.links_known else UNKNOWN} of {target} ready", enough),
             cell(f"{usd_per_hour}/h on {status.cloud}"),
+            *([cell(f"{price(status.usd_to_date)} so far")] if status.usd_to_date else []),
             cell("not observed yet" if seen.age_s is None else f"seen {age(seen.age_s)} ago"),
             *([] if links_age_s is None else [cell(f"links seen {age(links_age_s)} ago")]),
             *(cell(text, "bold red") for text, sounds in alarms.items() if sounds),
@@ -111,11 +115,14 @@ def _joined(words: Sequence[Text]) -> Text:
 
 def notes(status: PoolStatus) -> list[Text]:
     """Return the sentences below the tables."""
-    found = list(status.notes)
+    found = [*status.notes, *troubles(status)]
     for row in status.services:
         order = row.counters.get("order") or {}
         if order.get("trouble"):
-            found.append(f"`{row.name}` cannot be had: {order['trouble']}")
+            found.append(f"`{row.name}` is unavailable: {order['trouble']}")
+        needed = row.counters.get("needed_replicas")
+        if needed:
+            found.append(f"`{row.name}`: more is asked than the replicas can do; {needed} would do")
         poison = row.counters.get("poison")
         if poison:
             at = time.strftime("%F %T", time.localtime(row.counters["poisoned_at"]))
@@ -123,6 +130,12 @@ def notes(status: PoolStatus) -> list[Text]:
             found.append(
                 f"`{row.name}`: services died over {requests}, which were not sent again; "
                 f"the last time at {at}"
+            )
+    for one in status.replicas:
+        if one.strangers >= _STRANGERS_SHOWN:
+            found.append(
+                f"replica {one.slot}.{one.generation} has turned away {number(one.strangers)} "
+                "connections of strangers: let a firewall admit only who should reach its port"
             )
     if status.excluded:
         found.append(f"excluded: {', '.join(status.excluded)}")
@@ -132,6 +145,17 @@ def notes(status: PoolStatus) -> list[Text]:
         lines.append(cell("note:", "bold cyan") + cell(f" {first}"))
         lines += [cell(f"  {line}") for line in more]
     return lines
+
+
+def troubles(status: PoolStatus) -> list[str]:
+    """Return what does not reach the other side, and why, a sentence each."""
+    found = [row.counters["trouble"] for row in status.services if row.counters.get("trouble")]
+    for row in status.topics:
+        if row.counters.trouble:
+            found.append(row.counters.trouble)
+        elif not row.heard_by and status.ready:
+            found.append(f"nobody hears `{row.name}`: no node of a replica subscribes to it")
+    return found
 
 
 def replicas(
@@ -169,7 +193,7 @@ def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
         "$/H": price(row.usd_per_hour).removeprefix("$"),
         "LINK": cell(link, LINKS.get(row.link, "dim")),
         "RTT": milliseconds(row.rtt_s) if links_known else UNKNOWN,
-        "WON": number(row.won),
+        "FIRST": number(row.won),
         "AGE": "-" if row.age_s is None else age(row.age_s),
     }
 
@@ -201,6 +225,29 @@ def services(
         )
     return table(
         SERVICE_COLUMNS, cells, width=width, right=NUMBERS, folds=("SERVICE",), optional=RARE
+    )
+
+
+def topics(
+    rows: Sequence[TopicStatus], *, width: int | None, links_known: bool = True
+) -> RenderableType:
+    """Return the table of topics: who hears them, and what became of their messages."""
+    from fogft.cli.table import table
+
+    cells: list[list[str | Text]] = []
+    for row in rows:
+        count, heard = row.counters, ", ".join(row.heard_by)
+        cells.append(
+            [
+                row.name,
+                row.origin,
+                (heard or cell("nobody", "bold red")) if links_known else UNKNOWN,
+                f"{count.rate_hz:.3g} Hz",
+                *map(number, (count.messages, count.passed, count.dropped, count.refused)),
+            ]
+        )
+    return table(
+        TOPIC_COLUMNS, cells, width=width, right=NUMBERS, folds=("TOPIC",), optional=("REFUSED",)
     )
 
 

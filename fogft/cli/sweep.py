@@ -19,18 +19,21 @@ def sweep(
     end: Annotated[
         bool, typer.Option("--end", help="End the machines found, after asking.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="With --end: do not ask.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="With --end: skip the confirmation.")
+    ] = False,
     cloud: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="Only `local` or `sky`; by default every cloud used from here."
+            metavar="NAME",
+            help="Only `local` or `sky`; by default every cloud used from this machine.",
         ),
     ] = None,
 ) -> None:
-    """Find machines that no manager owns, and end them on request.
+    """Find machines that no manager owns, and optionally end them.
 
-    Asks the clouds themselves where that can be, so it finds what everybody else forgot. A
-    machine whose pool is managed from another state folder looks like nobody's.
+    Asks the clouds directly where possible. A machine whose pool is managed from another state
+    folder (FOGFT_HOME) looks unowned: read the list before you end anything.
     """
     from fogft.pool.commands.sweep import clouds_used, end_found, sweep_cloud
 
@@ -39,24 +42,26 @@ def sweep(
         _show(one)
     unowned = [machine for one in found for machine in one.unowned]
     if not unowned:
-        output.done("every machine has a manager")
+        output.done("every machine belongs to a managed pool")
         if cloud is None and not any(one.cloud == "sky" for one in found):
-            output.hint("real clouds were never used from here: `--cloud sky` asks them too")
+            output.hint(
+                "real clouds were never used from this machine: `--cloud sky` checks them as well"
+            )
         return
     if not end:
         output.hint(
-            "`fogft sweep --end` ends them; `fogft up FILE` gives a pool that is still here its "
+            "`fogft sweep --end` ends them; `fogft up FILE` gives a pool on this machine its "
             "manager back"
         )
         return
     if not yes and not output.confirm(f"end {len(unowned)}?"):
-        output.say("nothing was done")
+        output.say("aborted: nothing was changed")
         raise typer.Exit(1)
     problems = [problem for one in found for problem in end_found(one, output.say)]
     if problems:
         hints = dict.fromkeys(problem.hint for problem in problems if problem.hint)
         raise FogftError("\n".join(problem.message for problem in problems), "; ".join(hints))
-    output.done("all of them are ended")
+    output.done("ended all of them")
 
 
 def _show(found: Swept) -> None:

@@ -57,20 +57,26 @@ class Watch:
         self._on_notice = on_notice
         self._poll_s = poll_s
         self._told: set[NoticeKind] = set()
+        self._source: Source | None = None
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="notice", daemon=True)
         self._thread.start()
+
+    @property
+    def silent(self) -> bool:
+        """Whether no source exists on this machine, as far as is known."""
+        return self._source is None
 
     def close(self) -> None:
         """Stop; no call is made after this has returned, but one under way. Repeatable."""
         self._closed.set()
 
     def _run(self) -> None:
-        source: Source | None = None
         failures = 0
         while not self._closed.is_set():
-            if source is None:
-                source = next(filter(_is_here, self._sources), None)
+            if self._source is None:
+                self._source = next(filter(_is_here, self._sources), None)
+            source = self._source
             if source is not None:
                 try:
                     self._tell(source)

@@ -33,7 +33,7 @@ class Notice:
 
     kind: NoticeKind
     at: float | None  # when it ends, in seconds since the epoch; None when that was not said
-    source: str  # who said so: ``aws``, ``gcp``, ``azure`` or ``file``
+    source: str  # who said so: ``aws``, ``gcp``, ``azure``, ``file`` or ``signal``
     detail: str = ""  # the words, for the log
 
 

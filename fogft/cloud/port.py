@@ -34,6 +34,8 @@ class Launch:
     files: Mapping[str, bytes] = field(default_factory=dict)
     # Where the server proxy listens, on a cloud whose machines have addresses of their own.
     link_port: int = LINK_PORT
+    # A machine of another type in the same place may cost so much at most; None for no limit.
+    limit_usd_per_hour: float | None = None
     # The replica dials its robots: nobody reaches it, so no port need be open.
     dials_out: bool = False
 
@@ -43,6 +45,8 @@ class Cloud(Protocol):
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """List what can be bought for a task's `resources`.
+
+        They hold ``ports: []`` where the machines need to be reached by nobody.
 
         Raises:
             CloudUnreachable: Prices cannot be had now.
@@ -90,6 +94,18 @@ class Accounts(Protocol):
 
     def check_task(self, task: Mapping[str, Any]) -> None:
         """Raise `SpecError` for what cannot be honoured on these clouds, before it is ordered."""
+
+    def left_out(self) -> Sequence[str]:
+        """Return, in sentences, what was not offered so far because it cannot be launched."""
+
+    def credentials_end_at(self) -> float | None:
+        """Return when the first credentials end that end by themselves, in seconds since the epoch.
+
+        Cheap. None where nobody knows of an end.
+        """
+
+    def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
+        """Return, in sentences, what may keep launches from working until a time; None for ever."""
 
     def exposures(self, clouds: Sequence[str], *, open_port: int | None) -> Sequence[str]:
         """Return, in sentences, what machines there are given or open to that they need not be.

@@ -21,7 +21,7 @@ def segments(_: Situation) -> Iterator[Finding]:
     """No shared memory of ROS is without a process."""
     abandoned = shared_memory.abandoned()
     if not abandoned:
-        yield ok("leftovers", "no shared memory of dead processes")
+        yield ok("leftovers", "no shared memory left by dead processes")
         return
     size = 0
     for path in abandoned:
@@ -29,9 +29,9 @@ def segments(_: Situation) -> Iterator[Finding]:
             size += path.stat().st_blocks * 512
     yield warn(
         "leftovers",
-        f"{len(abandoned)} files of dead processes in {shared_memory.FOLDER} "
+        f"{len(abandoned)} files left by dead processes in {shared_memory.FOLDER} "
         f"hold {size / 2**20:.1f} MiB",
-        "they do no harm but take memory; the next `fogft down` removes them",
+        "they are harmless but use memory; the next `fogft down` removes them",
     )
 
 
@@ -50,7 +50,7 @@ def orphaned_processes(situation: Situation) -> Iterator[Finding]:
         "leftovers",
         f"{len(orphans)} processes of replicas run whose pool is not in `{situation.home}`",
         "they belong to a pool of another state folder: with that in FOGFT_HOME `fogft list` shows "
-        "it and `fogft down` ends it. Where the folder is lost they end after `orphan_after_s`",
+        "it and `fogft down` ends it. Where the folder is lost they end by `unmanaged_max_hours`",
     )
 
 
@@ -64,7 +64,7 @@ def chaos(situation: Situation) -> Iterator[Finding]:
     if found:
         yield warn(
             "leftovers",
-            f"`fogft chaos` lasts, for every pool: {', '.join(found)}",
+            f"`fogft chaos` is still in force, for every pool: {', '.join(found)}",
             "undo it with `fogft chaos clear`",
         )
 

@@ -51,7 +51,7 @@ def installation(_: Situation) -> Iterator[Finding]:
         beside = Path(sys.executable).parent
         yield warn(
             "fogft",
-            f"fogft {version} is installed, but `fogft` is not on the PATH",
+            f"fogft {version} is installed, but `fogft` is not on PATH",
             f"activate the virtual environment, or add {beside} to PATH",
         )
     else:
@@ -66,7 +66,7 @@ def state_folder(situation: Situation) -> Iterator[Finding]:
         yield fail(
             "state folder",
             f"`{home}` cannot be written",
-            f"make `{existing}` yours, or set FOGFT_HOME to another folder",
+            f"change the owner of `{existing}`, or set FOGFT_HOME to another folder",
         )
         return
     if home.exists() and home.stat().st_mode & 0o077:
@@ -80,7 +80,7 @@ def state_folder(situation: Situation) -> Iterator[Finding]:
         yield warn(
             "state folder",
             f"only {_megabytes(free)} free at `{existing}`",
-            "free some space: logs and credentials are written there",
+            "free some disk space: logs and credentials are written there",
         )
     else:
         yield ok("state folder", f"`{home}`, {_megabytes(free)} free")
@@ -119,9 +119,9 @@ def ports(_: Situation) -> Iterator[Finding]:
     except OSError:
         yield warn(
             "ports",
-            f"TCP port {LINK_PORT} is taken; `fogft serve` uses it unless told otherwise",
+            f"TCP port {LINK_PORT} is in use, which is the default of `fogft serve`",
             "pass `--listen HOST:PORT` when you run `fogft serve` here; pools on the local "
-            "cloud choose free ports themselves",
+            "cloud pick free ports",
         )
     else:
         yield ok("ports", f"TCP ports can be bound on loopback; {LINK_PORT} is free")

@@ -34,7 +34,9 @@ def pool_file(situation: Situation) -> Iterator[Finding]:
 
     for service in situation.spec.services:
         if situation.spec.rmw.robot is Speaks.ZENOH and not service.needs_type:
-            yield ok("pool file", f"service `{service.name}` passes through, of whatever type")
+            yield ok(
+                "pool file", f"service `{service.name}` is forwarded without looking at its type"
+            )
             continue
         problem = trouble(partial(load_service_type, service.type))
         if problem:
@@ -56,7 +58,7 @@ def certificates(situation: Situation) -> Iterator[Finding]:
             yield warn(
                 "credentials",
                 f"pool `{pool}` has none yet",
-                "its manager makes them; see `fogft logs`",
+                "the manager creates them; see `fogft logs`",
             )
             continue
         problems = list(judge_folder(pool, folder, now))
@@ -75,7 +77,7 @@ def judge_folder(pool: str, folder: Path, now: datetime) -> Iterator[Finding]:
                 f"pool `{pool}`: `{key}` can be read by other users",
                 f"run `chmod 600 {key}`",
             )
-    anew = f"run `fogft down {pool}` and `fogft up` again: that makes new ones"
+    anew = f"run `fogft down {pool}` and `fogft up` again: that creates new ones"
     for certificate in sorted(folder.rglob("*.crt")):
         try:
             said = authority.describe(certificate)
@@ -110,6 +112,7 @@ def processes(situation: Situation) -> Iterator[Finding]:
             yield ok("manager", f"pool `{pool}`: ended {seen.status.ended}")
             continue
         yield from judge_processes(pool, seen)
+        yield from judge_traffic(pool, seen)
 
 
 def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
@@ -125,15 +128,31 @@ def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
         yield ok("client proxy", f"pool `{pool}`: runs")
     else:
         log = PoolPaths.of(pool).proxy_log.name
-        remedy = f"its manager starts it; see `{log}`" if seen.manager_alive else up
+        remedy = f"the manager restarts it; see `{log}`" if seen.manager_alive else up
         yield fail("client proxy", f"pool `{pool}` has none: no request is answered", remedy)
     if seen.answers:
         yield ok("answers", f"pool `{pool}`: each service has a ready replica")
     elif seen.answers is None and not seen.links_known:
-        yield warn("answers", f"pool `{pool}`: nobody knows", "see `links` and `client proxy`")
+        yield warn("answers", f"pool `{pool}`: unknown", "see `links` and `client proxy`")
     elif seen.answers is False and proxy and seen.status.target:
         listed = ", ".join(f"`{name}`" for name in seen.unanswered)
         yield fail("answers", f"pool `{pool}`: no replica answers {listed}", "see `fogft status`")
+
+
+def judge_traffic(pool: str, seen: Seen) -> Iterator[Finding]:
+    """Tell of clients that get no answers, and of topics that do not pass."""
+    for service in seen.status.services:
+        if why := service.counters.get("trouble"):
+            yield fail("middleware", f"pool `{pool}`: {why}", "see `fogft logs`")
+    for topic in seen.status.topics:
+        if topic.counters.trouble:
+            yield fail("topics", f"pool `{pool}`: {topic.counters.trouble}", "see `fogft status`")
+        elif not topic.heard_by and seen.answers:
+            yield warn(
+                "topics",
+                f"pool `{pool}`: nobody hears `{topic.name}`",
+                "is its `name` in the pool file what the nodes of `run` subscribe to?",
+            )
 
 
 def links(situation: Situation) -> Iterator[Finding]:
@@ -147,7 +166,7 @@ def links(situation: Situation) -> Iterator[Finding]:
         if report is None:
             yield fail(
                 "links",
-                f"pool `{pool}`: its client proxy has written no report that can be read",
+                f"pool `{pool}`: its client proxy has not written a readable report",
                 f"see `{paths.proxy_log}`",
             )
         elif age_s > _REPORT_LIMIT_S:
@@ -173,7 +192,7 @@ def judge_links(pool: str, reported: Sequence[LinkReport]) -> Iterator[Finding]:
             yield warn(
                 "links",
                 f"{replica} is {link.state.value}: {link.detail or 'it does not answer probes'}",
-                f"it was started by hand, and nobody replaces it; see {log}"
+                f"it was started by hand and is not replaced automatically; see {log}"
                 if by_hand
                 else f"it is replaced if it stays silent; see `fogft status` and {log}",
             )
@@ -181,8 +200,8 @@ def judge_links(pool: str, reported: Sequence[LinkReport]) -> Iterator[Finding]:
             yield warn(
                 "replicas",
                 f"{replica} is not ready: {link.detail}",
-                f"{log} shows what `run` says; is each `name` and `type` "
-                "in the pool file what the node offers?",
+                f"{log} shows what `run` says; compare each `name` and "
+                "`type` in the pool file with what the node offers",
             )
     if reported and not up:
         yield fail(

@@ -24,6 +24,10 @@ _LIMIT_S = 30.0
 _RMW_WITH_PROFILE = "rmw_fastrtps_cpp"
 # Above, the ports of DDS run into those that Linux gives to outgoing connections.
 _LAST_SAFE_DOMAIN, _LAST_DOMAIN = 101, 232
+_KNOWN = {
+    "rmw_cyclonedds_cpp": "works, but no service call passes between it and Fast DDS on a machine",
+    "rmw_zenoh_cpp": "works, and with `rmw: zenoh` in the pool file fogft needs no ROS 2 for it",
+}
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 _DISCOVERY_ADVICE = (
     "if this machine has no multicast (many containers and networks have none), set "
@@ -48,15 +52,18 @@ def rclpy(_: Situation) -> Iterator[Finding]:
         "rclpy",
         f"ROS 2 {described['distribution'].capitalize()}, rclpy {described['rclpy']}",
     )
-    rmw = described["rmw"]
+    yield judge_middleware(described["rmw"])
+
+
+def judge_middleware(rmw: str) -> Finding:
+    """Tell which middleware is in use, and what is known of it."""
     if rmw == _RMW_WITH_PROFILE:
-        yield ok("middleware", rmw)
-    else:
-        yield warn(
-            "middleware",
-            f"{rmw}: works, but is not what fogft is measured on",
-            f"for the speeds in the documentation set RMW_IMPLEMENTATION={_RMW_WITH_PROFILE}",
-        )
+        return ok("middleware", f"{rmw}: fogft's measurements were made with it")
+    return warn(
+        "middleware",
+        f"{rmw}: {_KNOWN.get(rmw, 'nobody has tried it with fogft')}",
+        f"set the same RMW_IMPLEMENTATION for your nodes, or {_RMW_WITH_PROFILE} for all",
+    )
 
 
 def domain(_: Situation) -> Iterator[Finding]:
@@ -124,7 +131,7 @@ def profile(_: Situation) -> Iterator[Finding]:
     measured = _self_test("segment")
     if "segment_bytes" not in measured:
         yield warn(
-            "Fast DDS profile", f"could not be tried: {measured['error']}", "see `rclpy` above"
+            "Fast DDS profile", f"could not be tested: {measured['error']}", "see `rclpy` above"
         )
         return
     yield judge_segment(measured["segment_bytes"], name, prepared[name] if is_ours else "")
@@ -142,7 +149,7 @@ def judge_segment(segment_bytes: int, variable: str, ours: str) -> Finding:
         if ours:
             return warn(
                 "Fast DDS profile",
-                "your nodes have none: messages over 0.5 MB take ten times as long",
+                "your nodes use none: messages over 0.5 MB take ten times as long",
                 f"export {variable}={ours} where your nodes start, as fogft's processes do",
             )
         return ok("Fast DDS profile", f"yours: a segment of {segment_bytes / 1e6:.0f} MB is mapped")
@@ -180,18 +187,20 @@ def discovery(_: Situation) -> Iterator[Finding]:
         found, called = result["discovery_s"], result["call_s"]
         yield ok(
             "discovery",
-            f"a node was found in {found:.1f} s and answered in {called * 1000:.1f} ms",
+            f"a node was discovered in {found:.1f} s and answered in {called * 1000:.1f} ms",
         )
     elif result.get("kind") == "TimeoutError" and result["error"] == "discovery":
-        yield fail("discovery", "two nodes here do not find each other", _DISCOVERY_ADVICE)
+        yield fail(
+            "discovery", "two nodes on this machine do not discover each other", _DISCOVERY_ADVICE
+        )
     elif result.get("kind") == "TimeoutError":
         yield fail(
             "discovery",
-            "a node was found, but its service did not answer",
+            "a node was discovered, but its service did not answer",
             "check /dev/shm (two users or containers may see different ones) and the firewall",
         )
     else:
-        yield fail("discovery", f"could not be tried: {result['error']}", "see `rclpy` above")
+        yield fail("discovery", f"could not be tested: {result['error']}", "see `rclpy` above")
 
 
 def _self_test(*arguments: str) -> dict[str, Any]:

@@ -317,4 +317,8 @@ def decode_cancel(frame: bytes) -> list[bytes]:
 def check_version(version: Any) -> None:
     """Refuse what another version wrote. Raises FrameError: it is not of this version."""
     if version is True or version != VERSION:
-        raise FrameError(f"version {version!r}, where {VERSION} is spoken here")
+        older = isinstance(version, int) and version < VERSION
+        raise FrameError(
+            f"version {version!r:.20} of the link, and here is version {VERSION}: upgrade fogft "
+            + ("there" if older else "here")
+        )

@@ -20,7 +20,7 @@ from fogft.model.plain import Count, Line, Seconds
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.type_definition import Definition
-from fogft.records.record import SignedRecord
+from fogft.records.record import Record, SignedRecord
 from fogft.requests.load import Handling, Load
 
 
@@ -29,14 +29,13 @@ class Probe:
     """What a robot tells a replica with each probe.
 
     Attributes:
-        manager_age_s: Since the robot last saw a sign of the pool's manager; None if
-            it never did.
         describe: The answer shall tell the definitions of the services' types.
+        version: Of fogft on the robot; empty before 0.2.0.
     """
 
     robot: Line
-    manager_age_s: Seconds | None = None
     describe: bool = False
+    version: Line = ""
 
 
 @dataclass(frozen=True)
@@ -57,6 +56,9 @@ class GatewayView:
     silent_for_s: Seconds = 0.0
     rtt_s: Seconds | None = None
     restarts: Count = 0
+    version: Line = ""
+    lease_age_s: Seconds | None = None
+    lease_left_s: Seconds | None = None
     detail: Line = ""
     through: Line = ""
 
@@ -91,7 +93,12 @@ class ProbeAnswer:
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
         behind: The replicas behind a gateway.
+        version: Of fogft on the replica; empty before 0.2.0.
+        lease_age_s: Since it last heard of the pool's manager; None for never.
+        lease_left_s: Until it shuts down unless it hears of it again; None for never.
         accepts: Names of compressions that it reads, or does by itself.
+        hanging: Services that have work, and have answered nothing for far longer than they take.
+        strangers: Connections that were turned away, because nobody with a certificate spoke.
     """
 
     slot: Count
@@ -107,7 +114,12 @@ class ProbeAnswer:
     offered: Mapping[Line, Line] = field(default_factory=dict)
     types: Mapping[Line, Definition] = field(default_factory=dict)
     behind: tuple[GatewayView, ...] = ()
+    version: Line = ""
+    lease_age_s: Seconds | None = None
+    lease_left_s: Seconds | None = None
     accepts: frozenset[Line] = frozenset()
+    hanging: frozenset[Line] = frozenset()
+    strangers: Count = 0
 
 
 class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
@@ -328,6 +340,9 @@ class Listener(Protocol):
 
     def revoke(self, names: Collection[str]) -> None:
         """Let the holders of these certificates (common names) in no more. Repeatable."""
+
+    def lease(self) -> Record | None:
+        """Return the newest lease that the manager signed, of those that robots brought."""
 
     def counters(self) -> Mapping[str, int]:
         """Counts by event name: ``malformed``, ``refused``, ``reply_dropped``, ..."""

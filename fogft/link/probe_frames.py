@@ -16,7 +16,7 @@ from fogft.model.plain import as_line, from_plain, to_plain
 
 T = TypeVar("T")
 PROBE_LIMIT = 1024
-PROBE_ANSWER_LIMIT = 65536
+PROBE_ANSWER_LIMIT = 256 << 10  # `NAMES_BYTES_LIMIT` has room in it twice, with types
 DETAIL_LIMIT = 500
 BEHIND_LIMIT = 128
 BEHIND_DETAIL_LIMIT = 100
@@ -35,16 +35,19 @@ def decode_probe(frame: bytes) -> Probe:
 def encode_probe_answer(answer: ProbeAnswer) -> bytes:
     """Return a probe's answer as compact JSON; a long `detail` is cut.
 
-    Definitions of types are left out where they do not fit.
+    Where it does not fit, definitions of types are left out, then the later half of what is
+    behind, then the next.
 
     Raises:
-        ValueError: It names too many services for one frame (64 KiB).
+        ValueError: It names more services than any pool file may.
     """
     behind = tuple(_shortened(one) for one in answer.behind)
     written = replace(answer, detail=_cut(answer.detail, DETAIL_LIMIT), behind=behind)
     frame = _encoded(written)
-    if len(frame) > PROBE_ANSWER_LIMIT:
-        frame = _encoded(replace(written, types={}))
+    while len(frame) > PROBE_ANSWER_LIMIT and (written.types or written.behind):
+        kept = written.behind if written.types else written.behind[: len(written.behind) // 2]
+        written = replace(written, types={}, behind=kept)
+        frame = _encoded(written)
     if len(frame) > PROBE_ANSWER_LIMIT:
         raise ValueError(f"a probe's answer of {len(frame)} bytes")
     return frame

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import fogft
@@ -85,7 +86,9 @@ class Collector:
             "Version of fogft and of Python.",
             [(1, {"version": fogft.__version__, "python": platform.python_version()})],
         )
-        for family in self._families:
+        from prometheus_client import ProcessCollector
+
+        for family in chain(self._families, ProcessCollector(registry=None).collect()):
             family.samples = [
                 sample._replace(labels={**self._labels, **sample.labels})
                 for sample in family.samples

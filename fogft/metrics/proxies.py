@@ -23,10 +23,12 @@ _COUNTS = {
     "undelivered": ("fogft_undelivered_responses_total", "Responses that ROS did not take."),
     "fallback_failed": ("fogft_fallback_failures_total", "Fallback calls without a response."),
 }
+LEASE = ("fogft_replica_lease_seconds", "Time until a replica that hears of no manager ends.")
 _LINK_GAUGES = {
     "silent_for_s": ("fogft_link_silent_seconds", "Time since the oldest unanswered probe."),
     "rtt_s": ("fogft_link_round_trip_seconds", "Round trip of the last probe."),
     "in_flight": ("fogft_link_requests_in_flight", "Requests sent to a replica and not answered."),
+    "lease_left_s": LEASE,
 }
 _LINK_COUNTS = {
     "reopened": ("fogft_link_reconnects_total", "Connections to a replica that were opened again."),
@@ -68,7 +70,7 @@ def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
             (count, {"topic": topic, "event": event})
             for topic, counts in report.get("topics", {}).items()
             for event, count in counts.items()
-            if event != "trouble"
+            if event not in ("trouble", "rate_hz")
         ),
     )
     yield gauge(
@@ -171,6 +173,8 @@ def of_server(report: Mapping[str, Any]) -> Iterator[Metric]:
     yield counter(
         "fogft_replica_restarts_total", "Restarts of the command.", [(report["restarts"], {})]
     )
+    if report["lease_left_s"] is not None:
+        yield gauge(*LEASE, [(report["lease_left_s"], {})])
     yield _listener(report["wire"])
 
 

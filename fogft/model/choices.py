@@ -45,6 +45,13 @@ class Freshness(str, Enum):
     LATEST = "latest"  # the newest: of a camera's images the older ones are worth less
 
 
+class Spread(str, Enum):
+    """What keeps replicas apart, where on-demand machines may stand in for spot ones."""
+
+    PREFER = "prefer"  # at most half of them in one location
+    REQUIRE = "require"  # one in each
+
+
 class Compression(str, Enum):
     """Whether a service's payloads are compressed on thin links."""
 
@@ -167,14 +174,13 @@ class OnDemandSpec:
 
     base: int = key(
         Whole(0, MAX_REPLICAS, "machines"),
-        "Number of replicas that are always on demand; the others are spot.",
+        "Number of replicas that are always on demand; the rest are spot.",
         default=0,
     )
     fallback: bool = key(
         Flag(),
         "Whether on-demand machines stand in while too few spot ones are ready, ordered beside the "
-        "search for spot, within `max_usd_per_hour` and `max_surge`. No location then gets more "
-        "than half of the spot machines.",
+        "search for spot, within `max_usd_per_hour` and `max_surge`.",
         default=False,
     )
 

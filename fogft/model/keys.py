@@ -1,8 +1,9 @@
 """All that is to be said of a key of the pool file, said once, beside the value that it sets. Pure.
 
 A field of a specification's dataclass is made by `key`: what may stand there, its unit, its
-default and its help. The reader of the pool file, the JSON Schema, the page `docs/pool-file.md`,
-the ROS parameters and the proxies' configuration files all come from that.
+default and its help. The reader of the pool file, the JSON Schema, the page
+`docs/reference/pool-file.md`, the ROS parameters and the proxies' configuration files all come from
+that.
 
     class HealthSpec:
         suspect_after_s: float = key(Number(3600, "seconds"), "Mark a replica ...", default=2.0)

@@ -23,13 +23,14 @@ T = TypeVar("T")
 Read = Callable[[Any], Any]
 
 _READERS: dict[Any, Read] = {}
+_MOST = 1e300  # further on there is no arithmetic
 
 
 class Misfit(ValueError):
     """This is no value of a class: `path` leads to what is wrong there."""
 
     def __init__(self, path: tuple[str | int, ...], what: str) -> None:
-        parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+        parts = (f"[{part}]" if isinstance(part, int) else f".{part:.40}" for part in path)
         self.path, self.what = path, what
         super().__init__(f"{''.join(parts).lstrip('.')}: {what}")
 
@@ -61,8 +62,8 @@ def _check_line(text: str) -> None:
 
 
 Line = Annotated[str, _check_line]  # it may reach a terminal: no escape, no second line
-Seconds = Annotated[float, within(-1e18, 1e18)]
-Moment = Annotated[float, within(0, 1e12)]  # seconds since the epoch
+Seconds = Annotated[float, within(0, 1e12)]  # a duration
+Moment = Annotated[float, within(0, 2.5e11)]  # seconds since the epoch: a year of four digits
 
 
 def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
@@ -100,7 +101,7 @@ def from_plain(cls: type[T], raw: Any) -> T:
     return made
 
 
-def stored(cls: type[T], raw: Any, what: str) -> T:
+def stored(cls: type[T], raw: Any, what: str, hint: str = "") -> T:
     """Return the value that JSON data of ours describes.
 
     Raises:
@@ -109,7 +110,7 @@ def stored(cls: type[T], raw: Any, what: str) -> T:
     try:
         return from_plain(cls, raw)
     except ValueError as error:
-        raise StateError(f"{what}: {error}") from error
+        raise StateError(f"{what}: {error}", hint) from error
 
 
 class _Entry(NamedTuple):
@@ -156,11 +157,10 @@ def _made(hint: Any) -> Read:  # noqa: PLR0911
         return _fixed([_reader(kind) for kind in arguments])
     if origin in (tuple, frozenset, Sequence, list):
         return _listed(list if origin is Sequence else origin, _reader(arguments[0]))
-    if origin is Mapping:
+    if origin in (Mapping, dict):
         return _map(int if arguments[0] is int else _reader(arguments[0]), _reader(arguments[1]))
     if issubclass(hint, Enum):
-        by_value: Read = hint
-        return by_value
+        return _by_value(hint)
     if dataclasses.is_dataclass(hint):
         return _class(hint)
     if hint is Path:
@@ -176,7 +176,19 @@ def _scalar(kind: Any) -> Read:
             raise ValueError(f"{raw!r:.40} is not of type `{kind.__name__}`")
         if isinstance(raw, str):
             raw.encode()  # a lone surrogate cannot be written again
+        elif not -_MOST <= raw <= _MOST:  # nor NaN
+            raise ValueError(f"{raw!r:.40} is too large")
         return kind(raw)
+
+    return read
+
+
+def _by_value(kind: type[Enum]) -> Read:
+    def read(raw: Any) -> Enum:
+        try:
+            return kind(raw)
+        except ValueError:
+            raise ValueError(f"{raw!r:.40} is no {kind.__name__}") from None
 
     return read
 

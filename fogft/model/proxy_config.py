@@ -50,12 +50,11 @@ class ClientProxyConfig:
         robot: Name of this robot, or gateway.
         membership: Which replicas there are; written by the manager.
         status: What the proxy reports to the manager.
-        lease: Its beat tells that a manager lives.
         suspect_after_s: Nothing more is sent to a replica after so long without a probe reply.
         tell_losers: Whether replicas are told which requests were answered elsewhere.
         domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
         records: What was learned from rendezvous, for the next start.
-        revocations: The manager's signed revocations, to be passed on to replicas.
+        announcements: What the manager signed for every replica, to be passed on to them.
         dial_in: Address that replicas which cannot be reached are given; `dial_in_listen` is where
             to listen for them, if not on that port of all addresses.
         uplinks: Network interfaces to use at once, the preferred one first.
@@ -67,7 +66,6 @@ class ClientProxyConfig:
     robot: Robot
     membership: Path
     status: Path
-    lease: Path
     lock: Path
     credentials: CredentialPaths
     services: tuple[ServiceSpec, ...]
@@ -76,7 +74,7 @@ class ClientProxyConfig:
     domain_id: DomainId | None = None
     rendezvous: tuple[Endpoint, ...] = ()
     records: Path | None = None
-    revocations: Path | None = None
+    announcements: Path | None = None
     dial_in: EndpointOrEmpty = ""
     dial_in_listen: EndpointOrEmpty = ""
     uplinks: tuple[Interface, ...] = ()
@@ -93,7 +91,6 @@ class ServerProxyConfig:
     Attributes:
         run: Command that starts the services in `workdir`; empty where they are started otherwise.
         domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
-        orphan_after_s: It shuts down after so long without a sign of a manager.
         notice: Where preemption notices come from.
         max_in_flight: Most requests held at once.
         advertise: Address at which this replica is reached, where it differs.
@@ -112,14 +109,13 @@ class ServerProxyConfig:
     workdir: Path = Path()
     envs: Mapping[str, str] = field(default_factory=dict)
     domain_id: DomainId | None = None
-    orphan_after_s: LastsFor = 3600.0
     notice: NoticeSource = "auto"
     max_in_flight: Annotated[int, within(1, 1 << 20)] = 512
     log_level: str = "info"
     advertise: EndpointOrEmpty = ""
     rendezvous: tuple[Endpoint, ...] = ()
     records: Path | None = None
-    revocations: Path | None = None
+    announcements: Path | None = None
     dial_out: tuple[Endpoint, ...] = ()
     metrics: EndpointOrEmpty = ""
     topics: tuple[TopicSpec, ...] = ()

@@ -29,6 +29,7 @@ class Cause(str, Enum):
     DRAINS_ITSELF = "drains_itself"
     SILENT = "silent"
     DISAGREES = "disagrees"
+    MISREAD = "misread"  # its answers are no messages of the type
     AT_RISK = "at_risk"
     SERVICE_AWAY = "service_away"
 
@@ -116,6 +117,7 @@ class Cause(str, Enum):
     NO_CERTIFICATE = "no_certificate"
     NO_RENDEZVOUS = "no_rendezvous"
     NOT_OFFERED = "not_offered"
+    OUTVOTED = "outvoted"  # not even half of the replicas offer a service
     TROUBLE = "trouble"  # an error, in its own words
 
 

@@ -1,6 +1,6 @@
 """The values that every part speaks of: replica, placement, machine, link report.
 
-Pure data, immutable, compared by value. The words are those of docs/glossary.md.
+Pure data, immutable, compared by value. The words are those of docs/reference/glossary.md.
 """
 
 from __future__ import annotations
@@ -92,9 +92,11 @@ class Offer:
     """A placement with its price in US dollars per hour.
 
     Attributes:
-        source: Where the price comes from: ``live``, ``catalogue``; empty where it is made up.
+        source: Where the price comes from: ``live``, ``catalogue``; empty where it is simulated.
         as_of: When it was true, in seconds since the epoch; 0 when that is not known.
         group: The group of the pool file that it suits; empty where there are none.
+        extras_usd_per_hour: The part of the price that is for its disk and its address.
+        egress_usd_per_hour: The part that is for the responses that leave the cloud.
     """
 
     placement: Placement
@@ -102,6 +104,8 @@ class Offer:
     source: str = ""
     as_of: float = 0.0
     group: str = ""
+    extras_usd_per_hour: float = 0.0
+    egress_usd_per_hour: float = 0.0
 
 
 class Phase(str, Enum):
@@ -135,7 +139,9 @@ class Machine:
             line break); None otherwise.
         progress: What the cloud says is being done there until it serves, for people.
         setting_up: The task's `setup` is under way.
+        running_at: When it was seen to run, in seconds since the epoch; 0 where it is not known.
         set_up_at: When that was done, in seconds since the epoch; 0 where it is not known.
+        pool: The name of its pool, as far as the cloud knows it.
     """
 
     id: ReplicaId
@@ -149,7 +155,9 @@ class Machine:
     failure: Reason | None = None
     progress: str = ""
     setting_up: bool = False
+    running_at: float = 0.0
     set_up_at: float = 0.0
+    pool: str = ""
 
 
 def by_id(machine: Machine) -> tuple[str, int, int]:
@@ -188,15 +196,21 @@ class LinkReport:
         ready: Names of the services that this replica says it can answer now.
         draining: The replica asked to be left alone (a preemption notice, a drain).
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
-        disagrees: Its answers have differed from those of a quorum, repeatedly.
+        disagrees: Its answers have differed from those of a quorum, repeatedly, or have been
+            `misread`: they were no responses.
         heard_age_s: Since the server proxy last answered a probe; None if never.
         silent_for_s: How long probes have gone unanswered; 0 while they are answered.
         rtt_s: Round trip of the last probe.
         restarts: How often the server proxy restarted the user's `run` command.
+        strangers: Connections at its port that nobody with a certificate had opened.
+        version: Of fogft on the replica; empty where it is not known.
+        lease_age_s: Since the replica last heard of the manager; None if it never did.
+        lease_left_s: Until it shuts down unless it hears of it again; None for never.
         answered: How many requests it has answered well, first or not.
         failed: How many came to a crash, a refusal or a response that was not ok.
         detail: Last error in words (connection refused, wrong certificate, ...).
         differs: A service's type is not the same there as on the robot, or cannot be loaded.
+        differing: The services of such types.
         offered: Name and type of each service that `run` offers, where that is found out.
     """
 
@@ -206,16 +220,22 @@ class LinkReport:
     draining: bool = False
     at_risk: bool = False
     disagrees: bool = False
+    misread: bool = False
     heard_age_s: float | None = None
     silent_for_s: float = 0.0
     rtt_s: float | None = None
     in_flight: int = 0
     won: int = 0
     restarts: int = 0
+    strangers: int = 0
+    version: str = ""
+    lease_age_s: float | None = None
+    lease_left_s: float | None = None
     answered: int = 0
     failed: int = 0
     detail: str = ""
     differs: bool = False
+    differing: tuple[str, ...] = ()
     offered: tuple[tuple[str, str], ...] = ()
 
     @property

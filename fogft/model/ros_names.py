@@ -40,6 +40,11 @@ def absolute_service_name(name: str) -> str:
     return absolute
 
 
+def is_below(name: str, namespace: str) -> bool:
+    """Whether an absolute name is in a namespace, or in one below it; all are in the empty one."""
+    return name.startswith(namespace.rstrip("/") + "/")
+
+
 def is_service_type(name: str) -> bool:
     """Whether this has the form ``package/srv/Name``."""
     return _is_type(name, "srv")

@@ -10,6 +10,7 @@ from enum import Enum
 from functools import cached_property
 from typing import Any
 
+from fogft import __version__
 from fogft.model.choices import (
     MAX_REPLICAS,
     MAX_USD_PER_HOUR,
@@ -25,6 +26,7 @@ from fogft.model.choices import (
     PlacementSpec,
     ScheduleSpec,
     Speaks,
+    Spread,
     TrafficSpec,
 )
 from fogft.model.keys import (
@@ -275,8 +277,8 @@ class HealthSpec:
     )
     start_limit_s: float = key(
         Number(DAY_S, "seconds"),
-        "Give up on a launch that is not ready so long after its `setup`, or whose machine does "
-        "not run by then. `setup` itself has an hour from the launch.",
+        "Give up on a launch that is not ready this long after its `setup`, or whose machine is "
+        "not running by then. `setup` itself has an hour.",
         default=900.0,
     )
 
@@ -296,7 +298,8 @@ class PoolSpec:
         groups: Kinds of machines; none for one kind, the task's `resources`.
         topics: What passes besides services; those of actions are among them.
         task: The SkyPilot task: the file without its `fogft` section.
-        discovered: The services found where the file names none.
+        discovered: The services found where the file names none; `discovered_by` is the hash of
+            the replicas that told of them.
     """
 
     name: str = ""
@@ -309,6 +312,16 @@ class PoolSpec:
         "without the services of ROS itself.",
         default=(),
         usual="what `run` advertises",
+    )
+    namespace: str = key(
+        Text(
+            "a namespace",
+            "write where the services are that may be offered, such as `namespace: /planner`",
+            absolute_service_name,
+        ),
+        "Where `services` is left out: only what is below this namespace is offered on the robot.",
+        default="",
+        usual="any",
     )
     replicas: int = key(
         Whole(1, MAX_REPLICAS, "machines"), "Number of replicas to keep ready.", default=2
@@ -333,7 +346,7 @@ class PoolSpec:
         usual="never",
     )
     health: HealthSpec = key(
-        Map(HealthSpec), "When a replica is doubted and replaced.", default_factory=HealthSpec
+        Map(HealthSpec), "When a replica is suspected and replaced.", default_factory=HealthSpec
     )
     availability: AvailabilitySpec | None = key(
         Map(AvailabilitySpec, short=("target",)),
@@ -351,6 +364,12 @@ class PoolSpec:
         Map(OnDemandSpec),
         "How spot and on-demand machines are mixed; what is not on demand is then spot.",
         default_factory=OnDemandSpec,
+    )
+    spread: Spread = key(
+        OneOf(Spread),
+        "With `on_demand.fallback`, how many spot machines one location gets while on-demand ones "
+        "can be had: at most half of them (`prefer`), or one (`require`).",
+        default=Spread.PREFER,
     )
     groups: tuple[GroupSpec, ...] = key(
         Maps(GroupSpec, "write `groups: [{name: anchor, replicas: 1, ...}]`"),
@@ -410,7 +429,7 @@ class PoolSpec:
     )
     metrics: MetricsSpec = key(
         Map(MetricsSpec, "write a map, such as `metrics: {proxy: 127.0.0.1:9464}`"),
-        "Where processes answer Prometheus (`GET /metrics`).",
+        "Addresses at which processes serve Prometheus metrics (`GET /metrics`).",
         default_factory=MetricsSpec,
     )
     topics: tuple[TopicSpec, ...] = key(
@@ -437,13 +456,15 @@ class PoolSpec:
         "Actions that every replica runs. Not with `topology`.",
         default=(),
     )
-    orphan_after_s: float = key(
-        Number(30 * DAY_S, "seconds"),
-        "A replica that hears of no manager for this long shuts its machine down.",
-        default=3600.0,
+    unmanaged_max_hours: float = key(
+        Number(MAX_HOURS, "hours"),
+        "How long replicas go on serving after the manager was last heard of. Then they shut their "
+        "machines down, and never later than `max_hours` has them.",
+        default=24.0,
     )
     task: Mapping[str, Any] = field(default_factory=dict)
     discovered: tuple[ServiceSpec, ...] = ()
+    discovered_by: str = ""
 
     @cached_property
     def derived(self) -> dict[Any, Any]:
@@ -459,16 +480,16 @@ class PoolSpec:
     def replica_hash(self) -> str:
         """16 hexadecimal digits that change when running replicas must be replaced.
 
-        Covers what a replica runs and serves, and the machine it needs; not how many
-        there are, how long the robot waits, or where machines may be.
+        Covers what a replica runs and serves, fogft on it, and the machine it needs; not how
+        many there are, how long the robot waits, or where machines may be.
         """
         return self.hash_with(self.services, self.task.get("resources"))
 
     def hash_with(self, services: tuple[ServiceSpec, ...], resources: Any) -> str:
         """Return the `replica_hash` of a replica with these services and such `resources`."""
         asked: dict[str, Any] = {
+            "fogft": __version__,
             "services": sorted(_run_by_replica(s) for s in services),
-            "orphan_after_s": self.orphan_after_s,
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
         }
         if self.topics:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
+from fogft.model.choices import Spread
 from fogft.model.groups import Group, group_of, is_stand_in, replica_hash
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
@@ -173,14 +174,17 @@ class Buyer:
         )
 
     def _full(self, group: Group) -> frozenset[str]:
-        """Return the locations that hold half of a group already, where on-demand can stand in."""
+        """Return the locations that hold enough of a group, where on-demand can stand in."""
         if not group.on_demand.fallback or len(self._listing(group, True).supplies) < 2:
+            return frozenset()
+        if not self.market(group, False).rows:
             return frozenset()
         stay = (*self.machines.good, *self.machines.replaced)
         here = [s.placement for s in stay if group_of(self.groups, s.slot) is group]
         here += [x.offer.placement for x in self.launches if group_of(self.groups, x.slot) is group]
         count = Counter(place.location for place in here if place.spot)
-        most = max(1, math.ceil(group.replicas / 2))
+        half = max(1, math.ceil(group.replicas / 2))
+        most = 1 if self.spec.spread is Spread.REQUIRE else half
         return frozenset(location for location, held in count.items() if held >= most)
 
     @cached_property

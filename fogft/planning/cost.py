@@ -47,7 +47,7 @@ class Cost:
 
 def cost(replicas: Sequence[tuple[Offer, Sequence[ServiceSpec]]]) -> Cost:
     """Return what replicas cost: each an offer, and the services that it carries."""
-    machines = sum(offer.usd_per_hour for offer, _ in replicas)
+    machines = sum(offer.usd_per_hour - offer.egress_usd_per_hour for offer, _ in replicas)
     carriers = {
         service.name: sum(service in carried for _, carried in replicas)
         for _, carried in replicas

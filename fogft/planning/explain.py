@@ -21,11 +21,12 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec, ServiceSpec
-from fogft.planning.availability import Expected, expected
+from fogft.planning.availability import Expected, expected, unavailability_of
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
 from fogft.planning.listing import is_possible
 from fogft.planning.observed.backoff import AVOID_MEMORY_S, EVERYWHERE, avoided, backing_off
+from fogft.planning.observed.hazard import UNKNOWN, hazards
 from fogft.planning.observed.history import History
 from fogft.planning.placement import crowding
 from fogft.planning.planner import plan
@@ -43,6 +44,8 @@ class Considered:
         why_not: Why it was not chosen; None when it was.
         rtt_s: Round trip to its region in seconds; None for not known.
         losses: Replicas of this pool lost there in the last hours.
+        losses_per_hour: As the planner reckons with; None on demand.
+        losses_assumed: No spot machine of this pool has lived there: it is the prior.
     """
 
     offer: Offer
@@ -50,6 +53,8 @@ class Considered:
     why_not: Reason | None
     rtt_s: float | None
     losses: int
+    losses_per_hour: float | None = None
+    losses_assumed: bool = True
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,22 @@ class Explanation:
         return min(self.expected.values(), key=lambda one: one.correlated)
 
     @property
+    def is_cheapest(self) -> bool | None:
+        """Whether the pool, and no single on-demand machine, is the cheapest that does.
+
+        What does reaches the target; where there is none, what the pool is expected to be. None
+        where neither does, or a price is not known.
+        """
+        if self.single is None:
+            return None
+        pool = self.least_expected.correlated
+        target = pool if self.target is None else self.target
+        costs = [(self.cost.usd_per_hour, True)] if pool >= target else []
+        if 1.0 - unavailability_of(self.assumed, spot=False) >= target:
+            costs.append((self.single[1].usd_per_hour, False))
+        return min(costs)[1] if costs else None
+
+    @property
     def round_trips_s(self) -> list[float]:
         """Round trips to the replicas where known, the shortest first."""
         return sorted(r.rtt_s for r in self.replicas if r.rtt_s is not None)
@@ -110,6 +131,8 @@ def explain(
     observed: Observed,
     history: History,
     on_demand: Sequence[Offer] = (),
+    *,
+    recovery_s: float | None = None,
 ) -> Explanation:
     """Plan a pool from nothing, and say why.
 
@@ -119,6 +142,7 @@ def explain(
         observed: Offers, distances and the time; machines and links are not looked at.
         history: What happened to the pool before: losses and failures count.
         on_demand: What one on-demand machine of this kind costs, for comparison.
+        recovery_s: How long launches have taken, in place of what is assumed where nobody said.
     """
     world = replace(observed, machines=(), links=None, ending=frozenset())
     intent = replace(intent, stopping=False)
@@ -135,6 +159,8 @@ def explain(
         cap=sized.max_usd_per_hour,
     )
     assumed = spec.availability.assumed if spec.availability else Assumption()
+    if recovery_s is not None and assumed.recovery_s == Assumption().recovery_s:
+        assumed = replace(assumed, recovery_s=recovery_s)
     carried = [(launch.offer, services_at(spec, launch.slot)) for launch in planned.launches]
     cheapest = min(
         (o for o in on_demand if is_possible(o)),
@@ -192,6 +218,7 @@ class _Reasons:
         self._losses: Mapping[str, list[float]] = history.losses
         self._backing_off = backing_off(history, observed.now)
         self._avoided = avoided(history, observed.now)
+        self._hazards = hazards(history, observed.now)
         self._scale = scale
         self._picks: dict[str, list[_Pick]] = {}
         self._slots: dict[Offer, list[int]] = {}
@@ -212,7 +239,9 @@ class _Reasons:
         recent = [t for t in self._losses.get(location, ()) if 0 <= self._now - t < AVOID_MEMORY_S]
         why = None if slots else self._why_not(offer)
         rtt_s = self._scale.latency(offer.placement)
-        return Considered(offer, slots, why, rtt_s, len(recent))
+        rate = self._hazards.get(location, UNKNOWN) if offer.placement.spot else None
+        is_assumed = location not in self._hazards
+        return Considered(offer, slots, why, rtt_s, len(recent), rate, is_assumed)
 
     def _why_not(self, offer: Offer) -> Reason:
         location = offer.placement.location

@@ -13,21 +13,48 @@ Not here: where they are bought (`buying`) and the two steps of an ending (`endi
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 
-from fogft.model.groups import is_stand_in
+from fogft.model.groups import Group, is_stand_in
 from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment
+from fogft.planning.observed.history import History
 
 # A quarter of all losses come within minutes of the order.
 SETTLED_S = 60.0
 # Under a cap that has no room for both, a stand-in makes way for a spot machine after so long.
 STAYS_S = 600.0
+# Where spot machines are lost so often, one of a group is on demand. An hour of it then costs
+# little more than that of a spot machine with the stand-ins that follow it.
+OFTEN = 4
+OFTEN_S = 3600.0
 
 
 def stand_ins(machines: Classification) -> list[Assessment]:
     """Return the machines that stand in for others, and are not lost."""
     return [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
+
+
+def held(group: Group, wanted: int, history: History, now: float) -> int:
+    """Return how many stand-ins serve in place of spot machines, which are then not looked for.
+
+    One, where each spot machine beside it would be lost `OFTEN` within `OFTEN_S`. None in place of
+    a lone one: that would be to give up spot machines.
+    """
+    spot = wanted - group.on_demand.base - 1
+    if not group.on_demand.fallback or spot < 1:
+        return 0
+    return int(len(losses_of_late(history, now)) >= OFTEN * spot)
+
+
+def losses_of_late(history: History, now: float) -> list[float]:
+    """Return when machines were lost of which `held` speaks."""
+    return [
+        at
+        for losses in history.losses.values()
+        for at in losses[bisect_right(losses, now - OFTEN_S) : bisect_right(losses, now)]
+    ]
 
 
 def missing(wanted: int, here: Classification, standing_in: Sequence[Assessment]) -> int:
@@ -44,9 +71,20 @@ def missing(wanted: int, here: Classification, standing_in: Sequence[Assessment]
     return wanted - ready - first - len(standing_in)
 
 
-def spare(wanted: int, here: Classification, standing_in: Sequence[Assessment], now: float) -> int:
-    """Return how many stand-ins are no longer needed, given enough others that have settled."""
-    settled = sum(_is_settled(s, now) for s in (*here.good, *here.replaced))
+def spare(
+    wanted: int,
+    here: Classification,
+    standing_in: Sequence[Assessment],
+    now: float,
+    *,
+    held: int = 0,
+) -> int:
+    """Return how many stand-ins are no longer needed, given enough others that have settled.
+
+    Beside one that is held, and serves, a spot machine needs no time to settle.
+    """
+    settled_s = 0.0 if held and any(s.serving for s in standing_in) else SETTLED_S
+    settled = sum(_has_served(s, settled_s, now) for s in (*here.good, *here.replaced))
     kept = sum(not s.unwanted for s in standing_in)
     return kept - max(0, wanted - settled)
 
@@ -54,10 +92,6 @@ def spare(wanted: int, here: Classification, standing_in: Sequence[Assessment], 
 def has_stayed(replica: Assessment, now: float) -> bool:
     """Whether a stand-in may make way for a spot machine that the cap has no room for besides."""
     return _has_served(replica, STAYS_S, now)
-
-
-def _is_settled(replica: Assessment, now: float) -> bool:
-    return _has_served(replica, SETTLED_S, now)
 
 
 def _has_served(replica: Assessment, for_s: float, now: float) -> bool:

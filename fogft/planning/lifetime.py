@@ -33,6 +33,12 @@ def ends_at(spec: PoolSpec, begun_at: float) -> float | None:
     return None if spec.max_hours is None else begun_at + spec.max_hours * HOUR_S
 
 
+def unmanaged_s(spec: PoolSpec, begun_at: float, now: float) -> float:
+    """Return for how long replicas may serve without a manager, beginning now, in seconds."""
+    lasts_s, end = spec.unmanaged_max_hours * HOUR_S, ends_at(spec, begun_at)
+    return lasts_s if end is None else max(0.0, min(lasts_s, end - now))
+
+
 def is_over(spec: PoolSpec, begun_at: float, now: float) -> bool:
     """Whether a pool's hours are used up."""
     end = ends_at(spec, begun_at)

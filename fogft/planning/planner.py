@@ -170,19 +170,18 @@ def plan_once(
         standing_in=standing_in,
     )
     settling = bool(others.replaced) and rollout.is_settling(others, observed.now)
-    needs = needed_launches(sized.groups, counts, others, history, settling=settling)
+    held = _held(sized.groups, counts, standing_in, history, observed.now)
+    sought = [count - kept for count, kept in zip(counts, held, strict=True)]
+    needs = needed_launches(sized.groups, sought, others, history, settling=settling)
     may_move = not needs and not standing_in and len(machines.good) == wanted and spec.max_surge > 0
     may_move = may_move and migration.is_quiet(machines, health)
     waits = False
     restless = migration.restless(buyer) if may_move else frozenset()
-    moves = False
-    if restless:
-        found = migration.mover(buyer, observed.now, restless)
-        moves = found is not None
-        if found is not None:
-            machines.good.remove(found.replica)
-            machines.replaced.append(found.replica._replace(unwanted=found.why))
-            needs = needed_launches(sized.groups, counts, machines, history)
+    found = migration.mover(buyer, observed.now, restless) if restless else None
+    if found is not None:
+        machines.good.remove(found.replica)
+        machines.replaced.append(found.replica._replace(unwanted=found.why))
+        needs = needed_launches(sized.groups, counts, machines, history)
     room = wanted + spec.max_surge - machines.live
     first: Assessment | None = None
     begun = [need.slot for need in needs if not history.generation(need.slot)]
@@ -197,11 +196,12 @@ def plan_once(
     begun = [launch.slot for launch in buyer.launches if launch.generation == 1]
     for need in _stand_ins_missing(sized.groups, counts, others, standing_in, begun):
         buyer.buy(need, room=room)
-    held: Sequence[ReplicaId] = ()
+    staying: Sequence[ReplicaId] = ()
     if settling:
-        held = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
+        staying = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
     endings = Endings()
-    for group, count in zip(sized.groups, counts, strict=True):  # no group's surplus is another's
+    # No group's surplus is another's.
+    for group, count, kept in zip(sized.groups, counts, held, strict=True):
         here = others.part(sized.groups, group)
         mine = [s for s in standing_in if group_of(sized.groups, s.slot) is group]
         makes_room = first is not None and group_of(sized.groups, first.slot) is group
@@ -214,10 +214,10 @@ def plan_once(
                 now=observed.now,
                 drain_limit_s=drain_limit_s,
                 dear_first=bool(excess),
-                held=held,
+                held=staying,
                 first=first if makes_room else None,
                 standing_in=mine,
-                spare=fallback.spare(count, here, mine, observed.now),
+                spare=fallback.spare(count, here, mine, observed.now, held=kept),
             )
         )
     ends = [
@@ -240,7 +240,7 @@ def plan_once(
         # Who moves is not to go before the one that comes serves: all others do, and are needed.
         # Room kept for stand-ins that they did not take is left for the next pass.
         closed=not (ends or endings.draining or machines.ending or excess)
-        and (moves or not machines.replaced)
+        and (found is not None or not machines.replaced)
         and not (kept_free and waits),
         waits=waits,
         restless=restless,
@@ -254,6 +254,23 @@ def _kept_free(short: int, room: int, machines: Classification) -> int:
     """
     serves = any(s.may_serve for s in (*machines.good, *machines.replaced))
     return max(0, min(1 if serves else short, short, room - 1))
+
+
+def _held(
+    groups: Sequence[Group],
+    counts: Sequence[int],
+    standing_in: Sequence[Assessment],
+    history: History,
+    now: float,
+) -> list[int]:
+    """Return how many of each group's stand-ins are kept in place of spot machines."""
+    return [
+        min(
+            fallback.held(group, count, history, now),
+            sum(group_of(groups, s.slot) is group for s in standing_in),
+        )
+        for group, count in zip(groups, counts, strict=True)
+    ]
 
 
 def _stand_ins_missing(

@@ -223,7 +223,7 @@ def describe(
         health: The pool, judged by `spec`.
         wanted: How many replicas should serve.
     """
-    if good is None or (spec is good and not trial.fault):
+    if good is None:
         return None
     current = [
         judged.machine.spec_hash == replica_hash(spec, judged.id.slot) for judged in health.replicas
@@ -237,7 +237,10 @@ def describe(
         back = all(current) and done >= wanted
         state = UpdateState.ROLLED_BACK if back else UpdateState.STOPPED
         return Update(state, done, wanted, trial.fault)
-    if not differs(spec, good, [judged.id.slot for judged in health.replicas]):
+    # Of one and the same file they differ where another fogft has launched them.
+    stay = [judged.verdict is Verdict.GOOD for judged in health.replicas]
+    outdated = any(good and not now for good, now in zip(stay, current, strict=True))
+    if not outdated and not differs(spec, good, [judged.id.slot for judged in health.replicas]):
         return None
     return Update(UpdateState.IN_PROGRESS, done, wanted)
 

@@ -15,7 +15,7 @@ from typing import Any
 from fogft.errors import SpecError
 from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
 from fogft.model.groups import MAX_GROUPS
-from fogft.model.names import POOL_NAME_PATTERN
+from fogft.model.names import NAMES_BYTES_LIMIT, POOL_NAME_PATTERN
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
 from fogft.poolfile import rules
@@ -141,6 +141,11 @@ def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
         topics=(*made.topics, *(one for _, topics in parts for one in topics)),
     )
     _check_topology(ours, made.services, spec)
+    names = [*(one.name for one in spec.services), *(one.name for one in spec.topics)]
+    size = sum(map(len, names))
+    if size > NAMES_BYTES_LIMIT:
+        what = f"and topics have names of {size} bytes together; {NAMES_BYTES_LIMIT} are the most"
+        raise ours.error("services", what, "use shorter names, or two pools", at_key=True)
     if spec.topics and Speaks.ZENOH in (spec.rmw.robot, spec.rmw.replica):
         what = "does not go with `rmw: zenoh`: services only pass there"
         raise ours.error(_topics_key(ours), what, "remove one of the two")

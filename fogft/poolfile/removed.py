@@ -23,7 +23,10 @@ _AUTOSCALE = {
 }
 _DEFAULT_IS_RIGHT = "is no key any more; remove it: the default is right"
 _HINTS: dict[type, dict[str, str]] = {
-    PoolSpec: {**_AUTOSCALE},
+    PoolSpec: {
+        **_AUTOSCALE,
+        "orphan_after_s": "is called `unmanaged_max_hours` now, in hours; write that",
+    },
     ServiceSpec: {
         **_AUTOSCALE,
         "hedging_budget": _DEFAULT_IS_RIGHT,
@@ -41,7 +44,7 @@ _HINTS: dict[type, dict[str, str]] = {
     StateSpec: {
         "shared": "is no key any more: a service with `state` is for one robot; for several "
         "robots remove `state` and let the service keep its state in a replicated store, such as "
-        "etcd; docs/state.md shows how"
+        "etcd; docs/how-to/state.md shows how"
     },
     Topology: {"through": "is called `default_gateways` now; write that"},
     Gateway: {"through": "is called `upstream` now; write that"},

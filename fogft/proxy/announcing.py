@@ -23,6 +23,7 @@ from fogft.records.signing import Signer
 log = logging.getLogger(__name__)
 
 LOAD_EVERY_S = 5.0
+_NOTHING = Known()
 
 
 class Records(Protocol):
@@ -127,17 +128,17 @@ class Presence:
             self._dial_out = DialOut(listening, config.id.pool_uid, sign)
             self._dial_out.follow(config.dial_out)
 
-    def look(self, ready: frozenset[str], *, draining: bool, in_flight: int) -> frozenset[str]:
-        """Say what is new of us, dial new doors; return the names that are revoked."""
+    def look(self, ready: frozenset[str], *, draining: bool, in_flight: int) -> Known:
+        """Say what is new of us, dial new doors; return what is known there."""
         if self._client is None or self._announcer is None:
-            return frozenset()
+            return _NOTHING
         self._announcer.look(ready, draining=draining, in_flight=in_flight)
         known = self._client.known
         if known is not self._seen:
             self._seen = known
             if self._dial_out is not None:
                 self._dial_out.follow((*self._own_doors, *doors(known)))
-        return known.revoked
+        return known
 
     def close(self) -> None:
         """Leave."""

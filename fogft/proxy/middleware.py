@@ -9,20 +9,22 @@ Not here: the implementations, and what the node is for.
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fogft.errors import RosError
 from fogft.model.cdr import Shape
 from fogft.model.choices import Speaks
-from fogft.model.type_definition import RESPONSE, Definition
+from fogft.model.type_definition import Definition
 from fogft.proxy import start
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
 
 if TYPE_CHECKING:
+    from fogft.ros.participant.joining import EarlyJoin
     from fogft.ros.visible import VisibleNode
 
 Told = Callable[[], Mapping[str, Definition]]
@@ -35,11 +37,16 @@ class Joined(NamedTuple):
     """A node, what defines types for it, and what makes the node that people see.
 
     Over Zenoh there is none to see: `/diagnostics` and parameters need types.
+
+    `participant` returns the id in DDS of who offers a service here, and `callers` counts who may
+    call it; nothing where that is not known.
     """
 
     node: RosNode
     define: Callable[[str], Definition]
     make_visible: Callable[[str, Judge], VisibleNode | None] = lambda name, judge: None
+    participant: Callable[[str], bytes] = lambda service: b""
+    callers: Callable[[str], int] = lambda service: 0
 
 
 def prepare(speaks: Speaks) -> None:
@@ -50,11 +57,44 @@ def prepare(speaks: Speaks) -> None:
     memory_tuning.tune()
 
 
+def join_early(speaks: Speaks, name: str, domain_id: int | None) -> EarlyJoin | None:
+    """Have this process known in its ROS domain before it offers anything, where that takes time.
+
+    Raises:
+        RosError: ROS is not usable here.
+    """
+    if speaks is not Speaks.RCLPY:
+        return None
+    from fogft.ros.participant.joining import EarlyJoin
+
+    return EarlyJoin(f"_{name}_standby", domain_id)
+
+
+def load_types(type_names: Sequence[str]) -> None:
+    """Load what of these service types can be had here; what is wrong, their user tells."""
+    from fogft.ros import messages, transfer, types
+
+    for name in type_names:
+        with contextlib.suppress(ImportError, RosError):
+            types.definition(name)
+            messages.default_response(name)
+            transfer.choose(types.load_service_type(name), name)
+
+
+def declare_gone(participant: str, domain_id: int | None) -> None:
+    """Tell everybody that the process of this `Joined.participant` was killed."""
+    from fogft.ros.participant import farewell
+
+    with contextlib.suppress(ValueError):  # what a file says
+        farewell.declare_gone(bytes.fromhex(participant), domain_id)
+
+
 def join(
     speaks: Speaks,
     name: str,
     domain_id: int | None,
     *,
+    early: EarlyJoin | None = None,
     told: Told = dict,
     noticed: Callable[[], None] = lambda: None,
     environ: Mapping[str, str] = os.environ,
@@ -65,6 +105,7 @@ def join(
         speaks: How.
         name: The node's name.
         domain_id: The ROS domain; None for what the environment says.
+        early: What `join_early` returned.
         told: Returns the definitions of types as replicas tell them.
         noticed: Called, from any thread, when a type may be known that was not.
         environ: Where the variables of ROS and Zenoh are, for Zenoh.
@@ -77,15 +118,18 @@ def join(
     if speaks is Speaks.RCLPY:
         from fogft.ros.node import SerialisedNode
 
-        serialised = SerialisedNode(name, domain_id)
-        return Joined(serialised, definition, serialised.make_visible)
+        serialised = SerialisedNode(name, domain_id, early=early)
+        seen = serialised.make_visible, serialised.participant, serialised.callers
+        return Joined(serialised, definition, *seen)
     from fogft.rmw_zenoh.node import RmwZenohNode
 
     def hash_of(type_name: str) -> str:
         there = told().get(type_name)
         return (there.service_hash if there else "") or definition(type_name).service_hash
 
-    node = RmwZenohNode(name, domain_id, hash_of=hash_of, noticed=noticed, environ=environ)
+    node = RmwZenohNode(
+        name, domain_id, hash_of=hash_of, fault_of=fault_of, noticed=noticed, environ=environ
+    )
 
     def define(type_name: str) -> Definition:
         found, hash = definition(type_name), node.graph.hash_of(type_name)
@@ -96,14 +140,14 @@ def join(
     return Joined(node, define)
 
 
-def response_fault(type_name: str) -> Callable[[bytes], str]:
-    """Return what says why bytes are no response of a type; empty for nothing.
+def fault_of(type_name: str, part: str) -> Callable[[bytes], str]:
+    """Return what says why bytes are no request, or response, of a type; empty for nothing.
 
     Where the type is not installed only the header can be judged.
     """
     from fogft.ros.types import definition
 
-    return Shape(RESPONSE, definition(type_name).fields).fault
+    return Shape(part, definition(type_name).fields).fault
 
 
 def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | None:
@@ -113,9 +157,9 @@ def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | N
         RosError: It is needed, or rclpy is, and it cannot be had.
     """
     try:
-        from fogft.ros import types
+        from fogft.ros import messages
 
-        return types.default_response(type_name)
+        return messages.default_response(type_name)
     except ImportError as error:
         if needed or speaks is Speaks.RCLPY:
             raise RosError(

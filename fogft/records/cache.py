@@ -11,14 +11,23 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
+from fogft.model.plain import stored
 from fogft.records.record import RecordError, SignedRecord, from_plain, to_plain
 
 VERSION = 1
+
+
+@dataclass(frozen=True)
+class _File:
+    version: int
+    checksum: str
+    records: list[Any]
 
 
 def write(path: Path, records: Sequence[SignedRecord], *, durable: bool = True) -> None:
@@ -41,13 +50,14 @@ def read(path: Path) -> list[SignedRecord]:
     raw = disk.read_json(path)
     if raw is None:
         return []
+    read = stored(_File, raw, f"`{path}` is damaged")
+    if read.version != VERSION:
+        raise StateError(f"`{path}` is of version {read.version}, not {VERSION}")
     try:
-        if raw["version"] != VERSION:
-            raise StateError(f"`{path}` is of version {raw['version']!r:.20}, not {VERSION}")
-        if raw["checksum"] != _checksum(raw["records"]):
+        if read.checksum != _checksum(read.records):
             raise StateError(f"`{path}` is damaged: its checksum is wrong")
-        return [from_plain(one) for one in raw["records"]]
-    except (KeyError, TypeError, RecursionError, RecordError) as error:
+        return [from_plain(one) for one in read.records]
+    except (RecursionError, RecordError) as error:
         raise StateError(f"`{path}` is damaged: {error}") from error
 
 

@@ -55,12 +55,15 @@ class RecordKind(str, Enum):
     ADMISSION = "admission"  # manager: which generation of which slot is let in
     TOPOLOGY = "topology"  # manager: who talks through whom
     REVOCATION = "revocation"  # manager: certificates that are good no more
+    LEASE = "lease"  # manager: how long replicas serve without hearing of it again
     SLOT = "slot"  # replica: its endpoint, services, state and load
     ROBOT = "robot"  # robot: where replicas may dial in
     GATEWAY = "gateway"  # gateway: its endpoint
 
 
-MANAGER_KINDS = frozenset({RecordKind.ADMISSION, RecordKind.TOPOLOGY, RecordKind.REVOCATION})
+MANAGER_KINDS = frozenset(
+    {RecordKind.ADMISSION, RecordKind.TOPOLOGY, RecordKind.REVOCATION, RecordKind.LEASE}
+)
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 from fogft.errors import StateError
 from fogft.model.credentials import Holder, holder_of
 from fogft.model.membership import from_content
 from fogft.model.names import gateway_slot, is_endpoint
-from fogft.model.plain import to_plain
+from fogft.model.plain import Moment, from_plain, to_plain, within
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import COUNT_LIMIT, Record, RecordError, RecordKind
 
 SERVICES_LIMIT = 256
 NAME_LIMIT = 256
+LEASE_LIMIT_S = 366 * 86_400.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,19 @@ class SlotState:
             "draining": self.draining,
             "in_flight": self.in_flight,
         }
+
+
+@dataclass(frozen=True)
+class ServingLease:
+    """For how long replicas go on serving without hearing of the manager again.
+
+    Attributes:
+        at: When it was signed, in seconds since the epoch by the manager's clock.
+        lasts_s: From then on; no longer than the pool itself may run (`max_hours`).
+    """
+
+    at: Moment
+    lasts_s: Annotated[float, within(0, LEASE_LIMIT_S)]
 
 
 @dataclass(frozen=True)
@@ -135,6 +149,18 @@ def revoked_names(record: Record) -> frozenset[str]:
     return frozenset(holder.common_name for holder in holders)
 
 
+def lease(record: Record) -> ServingLease:
+    """Read the manager's lease.
+
+    Raises:
+        RecordError: Its content is none.
+    """
+    try:
+        return from_plain(ServingLease, record.content)
+    except ValueError as error:
+        raise RecordError("malformed", str(error)) from error
+
+
 def check_content(record: Record) -> None:
     """See that a record's content can be used.
 
@@ -145,6 +171,8 @@ def check_content(record: Record) -> None:
         admission(record)
     elif record.kind is RecordKind.REVOCATION:
         revoked_names(record)
+    elif record.kind is RecordKind.LEASE:
+        lease(record)
     elif record.kind is RecordKind.SLOT:
         slot_state(record)
     elif record.kind in (RecordKind.ROBOT, RecordKind.GATEWAY):

@@ -42,6 +42,7 @@ class Signer:
         self._key_path = key
         self._version: tuple[int, int, int] | None = None
         self._der = b""
+        self._common_name = ""
         self._key: ec.EllipticCurvePrivateKey | None = None
         self._load()
 
@@ -54,10 +55,8 @@ class Signer:
     @property
     def common_name(self) -> str:
         """The certificate's common name."""
-        from cryptography import x509
-
         self._load()
-        return _attribute(x509.load_der_x509_certificate(self._der), "CN")
+        return self._common_name
 
     def __call__(self, message: bytes) -> tuple[bytes, bytes]:
         """Return certificate and signature (both DER)."""
@@ -69,14 +68,14 @@ class Signer:
         return self._der, self._key.sign(message, ec.ECDSA(hashes.SHA256()))
 
     def _load(self) -> None:
+        version = disk.version(self._certificate_path)
+        if version is not None and version == self._version:
+            return
         from cryptography import x509
         from cryptography.hazmat.primitives.asymmetric import ec
         from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
         try:
-            version = disk.version(self._certificate_path)
-            if version is not None and version == self._version:
-                return
             certificate = x509.load_pem_x509_certificate(self._certificate_path.read_bytes())
             key = load_pem_private_key(self._key_path.read_bytes(), password=None)
         except (OSError, ValueError, TypeError):
@@ -94,6 +93,7 @@ class Signer:
                 return
             raise CredentialError(f"`{self._key_path}` does not belong to its certificate")
         self._version, self._der, self._key = version, certificate.public_bytes(Encoding.DER), key
+        self._common_name = _attribute(certificate, "CN")
 
 
 class Verifier:

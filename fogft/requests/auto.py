@@ -25,7 +25,7 @@ from typing import Any
 
 from fogft.model.spec import HedgingMode, Part, ServiceSpec
 from fogft.requests.choose import All, Choose, Failover
-from fogft.requests.load import NEVER, Load, ReplicaLoad
+from fogft.requests.load import NEVER, Demand, Load, ReplicaLoad
 
 BUDGET_CAPACITY = 10.0
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
@@ -35,7 +35,7 @@ _CUT = 0.5
 # Spares come back while nothing is asked: a pause counts beyond so many service times, and after so
 # many of these every request has spares again.
 _PAUSE = 3.0
-_RECOVERED_AFTER = 300.0
+_RECOVERED_AFTER = 3000.0
 _MEMORY = 0.98  # of what spares saved and cost, from one request to the next
 _RETRY_S = 0.02
 
@@ -124,6 +124,7 @@ class Auto(Choose):
         self.look_at = NEVER
         self._budget = TokenBucket(budget, BUDGET_CAPACITY)
         self._spares = Spares()
+        self._demand = Demand()
         self._replicas: dict[int, ReplicaLoad] = {}
         # When a spare was first, by the copy that it beat, until that has ended.
         self._beaten: dict[tuple[bytes, int], float] = {}
@@ -134,6 +135,7 @@ class Auto(Choose):
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
         """Return who will answer first, and those besides that have nothing to do."""
         self._budget.request()
+        self._demand.asked(now)
         if not able:
             return ()
         best = self._best(request, able, now)
@@ -143,6 +145,8 @@ class Auto(Choose):
             self._spares.made_wait(known.service_s())
         others = able if self._spares.chosen(request) else self._stale(able, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
+        if self._spares.share < 1.0 and others is able:
+            spares = spares[:-1]  # spares were in the way: from now on they leave a replica free
         for spare in spares:
             self._spares.open[request, spare] = now
             self._replicas[spare].asked(request, now)
@@ -166,13 +170,13 @@ class Auto(Choose):
         if not candidates:
             return ()
         if open:
-            due = max(begun + self._of(replica).delay_s() for replica, begun in open.items())
-            if now < due:
-                self._look(due)
-                return ()
-            doubted = [self._of(replica).doubt(begun, now) for replica, begun in open.items()]
-            free = [c for c in candidates if self._of(c).free(now)]
+            doubted = [self._doubts(replica, begun, now) for replica, begun in open.items()]
             if not all(doubted):  # somebody works on it: only a free one may help, and few times
+                due = max(begun + self._of(replica).delay_s() for replica, begun in open.items())
+                if now < due:
+                    self._look(due)
+                    return ()
+                free = [c for c in candidates if self._of(c).free(now)]
                 if not free or not self._budget.take():
                     self._look(now + _RETRY_S)
                     return ()
@@ -200,6 +204,13 @@ class Auto(Choose):
     def is_spare(self, request: bytes, replica: int) -> bool:
         """Whether the replica is to drop it unless it has nothing else to do."""
         return (request, replica) in self._spares.open
+
+    def _doubts(self, replica: int, begun: float, now: float) -> bool:
+        known = self._of(replica)
+        was = known.doubted
+        if known.doubt(begun, now) and not was:
+            self.news = True  # what else it has goes to another, too
+        return known.doubted
 
     def _of(self, replica: int) -> ReplicaLoad:
         known = self._replicas.get(replica)
@@ -262,12 +273,21 @@ class Auto(Choose):
             if expired:
                 known.doubt(begun, now)
 
+    def hangs(self, replica: int) -> None:
+        """Doubt it: what it has goes to others at once."""
+        self._of(replica).doubted = self.news = True
+
     def forget(self, replica: int) -> None:
         """Forget what was on the way there."""
         self._of(replica).forget()
         for copies in (self._spares.open, self._beaten):
             for key in [key for key in copies if key[1] == replica]:
                 del copies[key]
+
+    def needed(self, able: int, now: float) -> int:
+        """Return how many replicas would do, where those able are too few; else 0."""
+        times_s = sorted(known.service_s() for known in self._replicas.values())
+        return self._demand.replicas(able, times_s[len(times_s) // 2], now) if times_s else 0
 
     def report(self) -> dict[str, Any]:
         """Return counts, the budget, and each replica's estimate by ``slot.generation``."""

@@ -26,10 +26,12 @@ class Choose:
     Attributes:
         moves_on: Whether another replica is asked at once when nobody works on a request.
         look_at: When `more` wants to be asked next, though nothing else has happened.
+        news: What it has learned concerns requests that it did not want to be asked about yet.
     """
 
     moves_on = True
     look_at = NEVER
+    news = False
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
         """Return which of the able replicas a new request goes to at once."""
@@ -68,8 +70,15 @@ class Choose:
     ) -> None:
         """A request ended without these: its deadline came, or it was answered otherwise."""
 
+    def hangs(self, replica: int) -> None:
+        """A replica has told that its service answers nothing of what it has."""
+
     def forget(self, replica: int) -> None:
         """A replica's link is new, or gone: of what was on the way there nothing more is heard."""
+
+    def needed(self, able: int, now: float) -> int:
+        """Return how many replicas would do, where those able are too few; else 0."""
+        return 0
 
     def report(self) -> dict[str, Any]:
         """Return what the policy has learned, for people."""
@@ -118,15 +127,15 @@ class Failover(Choose):
         """Return one when nobody works on the request, or nobody seems to."""
         if not candidates:
             return ()
-        overdue_at = max(
-            (self._of(replica).doubtful_at(begun) for replica, begun in open.items()), default=now
-        )
-        if now < overdue_at:
-            self.look_at = min(self.look_at, overdue_at)
-            return ()
-        doubted = [self._of(replica).doubt(begun, now) for replica, begun in open.items()]
-        if not all(doubted):
-            return ()
+        for replica, begun in open.items():
+            known = self._of(replica)
+            was = known.doubted
+            self.news |= known.doubt(begun, now) and not was
+            if not known.doubted:
+                overdue_at = known.doubtful_at(begun)
+                if now < overdue_at:
+                    self.look_at = min(self.look_at, overdue_at)
+                return ()
         self.hedges += bool(open)
         self._failed = self._failed or self._current in open
         return self._asked(request, self._one_of(candidates), now)
@@ -186,6 +195,12 @@ class Failover(Choose):
     ) -> None:
         """Move on from a replica that let a deadline pass: its service may hang."""
         if expired and self._current in open:
+            self._failed = True
+
+    def hangs(self, replica: int) -> None:
+        """Move on from it, with all that it has."""
+        self._of(replica).doubted = self.news = True
+        if replica == self._current:
             self._failed = True
 
     def forget(self, replica: int) -> None:

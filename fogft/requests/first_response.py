@@ -55,6 +55,7 @@ class Pending(Generic[T]):
         deaths: How often a service died while it worked on this: those that died together over
             copies of it, and of other requests, count as one.
         alone_at: The replica that works on it with nothing beside it, since a service has died.
+        died_at: The replicas where one has.
     """
 
     deadline: float
@@ -66,6 +67,7 @@ class Pending(Generic[T]):
     rejection: bytes | None = None
     deaths: int = 0
     alone_at: int | None = None
+    died_at: set[int] = field(default_factory=set)
 
 
 class FirstResponse(Generic[T]):
@@ -78,8 +80,10 @@ class FirstResponse(Generic[T]):
     def __init__(self, *, attempts: int = 3) -> None:
         self._attempts = attempts
         self._pending: dict[bytes, Pending[T]] = {}
-        # Those that some replica may have to be asked for, as far as is known.
-        self._short: dict[bytes, None] = {}
+        # Those that some replica may have to be asked for, as far as is known, and from when on.
+        self._short: dict[bytes, float] = {}
+        self._soonest_deadline = float("inf")  # or sooner
+        self.has_rejected = False  # any request so far
 
     def __len__(self) -> int:
         return len(self._pending)
@@ -119,8 +123,9 @@ class FirstResponse(Generic[T]):
             raise ValueError("request id is registered already")
         pending = Pending(deadline, item, dict.fromkeys(replicas, now))
         self._pending[request] = pending
+        self._soonest_deadline = min(self._soonest_deadline, deadline)
         if not complete or not pending.open:
-            self._short[request] = None
+            self._short[request] = 0.0
         return pending
 
     def attempt(self, request: bytes, replica: int, now: float = 0.0) -> Pending[T] | None:
@@ -141,7 +146,7 @@ class FirstResponse(Generic[T]):
 
     def _ended(self, request: bytes, pending: Pending[T], replica: int) -> None:
         pending.open.pop(replica, None)
-        self._short[request] = None
+        self._short[request] = 0.0
 
     def succeeded(self, request: bytes, now: float) -> tuple[Verdict, Pending[T] | None]:
         """Note a success. WON exactly once a request, and never after its deadline."""
@@ -158,6 +163,7 @@ class FirstResponse(Generic[T]):
         if pending is None or replica not in pending.open:
             return Verdict.LATE
         pending.rejection = response
+        self.has_rejected = True
         self._ended(request, pending, replica)
         pending.barred.add(replica)
         return Verdict.WAIT if pending.open else Verdict.IDLE
@@ -195,9 +201,13 @@ class FirstResponse(Generic[T]):
 
     def expire(self, now: float) -> list[tuple[bytes, Pending[T]]]:
         """Take out every request whose deadline has come, oldest first."""
+        if now < self._soonest_deadline:
+            return []
         expired = [entry for entry in self._pending.items() if entry[1].deadline <= now]
         for request, _ in expired:
             self.close(request)
+        left = (pending.deadline for pending in self._pending.values())
+        self._soonest_deadline = min(left, default=float("inf"))
         return expired
 
     def idle(self) -> Iterator[tuple[bytes, Pending[T]]]:
@@ -208,9 +218,24 @@ class FirstResponse(Generic[T]):
             if not self._pending[request].open
         )
 
-    def short(self) -> list[tuple[bytes, Pending[T]]]:
-        """List requests for which a further replica may have to be asked."""
-        return [(request, self._pending[request]) for request in self._short]
+    def short(self, now: float) -> tuple[list[tuple[bytes, Pending[T]]], float]:
+        """Return the requests for which a further replica may have to be asked now.
+
+        Returns:
+            They, and when the next one must be looked at; infinite for no other.
+        """
+        due, later = [], float("inf")
+        for request, at in self._short.items():
+            if at <= now:
+                due.append((request, self._pending[request]))
+            elif at < later:
+                later = at
+        return due, later
+
+    def look_at(self, request: bytes, at: float) -> None:
+        """Leave a request out of `short` until then, unless something happens to it."""
+        if request in self._short:
+            self._short[request] = at
 
     def candidates(self, pending: Pending[T], able: Sequence[int], now: float) -> list[int]:
         """Return who may be asked for a request now: not at work on it, barred, or waiting."""
@@ -222,6 +247,16 @@ class FirstResponse(Generic[T]):
             and pending.waits.get(replica, _NO_WAIT)[0] <= now
         ]
 
+    @staticmethod
+    def rests_until(pending: Pending[T], able: Iterable[int]) -> float:
+        """Return when the first of the able that may be asked, but for a wait, may be asked."""
+        waits = [
+            pending.waits.get(replica, _NO_WAIT)[0]
+            for replica in able
+            if replica not in pending.open and replica not in pending.barred
+        ]
+        return min(waits, default=float("inf"))
+
     def came(self, replica: int) -> None:
         """A replica came (back): it may be asked at once for all that it does not work on.
 
@@ -231,7 +266,7 @@ class FirstResponse(Generic[T]):
         for request, pending in self._pending.items():
             pending.waits.pop(replica, None)
             if replica not in pending.open and replica not in pending.barred:
-                self._short[request] = None
+                self._short[request] = 0.0
 
     def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
         """A replica has begun anew what some requests are about: what it said before is void."""
@@ -241,8 +276,8 @@ class FirstResponse(Generic[T]):
                 pending.failures.pop(replica, None)
                 pending.waits.pop(replica, None)
                 if replica not in pending.open:
-                    self._short[request] = None
+                    self._short[request] = 0.0
 
     def reconsider(self) -> None:
         """Put every request before the policy again: there is another one."""
-        self._short = dict.fromkeys(self._pending)
+        self._short = dict.fromkeys(self._pending, 0.0)

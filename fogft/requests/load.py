@@ -9,6 +9,7 @@ Owns: what is known of one replica. Not here: who is asked (`auto`, `choose`).
 
 from __future__ import annotations
 
+import math
 from enum import IntFlag
 from typing import NamedTuple
 
@@ -30,6 +31,8 @@ _UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
 _AVOIDED_S = 0.1
 _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
+_DEMAND_OVER_S = 10.0
+_TOO_FULL, _FULL = 0.95, 0.8  # a share of what replicas can do: from when on it is too much
 
 
 class Handling(IntFlag):
@@ -56,6 +59,32 @@ class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice
     slots: int
     service_s: float
     spent_s: float
+
+
+class Demand:
+    """How often a service was lately asked."""
+
+    def __init__(self) -> None:
+        self._asked = 0.0
+        self._at = 0.0
+
+    def asked(self, now: float) -> None:
+        """Count a request."""
+        self._asked, self._at = 1.0 + self._lately(now), now
+
+    def _lately(self, now: float) -> float:
+        return self._asked * math.exp((self._at - now) / _DEMAND_OVER_S)
+
+    def replicas(self, able: int, service_s: float, now: float) -> int:
+        """Return how many replicas would do, where those that there are do not; else 0.
+
+        Args:
+            able: How many there are.
+            service_s: What a replica takes for a request, divided by how many it has at once.
+            now: Seconds.
+        """
+        work = self._lately(now) / _DEMAND_OVER_S * service_s
+        return math.ceil(work / _FULL) if work > _TOO_FULL * max(1, able) else 0
 
 
 class ReplicaLoad:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
 from fogft.model.refusal import Effect, Refusal
+from fogft.requests.alarms import Alarms
 from fogft.requests.choose import Choose
 from fogft.requests.decide import Decide, Judgement, Means
 from fogft.requests.fallback import FallbackTimer
@@ -58,6 +59,7 @@ class PendingRequests(Generic[T]):
         self.fallback: FallbackTimer[Pending[T]] | None = None
         self._counts_deaths = counts_deaths
         self._cautious_until = -NEVER
+        self._alarms = Alarms()
 
     def __len__(self) -> int:
         return len(self._table)
@@ -110,17 +112,25 @@ class PendingRequests(Generic[T]):
         self, able: Sequence[int], now: float, *, newest_first: bool
     ) -> list[tuple[bytes, int]]:
         """Return which requests go to which further replicas now."""
-        self.choose.look_at = NEVER
-        short = self._table.short()
-        return [
-            (request, replica)
-            for request, pending in (short[::-1] if newest_first else short)
-            for replica in self._next_for(request, pending, able, now)
-        ]
+        choose, steps = self.choose, []
+        if choose.news:
+            choose.news = False
+            self._table.reconsider()
+        short, soonest = self._table.short(now)
+        for request, pending in short[::-1] if newest_first else short:
+            choose.look_at = NEVER
+            chosen, again_at = self._next_for(request, pending, able, now)
+            steps += [(request, replica) for replica in chosen]
+            if again_at > now:
+                self._table.look_at(request, again_at)
+                soonest = min(soonest, again_at)
+        choose.look_at = now if choose.news else soonest
+        return steps
 
     def _next_for(
         self, request: bytes, pending: Pending[T], able: Sequence[int], now: float
-    ) -> Sequence[int]:
+    ) -> tuple[Sequence[int], float]:
+        """Return whom a request goes to now, and when to look at it again if nothing happens."""
         candidates, room = self._table.candidates(pending, able, now), len(able)
         if pending.deaths:  # alone
             room = 0 if pending.open else 1
@@ -128,9 +138,12 @@ class PendingRequests(Generic[T]):
             waited = now >= max(pending.open.values()) + _SPREADS_AFTER_S
             room -= len(pending.open) + (0 if waited else 1)
             candidates = candidates[: max(0, room)]
+        elif not candidates:
+            return (), self._table.rests_until(pending, able)
         if room <= 0:
-            return ()
-        return self.choose.more(request, pending.open, candidates, now)[:room]
+            return (), now
+        chosen = self.choose.more(request, pending.open, candidates, now)[:room]
+        return chosen, self.choose.look_at if self.choose.look_at < NEVER else now
 
     def poisonous(self, request: bytes | None) -> bool:
         """Whether a request has ended so many services that it is not to be sent again."""
@@ -208,6 +221,8 @@ class PendingRequests(Generic[T]):
             if pending is None:
                 self.choose.late(request, replica, now, answered=True)
                 return means, None, (), Verdict.LATE
+            for other in pending.died_at - {replica}:
+                self._alarms.was_false(other, now)
             losers = self.choose.answered(request, pending.open, replica, load, now)
             self._closed(request, pending)
             return means, pending, losers, Verdict.WON
@@ -226,12 +241,14 @@ class PendingRequests(Generic[T]):
     def refused(self, request: bytes, replica: int, refusal: Refusal, now: float) -> Verdict:
         """Take a refusal."""
         pending = self._table.get(request)
-        if refusal is Refusal.CRASHED and self._counts_deaths:
+        crashed = refusal is Refusal.CRASHED and self._counts_deaths
+        if crashed and self._alarms.believed(replica, now):
             self._cautious_until = now + CAUTIOUS_S
             if pending is not None and replica in pending.open:
                 # Beside others it is but suspected: any of them may have been the cause.
                 alone = replica == pending.alone_at
                 pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
+                pending.died_at.add(replica)
         verdict = self._table.failed(
             request,
             replica,
@@ -272,8 +289,8 @@ class PendingRequests(Generic[T]):
         return pending
 
     def idle(self) -> list[bytes]:
-        """Return the requests that nobody works on."""
-        return [request for request, _ in self._table.idle()]
+        """Return the requests that nobody works on, where some were answered, if not well."""
+        return [request for request, _ in self._table.idle()] if self._table.has_rejected else []
 
     def stop(self, request: bytes, now: float) -> Pending[T] | None:
         """Take a request out that its caller does not want any more."""
@@ -293,6 +310,7 @@ class PendingRequests(Generic[T]):
         """Take a request out that no replica is to have any more; the fallback still may."""
         pending = self._table.close(request)
         if pending is not None:
+            self._alarms.were_right(pending.died_at)
             self._given_up(request, pending, now, expired=False)
         return pending
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 from queue import SimpleQueue
@@ -23,12 +24,14 @@ from fogft.errors import RosError, Unreadable
 from fogft.link.zenoh import threads
 from fogft.log_limits import worth_logging
 from fogft.rmw_zenoh import naming
+from fogft.ros.pacing.pacer import Pacer, Probes
 
 log = logging.getLogger(__name__)
 
 # `rmw_zenoh` waits for ever; nobody who asks here waits longer than a request may take.
 _TIMEOUT_S = 1e6
 _CLOSE_LIMIT_S = 10.0
+_CLIENTS_KEPT = 64
 
 
 class Worker:
@@ -64,6 +67,7 @@ class Worker:
 class _Handle(NamedTuple):
     query: Any
     attachment: bytes
+    client: bytes
 
 
 class Server:
@@ -76,13 +80,19 @@ class Server:
         session: The Zenoh session.
         token: How it is told, without a hash.
         on_request: Gets the serialised request and a handle.
+        fault: Says why bytes are no response.
+        probes: Asks the clients' nodes whether they take what they got.
     """
 
     def __init__(
         self, session: Any, token: Callable[[str], naming.Token], hash: str,
-        on_request: Callable[[bytes, Any], None],
+        on_request: Callable[[bytes, Any], None], fault: Callable[[bytes], str],
+        *, probes: Probes | None = None,
     ) -> None:  # fmt: skip
+        self._pacer = Pacer(self._reply, probes, client_of=lambda handle: handle.client)
+        self._answered_ns = OrderedDict[bytes, int]()  # client -> when it got its last answer
         self._session = session
+        self._fault = fault
         self._token = token
         self._on_request = on_request
         self._open = True
@@ -123,19 +133,34 @@ class Server:
         if not self._open or query.payload is None or query.attachment is None:
             return  # dropped: who asks is told that no answer comes
         try:
-            handle = _Handle(query, query.attachment.to_bytes())
+            attachment = query.attachment.to_bytes()
+            client, sent_ns = naming.sent_by(attachment)
+            handle = _Handle(query, attachment, client)
+            # One that was sent before the last answer cannot follow from it: it is of a burst.
+            self._pacer.requested(handle, together=sent_ns < self._answered_ns.get(client, 0))
             self._on_request(query.payload.to_bytes(), handle)
         except Exception:
             log.exception("%s: a request was lost", self.name)
 
+    def mismatch(self) -> str:
+        """Return nothing: only nodes of one middleware are in Zenoh's graph."""
+        return ""
+
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send the serialised response. Nothing happens once the service is withdrawn."""
-        _check(payload)
+        _check(self._fault(payload), payload)
         if self._open:
+            self._pacer.respond(handle, payload)
+
+    def _reply(self, handle: _Handle, payload: bytes) -> None:
+        if self._open:
+            self._answered_ns[handle.client] = time.time_ns()
+            if len(self._answered_ns) > _CLIENTS_KEPT:
+                self._answered_ns.popitem(last=False)
             self._worker.do(partial(self._send, handle, payload))
 
     def _send(self, handle: _Handle, payload: bytes) -> None:
-        query, attachment = handle
+        query, attachment, _ = handle
         try:
             query.reply(
                 query.key_expr,
@@ -150,6 +175,7 @@ class Server:
         """Withdraw the service. Repeatable."""
         if self._open:
             self._open = False
+            self._pacer.close()
             self._worker.do(self._undeclare)
             self._worker.close()
 
@@ -172,13 +198,15 @@ class Client:
         session: The Zenoh session.
         token: How it is told, without a hash.
         servers: Returns the type hash of each server that is there now.
+        fault: Says why bytes are no request.
     """
 
     def __init__(
         self, session: Any, token: Callable[[str], naming.Token],
-        servers: Callable[[], list[str]],
+        servers: Callable[[], list[str]], fault: Callable[[bytes], str],
     ) -> None:  # fmt: skip
         self._session = session
+        self._fault = fault
         self._token = token
         self._hashes = servers
         self._name = token("").service
@@ -199,13 +227,17 @@ class Client:
         """Whether anybody offers this service."""
         return self.servers() > 0
 
+    def mismatch(self) -> str:
+        """Return nothing: only nodes of one middleware are in Zenoh's graph."""
+        return ""
+
     def servers(self) -> int:
         """Count those who offer it."""
         return len(self._hashes()) if self._open else 0
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         """Send a serialised request; return its ticket. Raises RosError: nobody offers it."""
-        _check(payload)
+        _check(self._fault(payload), payload)
         hashes = self._hashes()
         with self._lock:
             if not self._open:
@@ -292,6 +324,6 @@ class Client:
             self._told = None
 
 
-def _check(payload: bytes) -> None:
-    if not naming.is_message(payload):
-        raise Unreadable(f"{len(payload)} bytes are not a serialised message")
+def _check(fault: str, payload: bytes) -> None:
+    if fault:
+        raise Unreadable(f"{len(payload)} bytes are not a serialised message: {fault}")

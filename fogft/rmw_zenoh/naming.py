@@ -29,7 +29,6 @@ _NODE_PARTS, _SERVICE_PARTS = 9, 13
 _GID_BYTES = 16
 _STAMP = slice(8, 16)  # of the attachment: between sequence number and GID
 _ATTACHMENT_BYTES = (32, 33)  # without, and with, a byte that says how long the GID is
-_HEADER_BYTES = 4
 
 
 @dataclass(frozen=True)
@@ -135,9 +134,14 @@ def response_attachment(of_request: bytes, sent_ns: int) -> bytes:
     return of_request[: _STAMP.start] + stamp + of_request[_STAMP.stop :]
 
 
-def is_message(payload: bytes) -> bool:
-    """Whether these bytes may be a serialised message: all that can be said with no type."""
-    return len(payload) >= _HEADER_BYTES and payload[0] == 0
+def sent_by(of_request: bytes) -> tuple[bytes, int]:
+    """Return the client's GID, and when it sent a request, in nanoseconds since 1970.
+
+    Of an attachment of no known form, nothing and 0.
+    """
+    if len(of_request) not in _ATTACHMENT_BYTES:
+        return b"", 0
+    return of_request[-_GID_BYTES:], struct.unpack("<q", of_request[_STAMP])[0]
 
 
 def may_be_same(one: str, other: str) -> bool:
@@ -187,6 +191,21 @@ class Graph:
         """Return the type hash of each server, or client, of a service; sorted."""
         wanted = (kind, name, type_name)
         return sorted(t.hash for t in self._all() if (t.kind, t.service, t.type) == wanted)
+
+    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
+        """Return name and namespace of the node that calls a service, if there is only one.
+
+        Of several, `client` (a GID) does not tell which: it is a hash of the token in a way of
+        `rmw_zenoh`'s own.
+        """
+        tokens = self._all()
+        nodes = {(t.node, t.namespace) for t in tokens if (t.kind, t.service) == (CLIENT, service)}
+        return nodes.pop() if len(nodes) == 1 else None
+
+    def services_of(self, name: str, namespace: str) -> list[str]:
+        """Return the names of a node's services."""
+        node = (SERVER, name, namespace)
+        return [t.service for t in self._all() if (t.kind, t.node, t.namespace) == node]
 
     def hash_of(self, type_name: str) -> str:
         """Return the hash of a type as anybody here has it; empty where nobody says."""

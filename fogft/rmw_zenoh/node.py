@@ -22,13 +22,18 @@ import zenoh
 from zenoh import handlers
 
 from fogft.errors import RosError
+from fogft.model.cdr import Shape
+from fogft.model.type_definition import REQUEST, RESPONSE
 from fogft.rmw_zenoh import naming, session
 from fogft.rmw_zenoh.entities import Client, Server
 from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
+from fogft.ros.pacing.client_probes import NodeProbes, ServiceProbes
 
 log = logging.getLogger(__name__)
 
 _DOMAIN = "ROS_DOMAIN_ID"
+
+FaultOf = Callable[[str, str], Callable[[bytes], str]]
 
 
 class RmwZenohNode:
@@ -39,6 +44,8 @@ class RmwZenohNode:
         domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
         hash_of: Returns the hash of a service type, as known from elsewhere; empty where it is
             not. A client's own goes before it.
+        fault_of: Returns what says why bytes are no request, or response, of a service type; no
+            others are passed on.
         noticed: Called, from Zenoh's thread, when a client has come. Must not block.
         environ: Where the variables of ROS and Zenoh are.
 
@@ -52,15 +59,18 @@ class RmwZenohNode:
         domain_id: int | None = None,
         *,
         hash_of: Callable[[str], str] = lambda _: "",
+        fault_of: FaultOf = lambda type_name, part: Shape("", {}).fault,
         noticed: Callable[[], None] = lambda: None,
         environ: Mapping[str, str] = os.environ,
     ) -> None:
         self._name = name
         self._hash_of = hash_of
+        self._fault_of = fault_of
         self._noticed = noticed
         self._domain = _domain(environ) if domain_id is None else domain_id
         self._numbers = itertools.count(1)
         self._made: list[Server | Client] = []
+        self._probes = NodeProbes(self)
         self._lock = threading.Lock()
         self._open = True
         config = session.settings_from(environ)
@@ -119,7 +129,11 @@ class RmwZenohNode:
                 "a replica that is ready tells it, and so does a client on the robot",
             )
         server: Server = self._add(
-            lambda: Server(self._session, self._tokens(SERVER, name, type_name), known, on_request)
+            lambda: Server(
+                *(self._session, self._tokens(SERVER, name, type_name), known, on_request),
+                self._fault_of(type_name, RESPONSE),
+                probes=ServiceProbes(name, self._probes),
+            )
         )
         for hash in self.graph.hashes(CLIENT, name, type_name):
             server.clients_hash(hash)
@@ -128,8 +142,9 @@ class RmwZenohNode:
     def client(self, name: str, type_name: str) -> Client:
         """Make a client of a service. Raises RosError: the node is closed."""
         servers = functools.partial(self.graph.hashes, SERVER, name, type_name)
+        fault = self._fault_of(type_name, REQUEST)
         made: Client = self._add(
-            lambda: Client(self._session, self._tokens(CLIENT, name, type_name), servers)
+            lambda: Client(self._session, self._tokens(CLIENT, name, type_name), servers, fault)
         )
         return made
 
@@ -148,6 +163,14 @@ class RmwZenohNode:
                 raise RosError(f"Zenoh refuses a service or client: {error}") from error
             self._made = [*(m for m in self._made if m.is_open), made]
             return made
+
+    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
+        """Return the node that a client of a service belongs to; see `Graph.node_of`."""
+        return self.graph.node_of(service, client)
+
+    def services_of(self, name: str, namespace: str) -> list[str]:
+        """Return the names of a node's services."""
+        return self.graph.services_of(name, namespace)
 
     def offered(self) -> dict[str, str]:
         """Return name -> type of the services that applications offer in this domain."""

@@ -16,6 +16,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.model.type_definition import nested
+from fogft.ros.messages import from_bytes
 from fogft.ros.types import load_service_type, nested_type, trouble
 
 _FLOAT = re.compile(r"(sequence<)?(float|double)\b.*")  # one, or a list of them
@@ -34,21 +35,14 @@ class Comparison:
     """
 
     def __init__(self, type_name: str, tolerances: Mapping[str, float]) -> None:
-        from rclpy.serialization import deserialize_message
-
-        self._read = deserialize_message
         self._response = load_service_type(type_name).Response
-        self._name = type_name
         self._tolerances = dict(tolerances)
         for path in tolerances:
             _check_float(self._response, type_name, path)
 
     def read(self, payload: bytes) -> Any:
-        """Return the message. Raises RosError for bytes that are no such response."""
-        try:
-            return self._read(payload, self._response)
-        except Exception as error:  # rclpy's own error types are private and vary by release
-            raise RosError(f"{len(payload)} bytes are not a response of `{self._name}`") from error
+        """Return the message. Raises Unreadable."""
+        return from_bytes(payload, self._response)
 
     def agree(self, one: Any, other: Any) -> bool:
         """Whether two messages are the same, within the tolerances. NaN agrees with NaN."""

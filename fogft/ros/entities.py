@@ -17,7 +17,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.log_limits import worth_logging
-from fogft.ros.pacing import Pacer, Probes
+from fogft.ros.pacing.pacer import Pacer, Probes
 from fogft.ros.port import OnBurst
 from fogft.ros.transfer import ClientEnd, ServiceEnd
 
@@ -51,6 +51,7 @@ class Server:
         *,
         on_burst: OnBurst | None = None,
         probes: Probes | None = None,
+        mismatch: Callable[[], str] = str,
     ) -> None:
         self.handle = service.handle
         self._service = service
@@ -60,6 +61,7 @@ class Server:
         self._on_burst = on_burst
         self._withdraw = withdraw
         self._unreadable = _Unreadable(service.srv_name)
+        self.mismatch = mismatch
         self._in_bursts = False  # several came together the last time
         self._lock = threading.Lock()
         self._pacer = Pacer(self._send, probes)
@@ -148,8 +150,10 @@ class Client:
         end: ClientEnd,
         withdraw: Callable[[Client], None],
         count: Callable[[str], int],
+        mismatch: Callable[[], str] = str,
     ) -> None:
         self.handle = client.handle
+        self.mismatch = mismatch
         self._count = count
         self._client = client
         self._end: ClientEnd | None = end

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fogft.errors import Unreadable
+from fogft.ros.messages import from_bytes, to_bytes
 from fogft.topics import goals
 
 
@@ -17,20 +19,19 @@ def merged(said: Mapping[int, bytes]) -> bytes | None:
     None where a list cannot be read; what cannot be read comes from no action server.
     """
     from action_msgs.msg import GoalStatusArray
-    from rclpy.serialization import deserialize_message, serialize_message
 
     entries: dict[bytes, Any] = {}
     statuses: dict[int, dict[bytes, int]] = {}
     try:
         for replica, message in said.items():
-            listed = deserialize_message(message, GoalStatusArray).status_list
+            listed = from_bytes(message, GoalStatusArray).status_list
             statuses[replica] = {bytes(one.goal_info.goal_id.uuid): one.status for one in listed}
             for one in listed:
                 entries.setdefault(bytes(one.goal_info.goal_id.uuid), one)
-    except Exception:  # rclpy's own error types are private and vary by release
+    except Unreadable:
         return None
     found = GoalStatusArray()
     for goal, status in goals.merged(statuses).items():
         entries[goal].status = status
         found.status_list.append(entries[goal])
-    return bytes(serialize_message(found))
+    return to_bytes(found)

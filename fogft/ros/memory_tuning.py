@@ -36,8 +36,11 @@ def tune() -> bool:
 
 
 def own_bytes() -> int:
-    """Return this process's own memory: what no file stands behind (RssAnon)."""
-    found = re.search(r"RssAnon:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    """Return this process's own memory: what no file stands behind (RssAnon); 0 if unknown."""
+    try:
+        found = re.search(r"RssAnon:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    except OSError:  # there is no descriptor left
+        return 0
     return int(found[1]) * 1024 if found else 0
 
 

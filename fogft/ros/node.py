@@ -11,17 +11,21 @@ Not here: pending requests (`entities`), bytes (`transfer`).
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 from fogft.errors import RosError
 from fogft.model import ros_names
 from fogft.model.topic import Quality
-from fogft.ros import topic_ends, transfer
-from fogft.ros.client_probes import NodeProbes, ServiceProbes
+from fogft.ros import topic_ends, transfer, vendors
 from fogft.ros.entities import Client, Server
+from fogft.ros.pacing.client_probes import NodeProbes, ServiceProbes
+from fogft.ros.participant import farewell
+from fogft.ros.participant.joining import EarlyJoin, bare_node, new_context
 from fogft.ros.port import OnBurst
 from fogft.ros.topic_ends import Publisher, Reader, Subscription
 from fogft.ros.types import load_message_type, load_service_type
@@ -36,10 +40,6 @@ _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a cal
 _NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, and proxies
 _NO_LIMIT = -1  # of rcl_wait: until something happens
 
-# A process that proxies must not leave files in ~/.ros/log; it has a log of its own, on standard
-# error. What goes through rclpy's loggers goes to /rosout only, or each line would be there twice.
-_ROS_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs", "--disable-stdout-logs"]
-
 
 class SerialisedNode:
     """Serialised services and clients in one ROS domain (`fogft.ros.port.RosNode`).
@@ -47,12 +47,15 @@ class SerialisedNode:
     Args:
         name: The node's name: letters, digits and underscores.
         domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
+        early: This process's participant in that domain, if it has joined already.
 
     Raises:
         RosError: ROS 2 is not usable here, or refuses the name.
     """
 
-    def __init__(self, name: str, domain_id: int | None = None) -> None:
+    def __init__(
+        self, name: str, domain_id: int | None = None, *, early: EarlyJoin | None = None
+    ) -> None:
         self._entities: tuple[Entity, ...] = ()
         self._changes: list[tuple[Entity, bool, threading.Event]] = []
         self._create_lock = threading.Lock()  # rcl wants one creation at a time
@@ -62,10 +65,10 @@ class SerialisedNode:
         self._visible: VisibleNode | None = None
         self._probes = NodeProbes(self)
         try:
-            self._start_ros(name, domain_id)
+            self._start_ros(name, domain_id, early)
         except ImportError as error:
             raise RosError(
-                f"ROS 2 is not usable here: {error}",
+                f"ROS 2 cannot be used here: {error}",
                 "source a ROS 2 installation, or install `fogft[ros]`",
             ) from error
         except Exception as error:
@@ -73,41 +76,28 @@ class SerialisedNode:
         self._thread = threading.Thread(target=self._run, name=f"ros-{name}", daemon=True)
         self._thread.start()
 
-    def _start_ros(self, name: str, domain_id: int | None) -> None:
-        import rclpy
-        from rclpy.context import Context
+    def _start_ros(self, name: str, domain_id: int | None, early: EarlyJoin | None) -> None:
         from rclpy.guard_condition import GuardCondition
         from rclpy.impl.implementation_singleton import rclpy_implementation
-        from rclpy.parameter import Parameter
         from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-        from rclpy.signals import SignalHandlerOptions
+        from rclpy.utilities import get_rmw_implementation_identifier
 
+        self._middleware: str = get_rmw_implementation_identifier()
         self._new_wait_set: Any = rclpy_implementation.WaitSet
         self._quality = QoSProfile(
             history=HistoryPolicy.KEEP_ALL,
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.VOLATILE,
         )
-        self._context: Any = Context()
-        rclpy.init(
-            args=_ROS_ARGUMENTS,
-            context=self._context,
-            domain_id=domain_id,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
+        self._context: Any = early.context if early is not None else new_context(domain_id)
         try:
-            self._node = rclpy.create_node(
-                name,
-                context=self._context,
-                use_global_arguments=False,
-                enable_rosout=False,
-                start_parameter_services=False,
-                parameter_overrides=[Parameter("start_type_description_service", value=False)],
-            )
+            self._node = bare_node(name, self._context)
             self._guard = GuardCondition(None, None, context=self._context)
         except BaseException:
             self._context.try_shutdown()
             raise
+        if early is not None:
+            early.done()
 
     @property
     def alive(self) -> bool:
@@ -131,9 +121,12 @@ class SerialisedNode:
             )
             try:
                 end = ends.service(service, service_type)
-                probes = ServiceProbes(service.service_name, self._probes)
+                full = service.service_name
                 return Server(
-                    service, end, on_request, self._withdraw, on_burst=on_burst, probes=probes
+                    *(service, end, on_request, self._withdraw),
+                    on_burst=on_burst,
+                    probes=ServiceProbes(full, self._probes),
+                    mismatch=partial(self._clients_mismatch, full),
                 )
             except BaseException:
                 self._node.destroy_service(service)
@@ -151,7 +144,8 @@ class SerialisedNode:
         def create() -> Client:
             client: Any = self._node.create_client(service_type, name, qos_profile=self._quality)
             try:
-                return Client(client, ends.client(client, service_type), self._withdraw, count)
+                end, mismatch = ends.client(client, service_type), self._servers_mismatch
+                return Client(client, end, self._withdraw, count, partial(mismatch, name))
             except BaseException:
                 self._node.destroy_client(client)
                 raise
@@ -238,6 +232,36 @@ class SerialisedNode:
             if bytes(reader.endpoint_gid)[: len(client)] == client:
                 return reader.node_name, reader.node_namespace
         return None
+
+    def participant(self, service: str) -> bytes:
+        """Return the first bytes of our participant's id; empty before it offers `service`."""
+        find: Any = self._node.get_subscriptions_info_by_topic
+        with contextlib.suppress(Exception):  # rclpy's InvalidHandle: closed meanwhile
+            for reader in find(f"rq{service}Request", no_mangle=True):
+                if reader.node_name == self._node.get_name():
+                    return bytes(reader.endpoint_gid)[: farewell.PREFIX_BYTES]
+        return b""
+
+    def callers(self, service: str) -> int:
+        """Count the clients of a service that discovery has found: those find us, too."""
+        return len(self._identifiers(self._node.get_publishers_info_by_topic, service))
+
+    def _clients_mismatch(self, service: str) -> str:
+        writers = self._identifiers(self._node.get_publishers_info_by_topic, service)
+        others = vendors.strangers(self._middleware, writers)
+        return vendors.of_client(service, self._middleware, others[0]) if others else ""
+
+    def _servers_mismatch(self, service: str) -> str:
+        readers = self._identifiers(self._node.get_subscriptions_info_by_topic, service)
+        others = vendors.strangers(self._middleware, readers)
+        none_is_ours = others and len(others) == len(readers)
+        return vendors.of_server(service, self._middleware, others[0]) if none_is_ours else ""
+
+    def _identifiers(self, find: Any, service: str) -> list[bytes]:
+        """Return the identifiers of those who write, or read, the requests to a service."""
+        with contextlib.suppress(Exception):  # rclpy's InvalidHandle: closed meanwhile
+            return [bytes(one.endpoint_gid) for one in find(f"rq{service}Request", no_mangle=True)]
+        return []
 
     def services_of(self, name: str, namespace: str) -> list[str]:
         """Return the names of a node's services, as discovery knows them; empty if it is gone."""

@@ -34,6 +34,9 @@ class RosServer(Protocol):
         Any thread. A client that is gone is no error. At most once for each handle.
         """
 
+    def mismatch(self) -> str:
+        """Say why a client that is there is not heard; empty if all are. Cheap."""
+
     def close(self) -> None:
         """Withdraw the service."""
 
@@ -43,6 +46,9 @@ class RosClient(Protocol):
 
     def available(self) -> bool:
         """Whether discovery has found a server. Cheap; never blocks."""
+
+    def mismatch(self) -> str:
+        """Say why no server that is there can be called; empty if one can. Cheap."""
 
     def servers(self) -> int:
         """Count the servers that discovery lists: one that died stays listed for a while."""

@@ -31,6 +31,7 @@ SETTLED_S = 2.0
 FOLDER = Path("/dev/shm")
 
 _TURN_LIMIT_S = 5.0
+_SEGMENT = re.compile(r"fast(?:dds|rtps)_[0-9a-f]{16}")
 _OURS = re.compile(
     r"(?:sem\.)?(?P<group>fast(?:dds|rtps)_(?:port\d+|[0-9a-f]+)|fast_datasharing_[^/]+?"
     r"|lttng-ust-wait-[\w-]+?)(?:_el|_sl|_mutex)?"
@@ -108,16 +109,33 @@ def grouped_names() -> dict[str, list[str]]:
     return {group: names for group, names in groups.items() if group not in fresh}
 
 
+def make_private() -> None:
+    """Let no other user read the segments of this process: what it sends lies there.
+
+    Fast DDS makes them readable by all, whatever the umask. Other users' processes lose nothing:
+    they would have to write to a segment to use it, and go through UDP as before.
+    """
+    for name in _mapped("self"):
+        if _SEGMENT.fullmatch(name):
+            with contextlib.suppress(OSError):  # another user's, or gone
+                (FOLDER / name).chmod(0o600)
+
+
+def _mapped(process: str) -> set[str]:
+    prefix, names = f"{FOLDER}/".encode(), set[str]()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc", process, "maps").read_bytes().splitlines():
+            _, found, name = line.partition(prefix)
+            if found:
+                names.add(name.removesuffix(b" (deleted)").decode(errors="replace"))
+    return names
+
+
 def names_in_use() -> set[str]:
     """Return the names in /dev/shm that a process of ours maps or holds open."""
-    prefix = f"{FOLDER}/".encode()
     used: set[str] = set()
     for process in filter(str.isdigit, os.listdir("/proc")):
-        with contextlib.suppress(OSError):
-            for line in Path("/proc", process, "maps").read_bytes().splitlines():
-                _, found, name = line.partition(prefix)
-                if found:
-                    used.add(name.removesuffix(b" (deleted)").decode(errors="replace"))
+        used |= _mapped(process)
         with contextlib.suppress(OSError):
             descriptors = f"/proc/{process}/fd"
             for descriptor in os.listdir(descriptors):

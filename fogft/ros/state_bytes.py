@@ -16,6 +16,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.model.state import StateService, StateSpec
+from fogft.ros.messages import from_bytes, to_bytes
 from fogft.ros.types import load_service_type, trouble
 
 _SEQUENCE = re.compile(r"sequence<(octet|uint8|int8|char)(?:, \d+)?>")
@@ -30,9 +31,6 @@ class StateBytes:
     """
 
     def __init__(self, spec: StateSpec) -> None:
-        from rclpy.serialization import deserialize_message, serialize_message
-
-        self._read, self._write = deserialize_message, serialize_message
         self._snapshot = load_service_type(spec.snapshot.type)
         self._restore = load_service_type(spec.restore.type)
         self._out = _Field(self._snapshot.Response, spec.snapshot, "response")
@@ -45,11 +43,11 @@ class StateBytes:
 
     def snapshot_request(self) -> bytes:
         """Return the serialised request of the snapshot service."""
-        return bytes(self._write(self._snapshot.Request()))
+        return to_bytes(self._snapshot.Request())
 
     def read_snapshot(self, response: bytes) -> bytes:
         """Return the state in a response of the snapshot service. Raises RosError."""
-        message = self._response(response, self._snapshot.Response)
+        message = from_bytes(response, self._snapshot.Response)
         _check_success(message)
         return self._out.get(message)
 
@@ -58,19 +56,13 @@ class StateBytes:
         message = self._restore.Request()
         try:
             self._in.set(message, state)
-            return bytes(self._write(message))
+            return to_bytes(message)
         except Exception as error:  # what a message's setter raises is its own affair
             raise RosError(f"a state of {len(state)} bytes does not fit: {error}") from error
 
     def check_restored(self, response: bytes) -> None:
         """Raise RosError where a response of the restore service says that it failed."""
-        _check_success(self._response(response, self._restore.Response))
-
-    def _response(self, payload: bytes, kind: Any) -> Any:
-        try:
-            return self._read(payload, kind)
-        except Exception as error:  # rclpy's own error types are private and vary by release
-            raise RosError(f"{len(payload)} bytes are not a {kind.__name__}") from error
+        _check_success(from_bytes(response, self._restore.Response))
 
 
 def _check_success(message: Any) -> None:

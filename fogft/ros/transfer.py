@@ -13,28 +13,10 @@ import logging
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
-from fogft.errors import RosError, Unreadable
+from fogft.errors import RosError
+from fogft.ros.messages import from_bytes, to_bytes
 
 log = logging.getLogger(__name__)
-
-
-def to_bytes(message: Any) -> bytes:
-    """Serialise a message."""
-    from rclpy.serialization import serialize_message
-
-    return bytes(serialize_message(message))
-
-
-def from_bytes(payload: bytes, message_type: Any) -> Any:
-    """Read a serialised message back. Raises Unreadable."""
-    from rclpy.serialization import deserialize_message
-
-    try:
-        return deserialize_message(payload, message_type)
-    except Exception as error:  # rclpy's own error types are private and vary by release
-        raise Unreadable(
-            f"{len(payload)} bytes are not a serialised {message_type.__name__}: {error}"
-        ) from error
 
 
 class ServiceEnd(Protocol):

@@ -3,8 +3,8 @@
 Needs the interface package, not rclpy, to load a type; so the pool file's reader can
 check one without starting ROS.
 
-Owns: names of types, their errors and hints, default responses, boolean fields.
-Not here: moving messages (`transfer`), comparing two definitions (`fogft.model.type_definition`).
+Owns: names of types, their errors and hints, shapes, definitions.
+Not here: messages (`messages`), comparing two definitions (`fogft.model.type_definition`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.errors import RosError, told
-from fogft.model.cdr import NUMBER_BYTES, Shape
+from fogft.model.cdr import Shape
 from fogft.model.plain import as_line
 from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
 
@@ -31,7 +31,6 @@ _NAME = re.compile(
 _MESSAGE = re.compile(
     r"[a-z][a-z0-9_]*/(msg/[A-Z][A-Za-z0-9]*|action/[A-Z][A-Za-z0-9]*_FeedbackMessage)"
 )
-_XCDR1_HEADERS = (b"\x00\x00", b"\x00\x01")  # big and little endian
 
 
 def load_service_type(name: str) -> Any:
@@ -82,7 +81,10 @@ def trouble(make: Callable[[], object]) -> str | None:
     except RosError as error:
         return told(error)
     except ImportError as error:
-        return f"ROS 2 is not usable here: {error}; source a ROS 2 installation"
+        return (
+            f"ROS 2 cannot be used here: {error}; install `fogft[ros]` "
+            "or source a ROS 2 installation"
+        )
     return None
 
 
@@ -108,12 +110,13 @@ def _find(name: str, what: str) -> Any:
             raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
         raise RosError(
             f"there is no package `{package}` with {what} here, so `{name}` cannot be loaded",
-            f"is the package installed, and its workspace sourced?{_did_you_mean(name)}",
+            "install the package, or source its workspace; ROS 2's own are in "
+            f"`fogft[ros]`{_did_you_mean(name)}",
         ) from error
     except AttributeError as error:
         raise RosError(
             f"package `{package}` has no {_KINDS[kind]} type `{type_name}`",
-            f"does the sourced workspace hold its newest build?{_did_you_mean(name)}",
+            f"is the sourced workspace's build up to date?{_did_you_mean(name)}",
         ) from error
     except Exception as error:  # generated code: anything may go wrong in it
         raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
@@ -134,11 +137,6 @@ def _load_type_support(name: str, *parts: Any) -> None:
             ) from error
         if type(part)._TYPE_SUPPORT is None:
             raise RosError(f"the C library of `{name}` cannot be loaded", _SOURCE_HINT)
-
-
-def check_ok_field(name: str, field: str) -> str | None:
-    """Return why a type's response has no such boolean field, with what to do; None if it has."""
-    return trouble(partial(bool_field, name, field))
 
 
 def installed_service_types() -> list[str]:
@@ -164,65 +162,6 @@ def _did_you_mean(name: str) -> str:
     by_type = [full for full in known if full.rsplit("/", 1)[1] == name.rsplit("/", 1)[-1]]
     close = by_type[:1] or difflib.get_close_matches(name, known, n=1, cutoff=0.75)
     return f" Did you mean `{close[0]}`?" if close else ""
-
-
-def default_response(name: str) -> bytes:
-    """Return the serialised default response of a service type. Raises RosError."""
-    from rclpy.serialization import serialize_message
-
-    return bytes(serialize_message(load_service_type(name).Response()))
-
-
-def bool_field(name: str, field: str) -> Callable[[bytes], bool]:
-    """Return a function that reads a boolean field of a serialised response.
-
-    The function raises RosError for bytes that are no such response. Where only numbers
-    stand before the field, it looks at one byte; else it deserialises the response.
-
-    Raises:
-        RosError: The type cannot be loaded, or its response has no such boolean field.
-    """
-    from rclpy.serialization import deserialize_message
-
-    response_type = load_service_type(name).Response
-    fields: dict[str, str] = response_type.get_fields_and_field_types()
-    if fields.get(field) != "boolean":
-        booleans = [key for key, kind in fields.items() if kind == "boolean"]
-        raise RosError(
-            f"the response of `{name}` has no boolean field `{field}`",
-            f"its boolean fields: {', '.join(booleans) or 'none'}",
-        )
-
-    def read_all(payload: bytes) -> bool:
-        try:
-            return bool(getattr(deserialize_message(payload, response_type), field))
-        except Exception as error:  # rclpy's own error types are private and vary by release
-            raise RosError(f"{len(payload)} bytes are not a response of `{name}`") from error
-
-    offset = fixed_offset(fields, field)
-    if offset is None:
-        return read_all
-
-    def read_byte(payload: bytes) -> bool:
-        if payload[:2] in _XCDR1_HEADERS and offset < len(payload):
-            return payload[offset] != 0
-        return read_all(payload)
-
-    return read_byte
-
-
-def fixed_offset(fields: dict[str, str], field: str) -> int | None:
-    """Return where a field lies in every serialised message; None if that varies."""
-    offset = 0
-    for name, kind in fields.items():
-        size = NUMBER_BYTES.get(kind)
-        if size is None:
-            return None
-        offset += -offset % size
-        if name == field:
-            return 4 + offset  # after the header, from which alignment is counted
-        offset += size
-    return None
 
 
 def definition(type_name: str) -> Definition:

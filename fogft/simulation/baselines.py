@@ -91,8 +91,8 @@ class Static:
 class Search:
     """Spot machines wherever a rule finds room, and `extra` ones besides.
 
-    `on_demand` runs for each replica that no ready spot machine serves. After a refusal in every
-    location it waits a minute.
+    `on_demand` runs for each spot machine that is not ready, but for no more than the replicas.
+    After a refusal in every location it waits a minute.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Search:
                 offer = rule.place(taken)
                 taken.append(offer)
                 fleet.order(slot, offer, partial(self._refused, offer))
-        self._fall_back(self._replicas - sum(map(fleet.ready, kept)))
+        self._fall_back(min(self._replicas, self._spots - sum(map(fleet.ready, kept))))
         return self._spot_from if self._spot_from > now else NEVER
 
     def _fall_back(self, wanted: int) -> None:

@@ -21,6 +21,7 @@ from fogft.planning.placement import choose
 from fogft.planning.sizing import size
 from fogft.pool.manager.offers import ask
 from fogft.simulation.baselines import ActiveZones, InTurn, Naive, Search, Static
+from fogft.simulation.bound import least_usd_per_hour
 from fogft.simulation.generator import generate
 from fogft.simulation.managed import Managed
 from fogft.simulation.market import FindOffers, Market
@@ -30,6 +31,7 @@ from fogft.simulation.timeline import Timeline
 from fogft.simulation.world import EPOCH, Policy, Target, World
 
 SETTLE_S = 3600.0
+BOUND = "omniscient"
 FIGURES = (
     "available",
     "under_target",
@@ -54,6 +56,8 @@ class Scenario:
     recorded: Mapping[str, Timeline] = field(default_factory=dict)
     days: float = 7.0  # how long each run is measured, after the first hour
     seeds: Sequence[int] = tuple(range(20))  # one run each
+    # Location -> its own MTTF and MTTR, where they are not the model's.
+    zones: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def length_s(self) -> float:
@@ -65,7 +69,11 @@ class Scenario:
         chance = random.Random(f"market {seed}")
         if not self.recorded:
             lines = generate(
-                self.model, spot_locations(self.spec, self.find), self.length_s, chance
+                self.model,
+                spot_locations(self.spec, self.find),
+                self.length_s,
+                chance,
+                self.zones,
             )
             return Market(self.find, lines, self.timing)
         known_s = min(line.length_s for line in self.recorded.values())
@@ -221,7 +229,37 @@ def compare(scenario: Scenario, told: Callable[[int], None] = lambda done: None)
             outcomes[name].append(meter.outcome())
             curve = tuple((at - meter.begin_s, ready) for at, ready in meter.curve)
             curves.setdefault(name, curve)
-    return [Row(name, tuple(outcomes[name]), curves[name]) for name in made]
+    rows = [Row(name, tuple(outcomes[name]), curves[name]) for name in made]
+    known = [bound(scenario, scenario.market(seed)) for seed in scenario.seeds]
+    reached = tuple(outcome for outcome in known if outcome is not None)
+    if len(reached) == len(known) and scenario.spec.schedule is None:
+        rows.append(Row(BOUND, reached))
+    return rows
+
+
+def bound(scenario: Scenario, market: Market) -> Outcome | None:
+    """Return what one who knows the future needs to have all ready always; None if he cannot."""
+    spec = scenario.spec
+    kind = max(groups_of(spec), key=lambda group: group.replicas).resources
+    spots: dict[str, float] = {}
+    for offer in market.offers(with_spot(kind, True)):
+        place, usd = offer.placement.location, offer.usd_per_hour
+        if offer.placement.spot:
+            spots[place] = min(usd, spots.get(place, usd))
+    reserved = [o for o in market.offers(with_spot(kind, False)) if not o.placement.spot]
+    replicas = replicas_of(spec, ask(World(market, seed=0, length_s=0.0), spec))
+    seconds = scenario.length_s - SETTLE_S
+    usd_per_hour = least_usd_per_hour(
+        {place: line.window(SETTLE_S, seconds) for place, line in market.timelines.items()},
+        spots,
+        min((o.usd_per_hour for o in reserved), default=None),
+        replicas,
+        boot_s=scenario.timing.boot_s,
+        length_s=seconds,
+    )
+    if usd_per_hour is None:
+        return None
+    return Outcome(seconds, 1.0, 0.0, float(replicas), usd_per_hour, 0, 0, 0, 0, 0.0)
 
 
 @contextmanager

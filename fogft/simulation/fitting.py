@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from fogft.errors import FogftError
 from fogft.simulation.model import MAX_CORRELATION, MarketModel
@@ -24,29 +24,48 @@ def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
     A correlation that no pair of locations can tell is that of the next narrower domain,
     and 0 between clouds. Negative ones become 0, and no wider one exceeds a narrower one.
     """
-    spells = [spell for line in timelines.values() for spell in line.spells()]
-    means = []
-    for room, what in ((True, "full"), (False, "free")):
-        ended = sum(over for has_room, _, over in spells if has_room is room)
-        if not ended:
+    means = _means(timelines.values())
+    for mean, what in zip(means, ("full", "free"), strict=True):
+        if mean is None:
             raise FogftError(
                 f"the traces cannot be fitted: no location ever becomes {what}",
                 "leave out `--fit` to replay them as they are",
             )
-        means.append(sum(s for has_room, s, _ in spells if has_room is room) / ended)
+    mttf_s, mttr_s = (mean or 0.0 for mean in means)
     region, cloud, world = _correlations(timelines)
     region = cloud if region is None else region
     cloud = region if cloud is None else cloud
     region = min(MAX_CORRELATION, max(0.0, region or 0.0))
     cloud = min(region, max(0.0, cloud or 0.0))
     return MarketModel(
-        mttf_s=means[0],
-        mttr_s=means[1],
+        mttf_s=mttf_s,
+        mttr_s=mttr_s,
         correlation_region=region,
         correlation_cloud=cloud,
         correlation_world=min(cloud, max(0.0, world or 0.0)),
         together=_together(timelines),
     )
+
+
+def of_zones(timelines: Mapping[str, Timeline]) -> dict[str, tuple[float, float]]:
+    """Return the MTTF and MTTR of each location that became full and free; others cannot tell."""
+    found: dict[str, tuple[float, float]] = {}
+    for place, line in timelines.items():
+        mttf_s, mttr_s = _means([line])
+        if mttf_s is not None and mttr_s is not None:
+            found[place] = mttf_s, mttr_s
+    return found
+
+
+def _means(timelines: Iterable[Timeline]) -> tuple[float | None, ...]:
+    """Return the mean times with and without room; None for one that never ended."""
+    spells = [spell for line in timelines for spell in line.spells()]
+    means = []
+    for room in (True, False):
+        ended = sum(over for has_room, _, over in spells if has_room is room)
+        whole_s = sum(s for has_room, s, _ in spells if has_room is room)
+        means.append(whole_s / ended if ended else None)
+    return tuple(means)
 
 
 def _together(timelines: Mapping[str, Timeline]) -> float:

@@ -16,7 +16,7 @@ from fogft.model.intent import Intent
 from fogft.model.replica import LinkReport, LinkState, MachinePhase, Membership, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning.endings import DRAIN_SETTLE_S
-from fogft.planning.fallback import SETTLED_S, STAYS_S
+from fogft.planning.fallback import OFTEN_S, SETTLED_S, STAYS_S, losses_of_late
 from fogft.planning.observed import backoff, launches
 from fogft.planning.observed.hazard import EVERY_S, as_of
 from fogft.planning.observed.health import LONE_SILENCE_FACTOR
@@ -148,6 +148,7 @@ class Managed:
             if (record.slot, record.generation) in restless:
                 times.append(record.first_ready_at + stay_s)
             if stands_in:
+                times += [at + OFTEN_S for at in losses_of_late(history, now)]
                 times += [record.first_ready_at + after_s for after_s in (SETTLED_S, STAYS_S)]
         provisioning = MachinePhase.PROVISIONING
         for machine in tick.observed.machines or ():

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 from fogft.errors import FogftError
+from fogft.model.choices import Assumption
 from fogft.planning.reliability import unavailability
 
 MAX_CORRELATION = 0.95
@@ -24,9 +25,13 @@ class Timing:
     # 5/4 of it, all equally likely.
     boot_s: float = 240.0
     notice_s: float = 120.0  # between a preemption notice and the end. 0: no notice
-    answer_s: float = 5.0  # until the cloud accepts or refuses an order
+    # Until the cloud accepts or refuses an order; as measured through SkyPilot on an emulated AWS.
+    answer_s: float = 28.0
     detect_s: float = 5.0  # until the loss of a machine without a notice is seen
-    on_demand_mttf_s: float = 0.0  # mean time to the failure of an on-demand machine; 0: never
+    # As `availability` assumes.
+    on_demand_mttf_s: float = (
+        Assumption.on_demand_uptime_s
+    )  # mean time to the failure of an on-demand machine; 0: never
 
 
 @dataclass(frozen=True)

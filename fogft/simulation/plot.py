@@ -28,6 +28,11 @@ def check(path: Path) -> None:
         raise FogftError(f"{path}: cannot draw a `{path.suffix}` file", f"endings: {known}")
     if not path.absolute().parent.is_dir():
         raise FogftError(f"{path}: there is no folder `{path.parent}`", "make it first")
+    needs_matplotlib()
+
+
+def needs_matplotlib() -> None:
+    """Check that plots can be drawn at all. Raises FogftError: matplotlib is not installed."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError:

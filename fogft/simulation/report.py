@@ -12,7 +12,7 @@ from typing import Any
 from fogft.errors import FogftError
 from fogft.planning.reliability import system_unavailability
 from fogft.pool.manager.offers import ask
-from fogft.simulation.comparison import Row, Scenario, compare, replicas_of
+from fogft.simulation.comparison import BOUND, Row, Scenario, compare, replicas_of
 from fogft.simulation.fitting import fit
 from fogft.simulation.meter import DAY_S
 from fogft.simulation.model import moving, staying
@@ -33,6 +33,22 @@ class Report:
     expected: Mapping[str, float] | None
     notes: tuple[str, ...] = ()  # what a reader should know, in sentences
 
+    @property
+    def target(self) -> float:
+        """The availability that the pool file asks for; else what fogft reached."""
+        asked = self.scenario.spec.availability
+        return asked.target if asked else self.rows[0].estimate("available").mean
+
+    @property
+    def cheapest(self) -> Row | None:
+        """The policy that reaches the target for least; None where none does."""
+        enough = [
+            row
+            for row in self.rows
+            if row.name != BOUND and row.estimate("available").mean >= self.target
+        ]
+        return min(enough, key=lambda row: row.estimate("usd_per_hour").mean, default=None)
+
     def to_json(self) -> dict[str, Any]:
         """Return everything, seed by seed."""
         scenario = self.scenario
@@ -42,10 +58,13 @@ class Report:
             "market": "recorded" if scenario.recorded else "modelled",
             "locations": len(scenario.recorded) or None,
             "model": None if scenario.recorded else asdict(scenario.model),
+            "zones": {place: list(own) for place, own in scenario.zones.items()},
             "timing": asdict(scenario.timing),
             "days": scenario.days,
             "seeds": list(scenario.seeds),
             "policies": [row.to_json() for row in self.rows],
+            "target": self.target,
+            "cheapest": self.cheapest.name if self.cheapest else None,
             "independent": dict(self.expected) if self.expected else None,
             "notes": list(self.notes),
         }

@@ -53,10 +53,11 @@ def simulate(
     market, timing = MarketModel(), Timing()
     lines: Mapping[str, Any] = {}
     notes: list[str] = []
+    zones: Mapping[str, tuple[float, float]] = {}
     if traces is None:
         if fit:
             raise FogftError("`--fit` needs traces to fit to", "name their folder with `--traces`")
-        notes.append("the market is made up; `--traces DIR` replays a recorded one")
+        notes.append("the market is simulated; `--traces DIR` replays a recorded one")
     else:
         usable = set(spot_locations(spec, find))
         everywhere = {p.location: p for p in _everything(spec, find)}
@@ -77,6 +78,12 @@ def simulate(
         told_by_traces = sorted(set(values) & set(MARKET_KEYS))
         if fit:
             market = fitting.fit(lines)
+            if not {"mttf_s", "mttr_s"}.intersection(values):
+                zones = fitting.of_zones(lines)
+                notes += [
+                    f"`{place}` never became both full and free: it is as all together are"
+                    for place in sorted(set(lines) - set(zones))
+                ]
             lines = {}
         elif told_by_traces:
             raise FogftError(
@@ -84,7 +91,9 @@ def simulate(
                 "add `--fit` to change what was fitted to them",
             )
     market, timing = applied(market, timing, values)
-    scenario = Scenario(spec, find, timing, market, recorded=lines, days=days, seeds=tuple(seeds))
+    scenario = Scenario(
+        spec, find, timing, market, recorded=lines, days=days, seeds=tuple(seeds), zones=zones
+    )
     return report.simulate(scenario, notes=notes, told=told)
 
 

@@ -13,7 +13,6 @@ Not here: what is made of them (`comparison`).
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +33,7 @@ class Trace:
 
     file: str
     place: str  # ``cloud/region/zone``, or the zone alone
+    gap_s: float
     timeline: Timeline
 
 
@@ -62,7 +62,8 @@ def _read_file(path: Path, folder: Path) -> Trace:
     inner = path.relative_to(folder).with_suffix("").parts
     zone = inner[-1].split("_")[0]
     place = "/".join((*inner[:-1], zone)) if len(inner) == 3 else zone
-    return Trace(str(path), place, parse(value, str(path)))
+    timeline = parse(value, str(path))
+    return Trace(str(path), place, float(value["metadata"]["gap_seconds"]), timeline)
 
 
 def parse(value: Any, file: str) -> Timeline:
@@ -118,18 +119,22 @@ def _check_times(times: Any, samples: int, gap_s: float, file: str) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e15
 
 
 def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, Timeline]:
     """Return the timelines by location, of those traces whose location is on offer.
 
     `offered` is what can be bought anywhere, not only what this pool may buy. Raises FogftError: a
-    trace is of a place that does not exist, or two are of the same.
+    trace is of a place that does not exist, two are of the same, or of different `gap_seconds`.
     """
+    traces = list(traces)
     found: dict[str, tuple[str, Timeline]] = {}
     for trace in traces:
         places = sorted({p.location for p in offered if trace.place in _names(p)})
+        if not places:  # in folders that name no cloud and region, as they are published
+            zone = trace.place.rpartition("/")[2]
+            places = sorted({p.location for p in offered if zone in _names(p)})
         if not places:
             known = {p.location for p in offered}
             raise FogftError(
@@ -148,6 +153,13 @@ def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, 
                 "keep the one of the instance that the pool uses",
             )
         found[places[0]] = trace.file, trace.timeline
+    for other in traces[1:]:
+        if other.gap_s != traces[0].gap_s:
+            raise FogftError(
+                f"{other.file}: gap_seconds is {other.gap_s:g}, but {traces[0].gap_s:g} in "
+                f"{traces[0].file}",
+                "simulate traces of one recording: others do not speak of the same moments",
+            )
     return {place: timeline for place, (_, timeline) in found.items()}
 
 

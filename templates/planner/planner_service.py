@@ -106,7 +106,7 @@ def _pose(request: GetPlan.Request, here: Point, there: Point) -> PoseStamped:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", type=int, default=7, help="seed of the scene")
-    parser.add_argument("--limit-s", type=float, default=5.0, help="give up planning after this")
+    parser.add_argument("--limit-s", type=float, default=25.0, help="give up planning after this")
     options = parser.parse_args(remove_ros_args(sys.argv)[1:])
     ou.setLogLevel(ou.LogLevel.LOG_ERROR)
     rclpy.init()

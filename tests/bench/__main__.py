@@ -27,6 +27,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
         commands,
         faults,
         graph,
+        hostile,
         load,
         ordering,
         planning,
@@ -46,9 +47,12 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["throughput"] = speed.throughput
     found["stalls"] = faults.stalls
     found["killed"] = faults.killed
+    found["hostile"] = hostile.hostile
+    found["restarted"] = faults.restarted
     found["memory"] = speed.memory
     found["hedging"] = tail.hedging
     found["load"] = load.load
+    found["idle"] = load.idle
     found["cancellation"] = tail.cancellation
     found["simulation"] = simulation.simulation
     found["ordering"] = ordering.ordering

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from fogft.model.choices import Speaks
@@ -19,8 +20,12 @@ CALL_LIMIT_S = 10.0
 _DISCOVERY_LIMIT_S = 30.0
 
 
-def payloads() -> dict[str, bytes]:
-    """Return the serialised requests by service: a few bytes, and 0.9 MB."""
+def payloads(*, poison: bool = False) -> dict[str, bytes]:
+    """Return the serialised requests by service: a few bytes, and 0.9 MB.
+
+    Args:
+        poison: The first ends the process that serves it, if that sleeps over requests.
+    """
     import array
 
     from nav_msgs.srv import SetMap
@@ -30,9 +35,14 @@ def payloads() -> dict[str, bytes]:
     large = SetMap.Request()
     large.map.data = array.array("b", bytes(LARGE_BYTES))
     return {
-        FLAG[0]: bytes(serialize_message(SetBool.Request(data=True))),
+        FLAG[0]: bytes(serialize_message(SetBool.Request(data=not poison))),
         MAP[0]: bytes(serialize_message(large)),
     }
+
+
+def is_right_flag(response: bytes) -> bool:
+    """Whether a response is what `FLAG`'s service gives: true, and an empty text."""
+    return response[4] == 1 and response[8:13] == b"\1\0\0\0\0"
 
 
 @dataclass
@@ -56,6 +66,7 @@ class Caller:
         environ: Mapping[str, str] = os.environ,
     ) -> None:
         self._node = middleware.join(speaks, name, domain_id, environ=environ).node
+        self.wrong = 0
         self._clients: dict[str, Any] = {n: self._node.client(n, t) for n, t in (FLAG, MAP)}
 
     def wait(self) -> None:
@@ -117,16 +128,22 @@ class Caller:
     ) -> list[float]:
         """Call at random moments, so many a second on average; return how long each took.
 
-        Calls without an answer are left out; the last ones have `CALL_LIMIT_S` to come.
+        Calls without an answer are left out; the last ones have `CALL_LIMIT_S` to come. `wrong`
+        counts the answers of `FLAG` that its service does not give.
         """
-        client, took = self._clients[service], []
+        client, took = self._clients[service], list[float]()
+
+        def answered(sent: float, response: bytes) -> None:
+            took.append(time.perf_counter() - sent)
+            self.wrong += service == FLAG[0] and not is_right_flag(response)
+
         began = time.perf_counter()
         at = began
         for _ in range(count):
             at += source.expovariate(per_s)
             time.sleep(max(0.0, at - time.perf_counter()))
             sent = time.perf_counter()
-            client.call(payload, lambda _, sent=sent: took.append(time.perf_counter() - sent))
+            client.call(payload, partial(answered, sent))
         end = time.perf_counter() + CALL_LIMIT_S
         while len(took) < count and time.perf_counter() < end:
             time.sleep(0.02)

@@ -13,7 +13,7 @@ from typing import Any
 from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.rig import Replica, Rig
 from tests.bench.service import FLAG, MAP
-from tests.estimates import estimate_of_rounds, longest_gap, percentile
+from tests.estimates import estimate, estimate_of_rounds, longest_gap, median, percentile
 
 SLEEP_S = 0.02
 _PAUSE_S = 0.01
@@ -115,6 +115,53 @@ def killed(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
                 )
             caller.close()
     return rows
+
+
+def restarted(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Kill the client proxy; how long until the next answer, with another one in line, or none.
+
+    A request every 10 ms; the pauses before a kill are chance, for DDS has periods of seconds.
+    """
+    rows, chance = [], random.Random(0)
+    with Rig(folder, 1) as rig:
+        caller = Caller(rig.robot_domain, "bench_restarted")
+        caller.wait()
+        payload = payloads()[FLAG[0]]
+        for in_line in (True, False):
+            gaps, lost = [], []
+            for _ in range(2 if quick else 12):
+                if in_line:
+                    rig.put_in_line()
+                _ask_until(caller, payload, time.monotonic() + chance.uniform(1.0, 4.0))
+                killed_at = rig.kill_proxy()
+                answered, asked = _ask_until(caller, payload, None)
+                gaps.append(answered[0] - killed_at)
+                lost.append(asked - len(answered))
+                rig.wait_ready([0])
+            took = estimate(gaps, median)
+            rows.append(
+                {
+                    "in_line": str(in_line),
+                    "kills": len(gaps),
+                    "gap_s": {"value": took.value, "low": took.low, "high": took.high},
+                    "longest_gap_s": max(gaps),
+                    "requests_lost_median": median(lost),
+                }
+            )
+        caller.close()
+    return rows
+
+
+def _ask_until(caller: Caller, payload: bytes, end: float | None) -> tuple[list[float], int]:
+    """Ask every 10 ms until a moment, or the first answer; return their times, and asked."""
+    answered: list[float] = []
+    asked = 0
+    while time.monotonic() < end if end is not None else not answered:
+        caller.ask(FLAG[0], payload, lambda: answered.append(time.monotonic()))
+        asked += 1
+        time.sleep(_PAUSE_S)
+    time.sleep(0.5)
+    return answered, asked
 
 
 def _calls(caller: Caller, payload: bytes, seconds: float) -> tuple[list[float], int]:

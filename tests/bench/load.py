@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http.client
+import os
 import random
 import shutil
 import signal
@@ -57,7 +58,7 @@ def load(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
             caller.wait()
             peer = None
             if shutil.which("haproxy"):
-                peer = stack.enter_context(_haproxy(below, words))
+                peer = stack.enter_context(haproxy(below, words))
             for share in loads:
                 for system in ("auto", "failover", "all", "haproxy"):
                     if system != "haproxy":
@@ -70,25 +71,45 @@ def load(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
+def idle(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Measure what the proxies of a pool of three use when nobody asks."""
+    seconds = 15.0 if quick else 60.0
+    with Rig(folder, REPLICAS) as rig:
+        time.sleep(5.0)
+        proxies = [rig.proxy.pid, *(replica.process.pid for replica in rig.replicas)]
+        before = [cpu_s(pid) for pid in proxies]
+        time.sleep(seconds)
+        robot, *replicas = (
+            (cpu_s(pid) - used) * 1000 / seconds for pid, used in zip(proxies, before, strict=True)
+        )
+    row = {"robot_ms_per_s": robot, "replica_ms_per_s": sum(replicas) / REPLICAS}
+    return [{"replicas": REPLICAS, **row, "pool_ms_per_s": robot + sum(replicas)}]
+
+
 def _of_rig(rig: Rig, caller: Caller, policy: str, share: float, seconds: float) -> dict[str, Any]:
-    rig.change(hedging=policy)
+    rig.change(hedging=policy, timeout_s=TIMEOUT_S)
     before = rig.report(after=time.time())["services"][FLAG[0]]
     proxies = [rig.proxy.pid, *(replica.process.pid for replica in rig.replicas)]
     used = sum(map(cpu_s, proxies))
-    row = _offer(_asking(caller), share, seconds)
+    row = _row(*offer(asking(caller), share, seconds))
     row["cpu_ms_per_request"] = (sum(map(cpu_s, proxies)) - used) * 1000 / row["requests"]
     after = rig.report(after=time.time())["services"][FLAG[0]]
     row["copies"] = (after["sent"] - before["sent"]) / row["requests"]
     return row
 
 
-def _asking(caller: Caller) -> Ask:
+def asking(caller: Caller) -> Ask:
+    """Return what sends a request of a few bytes through ROS."""
     payload = payloads()[FLAG[0]]
     return lambda answered: caller.ask(FLAG[0], payload, answered)
 
 
-def _offer(ask: Ask, share: float, seconds: float) -> dict[str, Any]:
-    """Ask at random moments without waiting; return what became of it."""
+def offer(ask: Ask, share: float, seconds: float) -> tuple[int, list[float]]:
+    """Ask at random moments without waiting.
+
+    Returns:
+        How many requests there were, and how many seconds each took that was answered in time.
+    """
     per_s = share * REPLICAS / MEDIAN_S
     source, took = random.Random(1), list[float]()
     count, at = int(per_s * seconds), time.perf_counter()
@@ -98,7 +119,10 @@ def _offer(ask: Ask, share: float, seconds: float) -> dict[str, Any]:
         began = time.perf_counter()
         ask(lambda began=began: took.append(time.perf_counter() - began))
     time.sleep(TIMEOUT_S + 0.5)
-    answered = [s for s in took if s <= TIMEOUT_S]
+    return count, [s for s in took if s <= TIMEOUT_S]
+
+
+def _row(count: int, answered: list[float]) -> dict[str, Any]:
     ms = milliseconds(answered)
     return {
         "requests": count,
@@ -108,31 +132,47 @@ def _offer(ask: Ask, share: float, seconds: float) -> dict[str, Any]:
     }
 
 
-class _Balanced:
-    """HTTP requests through HAProxy, each in a thread, over connections that stay open."""
+class Balanced:
+    """HTTP requests through HAProxy, each in a thread, over connections that stay open.
 
-    def __init__(self, port: int, pid: int) -> None:
+    Args:
+        port: Where it listens.
+        pid: Its process.
+        folder: Where servers note their deaths.
+    """
+
+    def __init__(self, port: int, pid: int, folder: Path) -> None:
         self._port = port
-        self._pid = pid
+        self.pid = pid
+        self._folder = folder
         self._idle: list[http.client.HTTPConnection] = []
 
     def row(self, share: float, seconds: float) -> dict[str, Any]:
         """Return what became of requests at a load."""
-        used = cpu_s(self._pid)
-        row = _offer(self._ask_aside, share, seconds)
-        row["cpu_ms_per_request"] = (cpu_s(self._pid) - used) * 1000 / row["requests"]
+        used = cpu_s(self.pid)
+        row = _row(*offer(self.ask, share, seconds))
+        row["cpu_ms_per_request"] = (cpu_s(self.pid) - used) * 1000 / row["requests"]
         return {**row, "copies": 1.0}
 
-    def _ask_aside(self, answered: Callable[[], None]) -> None:
-        threading.Thread(target=self._ask, args=(answered,), daemon=True).start()
+    def ask(self, answered: Callable[[], None]) -> None:
+        """Send a request, and wait for nothing."""
+        threading.Thread(target=self._ask, args=(b"1", answered), daemon=True).start()
 
-    def _ask(self, answered: Callable[[], None]) -> None:
+    def poison(self) -> None:
+        """Send a request that ends the server which gets it."""
+        threading.Thread(target=self._ask, args=(b"0", lambda: None), daemon=True).start()
+
+    def deaths(self) -> int:
+        """Return how many servers have died."""
+        return sum(len(file.read_bytes()) for file in self._folder.glob("deaths-*"))
+
+    def _ask(self, body: bytes, answered: Callable[[], None]) -> None:
         with contextlib.suppress(OSError, http.client.HTTPException):
             try:
                 connection = self._idle.pop()
             except IndexError:
                 connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=10)
-            connection.request("POST", "/", b"1")
+            connection.request("POST", "/", body)
             response = connection.getresponse()
             response.read()
             self._idle.append(connection)
@@ -141,27 +181,37 @@ class _Balanced:
 
 
 @contextlib.contextmanager
-def _haproxy(folder: Path, words: str) -> Iterator[_Balanced]:
+def haproxy(folder: Path, words: str, balance: str = "leastconn") -> Iterator[Balanced]:
+    """Start HAProxy before HTTP servers, which are started again when they die."""
     front, *backs = free_ports(1 + REPLICAS)
     servers = "".join(f"  server s{n} 127.0.0.1:{port}\n" for n, port in enumerate(backs))
     config = folder / "haproxy.cfg"
     config.write_text(
         "defaults\n  mode http\n  timeout connect 5s\n  timeout client 60s\n  timeout server 60s\n"
         f"frontend in\n  bind 127.0.0.1:{front}\n  default_backend out\n"
-        f"backend out\n  balance leastconn\n{servers}"
+        f"backend out\n  balance {balance}\n{servers}"
     )
     module = "tests.bench.load"
     processes = [
-        subprocess.Popen([sys.executable, "-m", module, str(port), *words.split()])
+        subprocess.Popen(
+            [
+                "bash",
+                "-c",
+                f"while :; do {sys.executable} -m {module} {port} {words}; "
+                f"printf . >>{folder}/deaths-{port}; done",
+            ],
+            start_new_session=True,
+        )
         for port in backs
     ]
-    processes.append(subprocess.Popen(["haproxy", "-f", str(config), "-db", "-q"]))
+    command = ["haproxy", "-f", str(config), "-db", "-q"]
+    processes.append(subprocess.Popen(command, start_new_session=True))
     try:
         time.sleep(1.5)
-        yield _Balanced(front, processes[-1].pid)
+        yield Balanced(front, processes[-1].pid, folder)
     finally:
         for process in processes:
-            process.send_signal(signal.SIGKILL)
+            os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
 
@@ -178,7 +228,8 @@ async def serve(port: int, median_s: float, sigma: float, stalled: float, stall_
                     for line in head.split(b"\r\n")
                     if line.lower().startswith(b"content-length")
                 )
-                await reader.readexactly(length)
+                if await reader.readexactly(length) == b"0":
+                    os._exit(1)
                 async with one_at_a_time:
                     seconds = median_s * source.lognormvariate(0.0, sigma)
                     seconds += stall_s if source.random() < stalled else 0.0

@@ -32,6 +32,7 @@ from fogft.pool.credentials import authority
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
 from tests.bench.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
+from tests.hostile.orders import HOSTILE
 
 ROOT = Path(__file__).resolve().parents[2]
 _READY_LIMIT_S = 60.0
@@ -105,6 +106,7 @@ class Rig:
         rmw: How proxies, services and callers speak ROS.
         environ: More of the environment for every process.
         graph: Whether topics and an action pass as well.
+        hostile: Slots of replicas that lie, as their file says (`tests.hostile.serve`).
         bare: Whether the same services are also to be had the barest way, in `bare_domain`.
     """
 
@@ -123,9 +125,11 @@ class Rig:
         rmw: str = "rclpy",
         environ: Mapping[str, str] = MappingProxyType({}),
         graph: bool = False,
+        hostile: Mapping[int, Path] = MappingProxyType({}),
         bare: bool = False,
     ) -> None:
         self._folder = folder
+        self._hostile = hostile
         self._uid = secrets.token_hex(8)
         self._version = 0
         self._processes: list[subprocess.Popen[bytes]] = []
@@ -144,6 +148,7 @@ class Rig:
         self.replicas = [self._replica(slot, slot in relayed) for slot in range(replicas)]
         self.floor_port = self._floor()
         self.proxy = self._client_proxy()
+        self._next: subprocess.Popen[bytes] | None = None
         self.bare = self._bare() if bare else []
         self.follow(range(replicas))
 
@@ -234,7 +239,10 @@ class Rig:
             "domain_id": self.domains[slot],
         }
         (self._folder / f"{name}.yaml").write_text(json.dumps(config))  # JSON is YAML
-        process = self._start(name, "fogft", "serve", "--config", f"{name}.yaml")
+        module, environ = "fogft", dict[str, str]()
+        if slot in self._hostile:
+            module, environ = "tests.hostile.serve", {HOSTILE: str(self._hostile[slot])}
+        process = self._start(name, module, "serve", "--config", f"{name}.yaml", environ=environ)
         relay = None
         if relayed:
             relay = self._start(f"relay-{slot}", "tests.bench.relay", str(dial_port), str(port))
@@ -249,6 +257,24 @@ class Rig:
         )
         self._write_policy()
         return self._start("proxy", "fogft", "proxy", "--config", "proxy.yaml")
+
+    def put_in_line(self) -> None:
+        """Start another client proxy, which takes over when the first ends."""
+        self._next = self._start("proxy", "fogft", "proxy", "--standby", "--config", "proxy.yaml")
+        log = self._folder / "proxy.log"  # begun anew
+        self._wait(lambda: "standby_ready" in log.read_text(), "the one in line")
+
+    def kill_proxy(self) -> float:
+        """Kill the client proxy; start another one at once where none is in line. Return when."""
+        self._processes.remove(self.proxy)
+        self.proxy.kill()
+        killed_at = time.monotonic()
+        self.proxy.wait()
+        if self._next is None:
+            self.proxy = self._start("proxy", "fogft", "proxy", "--config", "proxy.yaml")
+        else:
+            self.proxy, self._next = self._next, None
+        return killed_at
 
     def change(self, **policy: Any) -> None:
         """Give the client proxy another policy for `/bench_flag` while it runs, and wait for it."""

@@ -34,6 +34,7 @@ TOPICS = (
     TopicSpec("/bench_out", STRING, Origin.REPLICAS, depth=100),
 )
 ACTION_SERVICES = action_services(ActionSpec("/bench_act", FIBONACCI, 10.0, 60.0))
+_SMALL_BYTES = 8
 CANCEL = ("/bench_cancel", "std_srvs/srv/Trigger")
 _DEFAULTS = ("0", "0", "0", "0", "16")
 
@@ -60,7 +61,11 @@ def main() -> None:
         def answer_now(_: bytes, handle: Any, ends: list[Any] = ends, it: bytes = answer) -> None:
             ends[0].respond(handle, it)
 
-        def answer_later(_: bytes, handle: Any, ends: list[Any] = ends, it: bytes = answer) -> None:
+        def answer_later(
+            request: bytes, handle: Any, ends: list[Any] = ends, it: bytes = answer
+        ) -> None:
+            if request[4] == 0 and len(request) <= _SMALL_BYTES:  # SetBool of false
+                os._exit(1)
             pool.submit(_respond_after, sleeps, ends[0], handle, it)
 
         ends.append(node.serve(name, type_name, answer_later if sleep_s else answer_now))

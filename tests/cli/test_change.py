@@ -23,10 +23,10 @@ def test_scale_counts_from_what_is_wanted_now(home, capsys):
     paths = lay_down(home)
     with disk.locked(paths.manager_lock):
         assert main.run(["scale", "up", "2"]) == 0
-        assert capsys.readouterr().err == "done: `planner` will have 5 replicas (was 3)\n"
+        assert capsys.readouterr().err == "done: `planner` is scaling from 3 to 5 replicas\n"
         assert main.run(["scale", "down", "1", "--pool", "planner"]) == 0
     said = capsys.readouterr()
-    assert (said.out, said.err) == ("", "done: `planner` will have 4 replicas (was 5)\n")
+    assert (said.out, said.err) == ("", "done: `planner` is scaling from 5 to 4 replicas\n")
     assert wish(paths)["target"] == 4
 
 
@@ -45,8 +45,8 @@ def test_without_a_manager_the_wish_is_kept_and_that_is_said(home, capsys):
     paths = lay_down(home)
     assert main.run(["drain", "1"]) == 0
     assert capsys.readouterr().err == (
-        "done: replica `1.12` of `planner` will be replaced\n"
-        "warning: `planner` has no manager: this takes effect once it has one\n\n"
+        "done: replica `1.12` of `planner` is being replaced\n"
+        "warning: `planner` has no manager: this takes effect once one is running\n\n"
         f"hint: start it with `fogft up {FILE}`\n"
     )
     assert wish(paths)["drained"] == {"1": 12}
@@ -78,7 +78,7 @@ def test_retry_is_written_down(home, capsys):
     paths = lay_down(home)
     with disk.locked(paths.manager_lock):
         assert main.run(["retry"]) == 0
-    assert "`planner` will launch replicas again" in capsys.readouterr().err
+    assert "`planner` launches replicas again" in capsys.readouterr().err
     assert abs(wish(paths)["retried_at"] - time.time()) < 60
 
 
@@ -129,4 +129,4 @@ def test_what_is_waited_for_is_said_when_it_is_done(home, capsys, monkeypatch, c
 def test_a_wait_without_a_manager_is_an_error(home, capsys):
     lay_down(home)
     assert main.run(["drain", "0", "--wait"]) == 1
-    assert "error: the manager of `planner` has ended" in capsys.readouterr().err
+    assert "error: the manager of `planner` has exited" in capsys.readouterr().err

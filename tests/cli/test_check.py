@@ -45,7 +45,7 @@ def test_an_example_is_right(capsys):
     assert main.run(["check", str(TEMPLATES / "echo" / "pool.yaml")]) == 0
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err.endswith("is right\n")
+    assert said.err.endswith("is valid\n")
 
 
 def test_what_is_no_yaml_is_one_mistake(tmp_path, capsys):

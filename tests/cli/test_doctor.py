@@ -18,8 +18,10 @@ from fogft.cloud.local.faults import CloudFaults
 from fogft.doctor import checks, finding, leftovers, machine, pools, ros
 from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
+from fogft.pool.commands.current import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager.status import TopicStatus
 from fogft.ros import environment
 from tests.cli.pools import FILE, STATUS, alive, lay_down, report
 from tests.needs import needs
@@ -66,7 +68,7 @@ def test_it_fails_when_something_does_not_work(monkeypatch, capsys):
     monkeypatch.setattr(checks, "examine", lambda _: iter(findings))
     assert main.run(["doctor"]) == 1
     said = capsys.readouterr()
-    assert said.err == "\n3 checks: 1 failed, 1 to look at\n"
+    assert said.err == "\n3 checks: 1 failed, 1 warnings\n"
     assert len(said.out.splitlines()) == 5
     assert "\033" not in said.out
 
@@ -155,6 +157,33 @@ def test_a_profile_that_is_no_xml_is_found(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("rmw", "verdict", "said"),
+    [
+        ("rmw_fastrtps_cpp", Verdict.OK, "measurements were made with it"),
+        ("rmw_cyclonedds_cpp", Verdict.WARN, "no service call passes between it and Fast DDS"),
+        ("rmw_zenoh_cpp", Verdict.WARN, "rmw: zenoh"),
+        ("rmw_connextdds", Verdict.WARN, "nobody has tried it"),
+    ],
+)
+def test_the_middleware_is_named_with_what_is_known_of_it(rmw, verdict, said):
+    found = ros.judge_middleware(rmw)
+    assert found.verdict is verdict
+    assert rmw in found.text
+    assert said in found.text
+
+
+def test_clients_without_answers_and_topics_that_nobody_hears_are_told():
+    service = replace(STATUS.services[0], counters={"trouble": "a client of `/plan` runs on X"})
+    topics = (TopicStatus("/scan", "sensor_msgs/msg/LaserScan", "robot"),)
+    status = replace(STATUS, services=(service,), topics=topics)
+    found = list(pools.judge_traffic("p", Seen(status, 0.0, manager_alive=True, answers=True)))
+    assert [(one.check, one.verdict) for one in found] == [
+        ("middleware", Verdict.FAIL),
+        ("topics", Verdict.WARN),
+    ]
+
+
+@pytest.mark.parametrize(
     ("segment_bytes", "ours", "verdict"),
     [
         (35_131_392, "", Verdict.OK),
@@ -173,7 +202,7 @@ def test_two_processes_find_each_other(tmp_path, monkeypatch, ros_domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
     found = the_only(ros.discovery(situation(tmp_path)))
     assert found.verdict is Verdict.OK, found
-    assert "was found in" in found.text
+    assert "was discovered in" in found.text
 
 
 @pytest.mark.ros
@@ -197,7 +226,7 @@ def test_nodes_that_cannot_find_each_other_are_found_out(tmp_path, monkeypatch, 
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
     found = the_only(ros.discovery(situation(tmp_path)))
     assert found.verdict is Verdict.FAIL
-    assert found.text == "two nodes here do not find each other"
+    assert found.text == "two nodes on this machine do not discover each other"
 
 
 def test_without_rclpy_it_says_how_to_get_it(tmp_path, monkeypatch):
@@ -255,7 +284,7 @@ def test_missing_processes_are_found_and_living_ones_seen(tmp_path):
     assert proxy.advice == f"run `fogft up {FILE}`", "what works in this state"
     with disk.locked(paths.manager_lock):
         _, proxy, *_ = pools.processes(situation(tmp_path, "planner"))
-    assert proxy.advice.startswith("its manager starts it")
+    assert proxy.advice.startswith("the manager restarts it")
     with alive(paths):
         found = list(pools.processes(situation(tmp_path, "planner")))
     assert [f.verdict for f in found] == [Verdict.OK] * 3

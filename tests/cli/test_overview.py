@@ -39,7 +39,7 @@ def test_each_pool_has_a_row_with_what_is_known_now(home, capsys, monkeypatch):
 
 def test_where_there_is_none_that_is_said(capsys):
     assert main.run(["list"]) == 0
-    assert "there is no pool here" in capsys.readouterr().err
+    assert "no pools on this machine" in capsys.readouterr().err
 
 
 def test_events_say_what_when_where_and_why(home, capsys):

@@ -59,7 +59,7 @@ def test_every_offer_is_chosen_or_says_why_not(pool, capsys):
     assert all(bool(o["slots"]) != bool(o["why_not"]) for o in shown["offers"])
     assert sum(bool(o["slots"]) for o in shown["offers"]) == 2
     by_place = {f"{o['region']}/{o['zone']}": o["why_not"] for o in shown["offers"]}
-    assert by_place["us-west-1/b"] == "dearer: $0.159/h, not $0.153/h (slot 0)"
+    assert by_place["us-west-1/b"] == "more expensive: $0.159/h, not $0.153/h (slot 0)"
     assert (
         "cheaper: $0.136/h, not $0.153/h but farther: 23 ms, not 11 ms" in by_place["us-west-2/b"]
     )
@@ -170,6 +170,26 @@ def test_losses_of_the_pool_are_shown(pool, capsys):
     assert "avoided for 4 min more" in lost["why_not"]
 
 
+def test_how_long_launches_took_is_shown_and_taken_for_the_time_away(pool, capsys):
+    """Nine in ten of the pool's own, once there are five; before, what is assumed."""
+    order = preview.order(pool)
+    store = composition.make_store("planner")
+    startup.write(store, order.spec, source=order.source, file=pool, cloud="local")
+    now = time.time() - 1000
+    for generation, took_s in enumerate((90, 100, 110, 120, 700), 1):
+        for at, kind in ((now, "launch"), (now + took_s, "ready"), (now + took_s + 5, "ready")):
+            line = {"at": at, "kind": kind, "slot": 0, "generation": generation}
+            with store.paths.history.open("a") as lines:
+                lines.write(json.dumps(line) + "\n")
+        assert main.run(["plan", str(pool), "--json"]) == 0
+        shown = json.loads(capsys.readouterr().out)
+        known = 700 if generation == 5 else None
+        assert shown["ready_p90_s"] == known
+        assert shown["availability"]["assumed"]["recovery_s"] == (known or 1200)
+    assert main.run(["plan", str(pool)]) == 0
+    assert "within 700 s of the order (p90 of 5 launches" in capsys.readouterr().out
+
+
 @needs("matplotlib")
 def test_every_offer_is_drawn_and_the_chosen_ones_named(pool, tmp_path):
     file = tmp_path / "plan.svg"
@@ -231,7 +251,7 @@ def test_regions_that_cannot_be_measured_are_told(pool, tmp_path, capsys):
     prices = table(tmp_path, "aws,us-west-1,a,m,8,32,0.4,0.1,", "aws,us-east-1,a,m,8,32,0.4,0.1,")
     assert main.run(["plan", str(pool), "--prices", prices]) == 0
     captured = capsys.readouterr()
-    assert "measuring the way to 2 regions" in captured.err
+    assert "measuring round trips to 2 regions" in captured.err
     assert "2 regions cannot be measured, such as `aws/us-east-1`: " in captured.err
     assert "response      11 ms" in captured.out
     assert main.run(["plan", str(pool), "--prices", prices, "--offline"]) == 0

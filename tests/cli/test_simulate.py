@@ -47,8 +47,8 @@ def test_a_table_of_policies_side_by_side(file, capsys):
         *("fogft", "one on-demand", "static, any of 2"),
         *("SkyServe, spot only", "SkyServe, fallback"),
     ]
-    assert "2 replicas wanted; 2 markets (made up) of 0.25 days." in out
-    assert "note: the market is made up" in err
+    assert "2 replicas wanted; 2 markets (simulated) of 0.25 days." in out
+    assert "note: the market is simulated" in err
 
 
 def test_json_holds_every_seed_and_what_was_assumed(file, capsys):

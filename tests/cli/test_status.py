@@ -28,7 +28,7 @@ from tests.cli.pools import FILE, STATUS, alive, lay_down, report
 SCREEN = """\
 planner  answering  1 of 3 ready  $0.063/h on local  seen 0.4 s ago
 
-REPLICA  PHASE     LOCATION                $/H  LINK            RTT    WON    AGE
+REPLICA  PHASE     LOCATION                $/H  LINK            RTT  FIRST    AGE
 0.1      ready     local/us-west-2/a     0.021  up          0.42 ms  1 412  7 min
 1.12     starting  local/eu-central-1/b  0.020  connecting        -      0  4.2 s
 2.3      draining  local/us-west-2/a     0.021  suspect      1.25 s      7   26 h
@@ -90,8 +90,8 @@ def test_a_dead_manager_is_told_twice(home, capsys):
     said = capsys.readouterr()
     assert "NO MANAGER" in said.out
     assert said.err == (
-        "warning: no manager runs: requests continue, but lost replicas are not replaced\n\n"
-        f"hint: start it with `fogft up {FILE}`, or end it with `fogft down`\n"
+        "warning: no manager is running: requests continue, but lost replicas are not replaced\n\n"
+        f"hint: start one with `fogft up {FILE}`, or shut the pool down with `fogft down`\n"
     )
 
 
@@ -127,7 +127,7 @@ def test_what_died_long_ago_is_not_shown_as_it_was(home, capsys):
     assert first.startswith("planner  not answering  ? of 3 ready  ?/h on local  seen 78 s ago")
     for row in rows[:3]:
         assert re.fullmatch(r"\d\.\d+ +\? +local/\S+ +\S+ +\? +\? .*", row), row
-    assert said.err.startswith("warning: no manager runs: nothing is replaced")
+    assert said.err.startswith("warning: no manager is running: nothing is replaced")
 
 
 def test_a_replica_that_has_served_is_not_starting(home, capsys):
@@ -178,7 +178,7 @@ def test_why_a_stateful_service_cannot_be_had_stands_below(home, capsys):
     lay_down(home, replace(STATUS, services=(replace(service, counters=counters),)))
     main.run(["status"])
     said = capsys.readouterr().out.splitlines()
-    assert "note: `/plan` cannot be had: all replicas are away" in said
+    assert "note: `/plan` is unavailable: all replicas are away" in said
 
 
 def test_a_pool_that_nobody_looked_at_yet_has_the_same_schema(home, capsys):
@@ -200,7 +200,7 @@ def test_a_status_of_another_version_is_an_error(home, capsys):
 
 def test_which_pool_is_meant_must_be_clear(home, capsys):
     assert main.run(["status"]) == 1
-    assert "error: there is no pool here\n\nhint: start one" in capsys.readouterr().err
+    assert "error: no pools on this machine\n\nhint: start one" in capsys.readouterr().err
     for name in ("planner", "detector"):
         lay_down(home, replace(STATUS, pool=name))
     assert main.run(["status"]) == 1

@@ -4,12 +4,94 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fogft.cli.status_text import notes
-from tests.cli.pools import STATUS
+import pytest
+
+from fogft.cli.lifecycle import services_at_fault
+from fogft.cli.status_text import notes, rendered, troubles
+from fogft.model.replica import LinkReport, LinkState, ReplicaId
+from fogft.pool.commands.current import Seen, current
+from fogft.pool.manager.proxy_report import ProxyReport, TopicCounted
+from fogft.pool.manager.status import ServiceStatus, TopicStatus
+from tests.cli.pools import REPLICA, STATUS, UID
+
+SCAN = TopicStatus("/scan", "sensor_msgs/msg/LaserScan", "robot")
+SETBOOL = "std_srvs/srv/SetBool"
+
+
+def with_topic(ready: frozenset[str], counted: TopicCounted) -> Seen:
+    link = LinkReport(ReplicaId(UID, 0, 1), LinkState.UP, ready)
+    report = ProxyReport(1, 5.0, links=(link,), topics={"/scan": counted})
+    status = replace(STATUS, topics=(SCAN,), observed_at=5.0)
+    return current(status, report, manager_alive=True, proxy_alive=True, now=5.0)
+
+
+def test_a_topic_is_shown_with_who_hears_it_and_what_became_of_its_messages():
+    """And in --json."""
+    seen = with_topic(frozenset({"/plan", "topic /scan"}), TopicCounted(120, 118, 2, 0, 10.0))
+    shown = shown_lines(seen)
+    at = next(i for i, line in enumerate(shown) if line.startswith("TOPIC"))
+    assert shown[at + 1].split() == ["/scan", "robot", "0.1", "10", "Hz", "120", "118", "2"]
+    assert troubles(seen.status) == []
+    (told,) = seen.to_json()["topics"]
+    assert told["heard_by"] == ["0.1"]
+    assert (told["counters"]["passed"], told["counters"]["rate_hz"]) == (118, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("ready", "trouble", "said"),
+    [
+        ({"/plan"}, "", "nobody hears `/scan`: no node of a replica subscribes to it"),
+        ({"/plan", "topic /scan"}, "it offers best effort", "it offers best effort"),
+    ],
+)
+def test_a_topic_that_does_not_pass_is_named(ready, trouble, said):
+    """It would just vanish."""
+    seen = with_topic(frozenset(ready), TopicCounted(5, trouble=trouble))
+    assert troubles(seen.status) == [said]
+    assert f"note: {said}" in shown_lines(seen)
+
+
+def test_a_client_that_gets_no_answers_is_told():
+    service = replace(STATUS.services[0], counters={"trouble": "a client runs on another"})
+    assert troubles(replace(STATUS, services=(service,))) == ["a client runs on another"]
+
+
+def test_only_services_whose_type_differs_are_named():
+    """The others wait for the same replicas, and nothing is wrong with them."""
+    replica = replace(REPLICA, differs=True, differing=("/odd",), detail="`a/srv/B` differs")
+    services = tuple(ServiceStatus(name, SETBOOL, 0) for name in ("/even", "/odd"))
+    status = replace(STATUS, replicas=(replica,), services=services)
+    assert services_at_fault(status) == ["/odd"]
+    assert services_at_fault(replace(status, replicas=(REPLICA,))) == ["/even", "/odd"]
+
+
+def shown_lines(seen: Seen) -> list[str]:
+    from io import StringIO
+
+    from rich.console import Console
+
+    out = Console(file=StringIO(), width=160)
+    out.print(rendered(seen, width=160))
+    return [line.rstrip() for line in out.file.getvalue().splitlines()]
+
+
+def test_a_port_that_strangers_flood_is_told_of():
+    flooded = replace(STATUS.replicas[0], strangers=9800)
+    status = replace(STATUS, notes=(), replicas=(flooded, *STATUS.replicas[1:]))
+    (line,) = [line.plain for line in notes(status)]
+    assert line.startswith("note: replica 0.1 has turned away 9 800 connections of strangers: ")
 
 
 def test_the_lines_of_a_log_stand_below_the_note_that_they_explain():
     status = replace(STATUS, notes=("it was never ready\nno module `plan`", "over"), services=())
     assert [line.plain for line in notes(replace(status, excluded=()))] == [
         *("note: it was never ready", "  no module `plan`", "note: over"),
+    ]
+
+
+def test_a_pool_that_is_too_small_says_how_many_replicas_would_do():
+    service = replace(STATUS.services[0], counters={"needed_replicas": 6})
+    status = replace(STATUS, notes=(), excluded=(), services=(service,))
+    assert [line.plain for line in notes(status)] == [
+        f"note: `{service.name}`: more is asked than the replicas can do; 6 would do"
     ]

@@ -14,8 +14,10 @@ from fogft.cli import main
 from fogft.cloud import sky
 from fogft.cloud.local import processes
 from fogft.errors import CloudUnreachable
+from fogft.pool.commands import preview
+from fogft.pool.commands.sweep import left_of
 from fogft.pool.folder.paths import PoolPaths
-from tests.cli.pools import STATUS, lay_down
+from tests.cli.pools import SPEC, STATUS, lay_down
 from tests.cloud.conftest import Local
 from tests.sky.scene import Scene
 from tests.sky.scripted_sky import replica
@@ -59,8 +61,9 @@ def test_what_a_living_manager_owns_is_left_alone(home, machines, capsys):
     assert lock.acquire(wait=False)
     assert run(capsys, "--end", "--yes") == (
         [],
-        "done: every machine has a manager\n"
-        "\nhint: real clouds were never used from here: `--cloud sky` asks them too\n",
+        "done: every machine belongs to a managed pool\n"
+        "\nhint: real clouds were never used from this machine: "
+        "`--cloud sky` checks them as well\n",
     )
     assert machines.machine(id)
     lock.release()
@@ -71,13 +74,20 @@ def test_what_a_living_manager_owns_is_left_alone(home, machines, capsys):
     assert machines.machine(id), "nothing is ended unasked"
 
 
-def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys):
-    """All of its processes go, and nothing of another pool's."""
+def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys, tmp_path):
+    """All of its processes go, and nothing of another pool's. An `up` of its name tells of it."""
     id = machines.running(task={"run": "x"}).id
+    file = tmp_path / "pool.yaml"
+    file.write_text(SPEC.replace("planner\n", "test\n", 1) + "resources: {infra: local}\n")
+    (note,) = [one for one in preview.order(file).preview.notes if "earlier pool" in one]
+    assert f"cost $0.070/h together: `{id}`." in note
+    assert "`fogft sweep` ends them" in note
+    file.write_text(SPEC + "resources: {infra: local}\n")
+    assert "earlier pool" not in str(preview.order(file).preview.notes), "another name"
     [line], _ = run(capsys)
     assert line.endswith(f"no pool of this uid in `{home}`")
     _, err = run(capsys, "--end", "--yes")
-    assert f"ended `{id}` (local/us-west-1/a)\ndone: all of them are ended\n" in err
+    assert f"ended `{id}` (local/us-west-1/a)\ndone: ended all of them\n" in err
     assert processes.find(machine=str(id)) == []
     assert run(capsys)[0] == []
 
@@ -147,6 +157,10 @@ def test_a_vm_that_only_its_cloud_still_knows_is_found_and_ended(scene, capsys):
     scene.launched()
     scene.sky.forget_everything()
     scene.cloud.journal.close(replica())
+    told = left_of("perception", "sky", scene.cloud)
+    assert "cost $0.021/h together" in told[0]
+    assert str(replica()) in told[0]
+    assert left_of("planner", "sky", scene.cloud) == []
     [line], err = run(capsys)
     assert line.split()[:3] == [str(replica()), "aws/us-east-1/us-east-1a", "$0.021/h"]
     assert "asked SkyPilot for all its clouds, and `aws` directly" in err

@@ -69,7 +69,7 @@ def test_it_says_what_it_will_do_each_change_and_how_it_ended(file, looks, capsy
         "  0  local/us-west-2/a  cpu4  $0.066/h",
         "  1  local/us-west-2/b  cpu4  $0.069/h",
         "  2  local/us-west-2/a  cpu4  $0.066/h",
-        "  together $0.201/h",
+        "  total $0.201/h",
         "0.1  provisioning at local/us-west-2/a",
         "0.1  starting",
         "0.1  `/plan` is not up yet",
@@ -122,7 +122,7 @@ def test_it_gives_up_at_once_when_run_keeps_ending(home, file, looks, capsys):
     looks(updated(file, services=(silent,), replicas=(hopeless,)))
     assert main.run(["up", str(file), "--timeout", "1000"]) == 1
     said = capsys.readouterr().err
-    assert "error: `/plan` of `planner` does not answer: `run` keeps ending\n" in said
+    assert "error: `/plan` of `planner` does not answer: `run` keeps exiting\n" in said
     assert f"  replica 0.1: {detail}\n" in said
 
 
@@ -138,7 +138,9 @@ def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, capsy
     lay_down(home).manager_log.write_text("its last words\n")
     looks(Seen(STATUS, 0.1, False))
     assert main.run(["up", str(file)]) == 1
-    assert "error: the manager of `planner` has ended:\nits last words\n" in capsys.readouterr().err
+    assert (
+        "error: the manager of `planner` has exited:\nits last words\n" in capsys.readouterr().err
+    )
 
 
 def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
@@ -150,7 +152,7 @@ def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
     monkeypatch.setattr("fogft.pool.commands.status.read", interrupt)
     assert main.run(["up", str(file)]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "interrupted: `planner` continues to start; `fogft down planner` ends it"
+    assert last == "interrupted: `planner` continues to start; `fogft down planner` shuts it down"
 
 
 # --- what is refused, and changes nothing
@@ -206,7 +208,7 @@ def test_a_changed_file_is_told_in_words(home, file, looks, capsys):
         "  `run`: python3 planner_service.py -> python3 planner_node.py",
         "  `resources` added",
         "  `replicas`: 3 -> 2",
-        "  so its replicas are replaced one after the other, new before old",
+        "  replicas are replaced one at a time, new before old",
     ]
 
 
@@ -228,7 +230,7 @@ def test_an_update_is_waited_for(home, file, looks, capsys):
 def test_an_update_that_is_rolled_back_is_an_error_with_its_reason(home, file, looks, capsys):
     lay_down(home)
     file.write_text(POOL.replace("_service", "_node"))
-    fault = "replica 0.2: `run` ended 4 times"
+    fault = "replica 0.2: `run` exited 4 times"
     looks(
         updated(file, "in progress"),
         updated(file, "stopped", fault),
@@ -236,8 +238,8 @@ def test_an_update_that_is_rolled_back_is_an_error_with_its_reason(home, file, l
     )
     assert main.run(["up", str(file)]) == 1
     assert capsys.readouterr().err.endswith(
-        "error: `planner` was not updated: replica 0.2: `run` ended 4 times\n\n"
-        "hint: see `fogft logs`; change the file and `fogft up` it again: this one is not retried\n"
+        "error: `planner` was not updated: replica 0.2: `run` exited 4 times\n\n"
+        "hint: see `fogft logs`; this file is not tried again: change it and run `fogft up`\n"
     )
 
 
@@ -263,8 +265,8 @@ def test_no_room_for_both_is_said_before(home, file, looks, capsys):
     looks(updated(file))
     assert main.run(["up", str(file)]) == 0
     said = capsys.readouterr().err
-    assert "  so its replicas are replaced one after the other, old before new\n" in said
-    assert "  $0.21/h (`max_usd_per_hour`) has no room for both: meanwhile one fewer" in said
+    assert "  replicas are replaced one at a time, old before new\n" in said
+    assert "  $0.21/h (`max_usd_per_hour`) leaves no room for both: one replica fewer" in said
 
 
 def test_the_same_file_changes_nothing(home, file, looks, capsys):
@@ -273,7 +275,7 @@ def test_the_same_file_changes_nothing(home, file, looks, capsys):
     looks(UP, started=False)
     assert main.run(["up", str(file)]) == 0
     first, _, last = capsys.readouterr().err.splitlines()
-    assert first == "pool `planner` already matches its file; nothing changes"
+    assert first == "pool `planner` already matches its file"
     assert last == "done: `planner` answers, with 1 of 1 replicas ready"
 
 
@@ -283,7 +285,7 @@ def test_up_again_gives_a_pool_its_manager_back(home, file, looks, capsys):
     looks(UP)
     assert main.run(["up", str(file)]) == 0
     second = capsys.readouterr().err.splitlines()[1]
-    assert second == "it had no manager: a new one takes over what runs"
+    assert second == "the pool had no manager: started a new one"
 
 
 # --- init and down
@@ -323,7 +325,7 @@ def test_an_example_with_a_type_of_its_own_asks_for_its_workspace(tmp_path, name
     files = init.copy_example(name, tmp_path / name)
     with pytest.raises(SpecError, match=f"no package `{package}`") as caught:
         preview.order(files[0])
-    assert "workspace sourced?" in caught.value.hint
+    assert "source its workspace" in caught.value.hint
 
 
 def test_an_unknown_example_is_an_error(capsys):
@@ -336,14 +338,14 @@ def test_an_unknown_example_is_an_error(capsys):
 def test_down_with_nothing_there_is_done(capsys):
     """It is safe to repeat."""
     assert main.run(["down"]) == 0
-    assert capsys.readouterr().err == "nothing to end: there is no pool here\n"
+    assert capsys.readouterr().err == "no pools on this machine\n"
 
 
 def test_down_ends_a_pool_whose_manager_is_dead(home, capsys):
     paths = lay_down(home)
     assert main.run(["down", "--yes"]) == 0
     assert not paths.folder.exists()
-    assert capsys.readouterr().err.endswith("done: nothing of `planner` is left\n")
+    assert capsys.readouterr().err.endswith("done: `planner` is shut down; nothing is left\n")
     assert main.run(["down"]) == 0
 
 
@@ -384,7 +386,7 @@ def test_refresh_without_a_manager_asks_the_cloud_and_says_so(home, capsys):
     lay_down(home)
     assert main.run(["status", "--refresh"]) == 0
     said = capsys.readouterr()
-    assert "note: no manager runs: the cloud was asked directly" in said.out
+    assert "note: no manager is running: asked the cloud directly" in said.out
     assert said.out.startswith("planner  not answering  ? of 3 ready  $0.000/h on local")
 
 
@@ -411,5 +413,5 @@ def test_an_update_that_is_under_way_is_joined(home, file, looks, capsys, end, s
     looks(updated(file, "in progress"), updated(file, "in progress"), last)
     assert main.run(["up", str(file)]) == status
     err = capsys.readouterr().err
-    assert "is being updated to this file: 1 of 2 replicas run it; waiting for it" in err
+    assert "is already being updated to this file: 1 of 2 replicas run it; waiting" in err
     assert said in err

@@ -65,15 +65,15 @@ def answer(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
 def test_a_file_that_names_clouds_is_for_sky_and_its_prices_are_told(scene, file, started, capsys):
     assert main.run(["up", str(file), "--yes"]) == 0
     said = capsys.readouterr().err.splitlines()
-    assert said.pop(1) == "measuring the way to 2 regions"
+    assert said.pop(1) == "measuring round trips to 2 regions"
     assert said[:3] == [
-        "asking SkyPilot which clouds can be used, and for their prices",
+        "asking SkyPilot for usable clouds and prices",
         "`aws` can be used",
         "pool `planner`: 3 replicas on `sky`",
     ]
     assert said[3].startswith("  0  aws/us-east-1/us-east-1a  m6i.large  $0.0")
     assert "live, " in said[3]
-    assert said[6].startswith("  together $0.0")
+    assert said[6].startswith("  total $0.1")
     assert len(started) == 1
     assert started[0].preview.cloud == "sky"
 
@@ -83,7 +83,8 @@ def test_nothing_is_started_unasked(scene, file, started, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
     assert main.run(["up", str(file)]) == 1
     assert capsys.readouterr().err.endswith(
-        "error: nobody is there to say yes\n\nhint: add `--yes` to go on without being asked\n"
+        "error: cannot ask for confirmation: there is no terminal\n\nhint: add "
+        "`--yes` to skip the confirmation\n"
     )
     assert started == []
 
@@ -95,7 +96,7 @@ def test_a_person_is_asked(scene, file, started, monkeypatch, capsys, text, goes
     assert main.run(["up", str(file)]) == (0 if goes_on else 1)
     said = capsys.readouterr().err
     assert "launch 3 machines at these prices? [y/N] " in said
-    assert ("nothing was done" in said) is not goes_on
+    assert ("aborted: nothing was changed" in said) is not goes_on
     assert bool(started) is goes_on
 
 
@@ -124,7 +125,7 @@ def test_with_no_cloud_that_works_nothing_is_begun(home, scene, file, started, c
     scene.sky.credentials = {"aws": "the key has expired"}
     assert main.run(["up", str(file), "--yes"]) == 1
     said = capsys.readouterr().err
-    assert "error: no cloud can be used with the credentials that are here\n" in said
+    assert "error: no cloud can be used with the credentials on this machine\n" in said
     assert "  `aws`: the key has expired\n" in said
     assert started == []
     assert list(home.iterdir()) == []
@@ -146,7 +147,7 @@ def test_without_skypilot_it_says_what_to_install(file, started, monkeypatch, ca
     monkeypatch.setitem(sys.modules, "sky", None)
     assert main.run(["up", str(file), "--yes"]) == 1
     said = capsys.readouterr().err
-    assert "error: SkyPilot is not usable here" in said
+    assert "error: SkyPilot cannot be used here" in said
     assert "pip install 'fogft[cloud]'" in said
     assert started == []
 
@@ -206,7 +207,7 @@ def test_down_asks_a_person(home, scene, monkeypatch, capsys, text, ends):
     paths.identity.write_text(paths.identity.read_text().replace('"local"', '"sky"'))
     answer(monkeypatch, text)
     assert main.run(["down"]) == (0 if ends else 1)
-    assert "end `planner` and all its machines? [y/N] " in capsys.readouterr().err
+    assert "shut down `planner` and all its machines? [y/N] " in capsys.readouterr().err
     assert paths.folder.exists() is not ends
 
 

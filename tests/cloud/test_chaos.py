@@ -200,7 +200,7 @@ def test_an_outage_cuts_off_then_ends_all_machines_there_and_refuses_new_ones(lo
     spared = local.running(2, where="us-west-2/a").id
     assert local.chaos.outage("us-west-1") == [hit]
     assert local.chaos.outage("local/slow-1/a") == [booting]
-    with pytest.raises(NoCapacity, match="`local/us-west-1` is out"):
+    with pytest.raises(NoCapacity, match="outage in `local/us-west-1`"):
         local.launch(3, where="us-west-1/b")
     assert faults.read_link(local.folder(hit) / "link.json").blackhole
     local.wait_gone(hit)

@@ -42,7 +42,8 @@ def test_a_machine_is_listed_runs_and_answers(local):
 
 
 def test_the_server_gets_its_place_its_files_and_marks_in_its_environment(local, tmp_path):
-    id = local.running(task={"workdir": str(tmp_path)}).id
+    envs = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "EMPTY": None, "PYTHONPATH": "/extra"}
+    id = local.running(task={"workdir": str(tmp_path), "envs": envs}).id
     given = local.given(id)
     folder = local.folder(id)
     assert given["config"] == str(folder / "replica.yaml")
@@ -51,6 +52,12 @@ def test_the_server_gets_its_place_its_files_and_marks_in_its_environment(local,
     assert 1 <= int(given["domain_id"]) <= 101
     assert given["environ"]["FOGFT_MACHINE"] == str(id)
     assert given["environ"]["FOGFT_POOL_UID"] == local.uid
+    # As on a VM: the proxy would not understand its service on another middleware.
+    assert given["environ"]["RMW_IMPLEMENTATION"] == "rmw_cyclonedds_cpp"
+    assert not given["environ"]["EMPTY"]
+    first, *others = given["environ"]["PYTHONPATH"].split(os.pathsep)
+    assert first == "/extra"
+    assert others, "where fogft itself lies"
 
 
 def test_what_is_secret_is_readable_by_its_owner_only(local):

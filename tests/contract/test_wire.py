@@ -410,12 +410,11 @@ def test_what_a_probe_says_is_seen_on_the_link(
     assert probe_answer.detail == "starts"
 
 
-def test_a_probe_tells_of_robot_and_manager(world: World, replica: Replica, owner: Owner) -> None:
-    dialer = world.dialer(robot="ada", manager_age=lambda: 4.5)
+def test_a_probe_tells_of_its_robot(world: World, replica: Replica, owner: Owner) -> None:
+    dialer = world.dialer(robot="ada")
     link = dialer.dial(peer(replica.listener.endpoint), keys(0), owner)
     world.wait_for(lambda: link.usable)
-    asked = replica.probes[-1]
-    assert (asked.robot, asked.manager_age_s) == ("ada", 4.5)
+    assert replica.probes[-1].robot == "ada"
 
 
 def test_definitions_are_asked_for_once_and_kept(

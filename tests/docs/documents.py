@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def documents() -> list[Path]:
     """Return every Markdown file that we ship."""
-    return sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+    return sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 
 def console_commands(text: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
-PAGE = (Path(__file__).parents[2] / "docs" / "launch.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs/how-to/launch-files.md").read_text()
 
 
 def test_before_and_after_differ_in_at_most_five_lines() -> None:

@@ -160,7 +160,7 @@ class Machine:
             self.environ["ROS_DOMAIN_ID"] = str(domain)
         self._folder = pool.folder
         secret = pool.folder / "secret"
-        secret.write_text("a passphrase that nobody knows\n")
+        secret.write_text("a passphrase that unknown\n")
         given = ("--passphrase-file", str(secret))
         bundle = pool.fogft("credentials", "issue", role, name, *given).strip()
         joined = subprocess.run(

@@ -54,7 +54,7 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
     pool.file = workspace / "pool.yaml"
     said = pool.fogft("up", str(pool.file), "--yes", ok=False)
     assert "there is no package `word_interfaces` with services here" in said
-    assert "workspace sourced?" in said
+    assert "source its workspace" in said
 
     build(workspace, pool.environ)
     bare, pool.environ = pool.environ, source(workspace, pool.environ)

@@ -1,9 +1,8 @@
-"""The commands of docs/quickstart.md, typed one after the other as the page has them."""
+"""The commands of docs/tutorial/first-pool.md, typed one after the other as the page has them."""
 
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 
@@ -16,9 +15,8 @@ pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
 
 
 def commands_by_hand() -> list[str]:
-    page = (ROOT / "docs" / "quickstart.md").read_text()
-    section = re.search(r"^## Do it by hand$(.*?)^## ", page, re.DOTALL | re.MULTILINE)
-    return [command for command in console_commands(section[1]) if "activate" not in command]
+    page = (ROOT / "docs" / "tutorial" / "first-pool.md").read_text()
+    return console_commands(page.partition("\n## Start the pool\n")[2])
 
 
 def test_the_quick_start_works_as_it_is_written(tmp_path, ros_domain):

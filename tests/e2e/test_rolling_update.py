@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,8 +12,10 @@ from typing import Any
 
 import pytest
 
+import fogft
 from tests.e2e.pool import NODES
 from tests.needs import needs
+from tests.proxy.by_hand import ROOT
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
 
@@ -36,9 +40,9 @@ def test_a_version_that_crashes_at_start_is_rolled_back_and_the_next_one_taken(p
     said = pool.fogft("up", str(pool.file), "--yes", ok=False)
     assert "new before old" in said
     assert "error: `e2e` was not updated: replica " in said
-    assert "`run` ended " in said
+    assert "`run` exited " in said
     status = pool.wait(lambda: rolled_back(pool))
-    assert "`run` ended " in status["update"]["fault"]
+    assert "`run` exited " in status["update"]["fault"]
     assert before <= replicas(pool) | before
     assert pool.ready() == 2
     assert replicas(pool) == before, "the good ones were never touched"
@@ -54,6 +58,39 @@ def test_a_version_that_crashes_at_start_is_rolled_back_and_the_next_one_taken(p
     result = client.finish()
     assert result["requests"] > 100
     assert flawless(result), result
+
+
+def test_up_after_an_upgrade_of_fogft_replaces_everything_and_loses_no_request(pool):
+    """A pool that another version has started: `status` says so, and `up` rolls it over."""
+    before = pool.folder / "before"
+    for name in ("fogft", "templates"):
+        shutil.copytree(ROOT / name, before / name, ignore=shutil.ignore_patterns("__pycache__"))
+    init = before / "fogft" / "__init__.py"
+    init.write_text(init.read_text().replace(fogft.__version__, "0.0.9"))
+    pool.write(replicas=2)
+    ours = pool.environ.get("PYTHONPATH", "")
+    pool.environ["PYTHONPATH"] = f"{before}{os.pathsep}{ours}"
+    pool.up()
+    pool.wait(lambda: (pool.folder / "home" / "pools" / "e2e" / "good.yaml").exists())
+    pool.environ["PYTHONPATH"] = ours
+    old, status = replicas(pool), pool.status()
+    assert versions(status) == {"0.0.9"}
+    assert "runs fogft 0.0.9" in pool.fogft("status", ok=False)
+    client = pool.client(300, 10)
+    said = pool.fogft("up", str(pool.file), "--yes", limit_s=200, ok=False)
+    assert "0.0.9" in said
+    assert not old & replicas(pool), said
+    pool.wait(lambda: versions(pool.status()) == {fogft.__version__})
+    assert pool.status()["manager_pid"] != status["manager_pid"]
+    result = client.finish()
+    assert result["requests"] > 100
+    assert flawless(result), result
+
+
+def versions(status: dict[str, Any]) -> set[str]:
+    """Return by which versions of fogft a pool's processes run."""
+    replicas = {one["version"] for one in status["replicas"]}
+    return {status["manager_version"], status["proxy_version"], *replicas}
 
 
 def rolled_back(pool) -> dict[str, Any] | None:

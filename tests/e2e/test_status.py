@@ -11,6 +11,7 @@ import pytest
 
 from fogft.pool.folder.lease import read_pid
 from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager.process_control import lock_holder
 from tests.e2e.pool import Pool
 
 pytestmark = pytest.mark.timeout(300)
@@ -22,12 +23,14 @@ def start(pool: Pool, *words: str) -> Popen[bytes]:
     return Popen(command, env=pool.environ, cwd=pool.folder, stdout=DEVNULL, stderr=DEVNULL)
 
 
-def pids(pool: Pool) -> tuple[int, int]:
-    """Return the manager's process and the client proxy's."""
+def pids(pool: Pool) -> list[int]:
+    """Return the processes of the robot's side: the manager, the client proxy, and its standby."""
     [folder] = (pool.folder / "home" / "pools").iterdir()
-    manager, proxy = read_pid(PoolPaths(folder)), pool.status()["proxy_pid"]
+    paths = PoolPaths(folder)
+    standby = pool.wait(lambda: lock_holder(paths.standby_lock), 30)
+    manager, proxy = read_pid(paths), pool.status()["proxy_pid"]
     assert manager is not None
-    return manager, proxy
+    return [manager, proxy, standby]
 
 
 def answers(pool: Pool) -> bool:
@@ -41,18 +44,21 @@ def test_status_says_what_is_true_now(pool: Pool) -> None:
     pool.up()
     assert answers(pool)
 
-    for pid in pids(pool):
+    all_of_it = pids(pool)
+    for pid in all_of_it:
         os.kill(pid, signal.SIGSTOP)
     pool.wait(lambda: pool.status()["answers"] is None, 20)
     assert pool.status()["ready"] == 0
     assert not answers(pool)
     assert "answering?" in pool.fogft("status")
-    for pid in pids(pool):
+    for pid in all_of_it:
         os.kill(pid, signal.SIGCONT)
     pool.wait(lambda: answers(pool), 30)
 
-    for pid in pids(pool):
-        os.kill(pid, signal.SIGKILL)
+    all_of_it = pids(pool)
+    for number in (signal.SIGSTOP, signal.SIGKILL):  # none of them has the time to start another
+        for pid in all_of_it:
+            os.kill(pid, number)
     assert not answers(pool)
     seen = pool.status()
     assert (seen["answers"], seen["ready"], seen["proxy_alive"]) == (False, 0, False)

@@ -18,7 +18,7 @@ from fogft.link.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnsw
 from fogft.link.send_options import SendOptions
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.records.record import SignedRecord
+from fogft.records.record import Record, SignedRecord
 from tests.fakes.link_ends import MemoryIncoming, MemoryLink, Session
 
 _STEP_S = 0.05
@@ -43,10 +43,9 @@ class MemoryWire:
         robot: str = "robot",
         *,
         suspect_after_s: float = 2.0,
-        manager_age: Callable[[], float | None] = lambda: None,
     ) -> MemoryDialer:
         """Make a robot's end."""
-        return MemoryDialer(self, robot, suspect_after_s, manager_age)
+        return MemoryDialer(self, robot, suspect_after_s)
 
     # -- moved by hand --------------------------------------------------------------------
 
@@ -125,12 +124,10 @@ class MemoryDialer:
         wire: MemoryWire,
         robot: str,
         suspect_after_s: float,
-        manager_age: Callable[[], float | None],
     ) -> None:
         self.wire = wire
         self.robot = robot
         self.suspect_after_s = suspect_after_s
-        self.manager_age = manager_age
         self._links: list[MemoryLink] = []
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> MemoryLink:
@@ -215,6 +212,10 @@ class MemoryListener:
 
     def revoke(self, names: Collection[str]) -> None:
         """Do nothing: this wire has no certificates."""
+
+    def lease(self) -> Record | None:
+        """Return nothing: this wire carries no records."""
+        return None
 
     def cancel(self, ids: Sequence[bytes]) -> None:
         """Take a cancellation that arrived."""

@@ -202,7 +202,7 @@ class MemoryLink:
             self._silence.began(now)
             known = self._status.probe_answer
             describe = not self.usable or known is None or not known.types
-            probe = Probe(self._dialer.robot, self._dialer.manager_age(), describe)
+            probe = Probe(self._dialer.robot, describe)
             self._wire.post(session, lambda: self._probed(session, probe, now))
         self._doubt(now)
 

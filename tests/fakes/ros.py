@@ -127,6 +127,10 @@ class MemoryServer:
         if self._open:
             self._on_request(payload, handle)
 
+    def mismatch(self) -> str:
+        """Return nothing: here all understand each other."""
+        return ""
+
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send the serialised response. Nothing happens once the service is withdrawn."""
         _check_payload(payload)
@@ -158,6 +162,10 @@ class MemoryClient:
     def available(self) -> bool:
         """Whether somebody serves this name with this type."""
         return self.servers() > 0
+
+    def mismatch(self) -> str:
+        """Return nothing: here all understand each other."""
+        return ""
 
     def servers(self) -> int:
         """Count those who serve this name with this type."""

@@ -1,4 +1,6 @@
-"""Fuzz every decoder of bytes that somebody else wrote, each in a process of its own.
+"""Fuzz every decoder of bytes that somebody else wrote, and what reads the state folder.
+
+Each runs in a process of its own.
 
 With atheris the cases follow what they reach in the code; without it they are damaged seeds.
 A finding ends the run with status 1 and is printed as hexadecimal.
@@ -14,6 +16,13 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tests.fuzz.targets import Target
+
+STATE_FILES = "state files"
+A_STATE_FILE = 50  # takes so many times as long as a frame, for whole commands read it
 
 
 def main() -> None:
@@ -26,17 +35,22 @@ def main() -> None:
     given = parser.parse_args()
     guided = not given.plain and importlib.util.find_spec("atheris") is not None
     if given.one:
-        (_guided if guided else _plain)(given.one, given.cases, given.seed)
+        follows = guided and given.one != STATE_FILES  # what reads them is all of fogft
+        (_guided if follows else _plain)(given.one, given.cases, given.seed)
         return
-    from tests.fuzz.targets import targets
-
-    names = given.only or list(targets())
+    names = given.only or [*_targets(), STATE_FILES]
     each = -(-given.cases // len(names))
     print(f"{each} cases for each of {len(names)} decoders, seed {given.seed}, "
           f"{'guided by coverage (atheris)' if guided else 'damaged seeds'}")  # fmt: skip
     failed = [name for name in names if not _in_a_process(name, each, given.seed, guided)]
     print(f"{each * len(names)} cases, findings in: {', '.join(failed) or 'none'}")
     sys.exit(bool(failed))
+
+
+def _targets() -> dict[str, Target]:
+    from tests.fuzz.targets import targets
+
+    return targets()
 
 
 def _in_a_process(name: str, cases: int, seed: int, guided: bool) -> bool:
@@ -63,12 +77,20 @@ def _in_a_process(name: str, cases: int, seed: int, guided: bool) -> bool:
 
 
 def _plain(name: str, cases: int, seed: int) -> None:
-    from tests.fuzz.mutation import damaged
-    from tests.fuzz.targets import targets
+    from tests.fuzz.mutation import damaged, damaged_text
 
-    target, dice = targets()[name], random.Random(f"{name} {seed}")
-    for _ in range(cases):
-        data = damaged(target.seeds, dice)
+    dice = random.Random(f"{name} {seed}")
+    if name == STATE_FILES:
+        from tests.fuzz.state_files import state_files
+
+        chosen = list(state_files().values())
+        cases = -(-cases // A_STATE_FILE)
+    else:
+        chosen = [_targets()[name]]
+    for number in range(cases):
+        target = chosen[number % len(chosen)]
+        one = name == STATE_FILES
+        data = damaged_text(target.seeds[0], dice) if one else damaged(target.seeds, dice)
         try:
             target.run(data)
         except BaseException:

@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+import json
+import math
 import random
+from collections.abc import Iterator
+from typing import Any
 
+VALUES: tuple[Any, ...] = (
+    *(None, True, -1, 0, 0.5, 1e17, 1e300, -1e300, 10**400, 1 << 64, math.nan, math.inf, [], {}),
+    *("", "1", "x" * 9000, "\x1b]0;owned\x07", "a\nb", "\ud800", [[[]]], {"": None}, [1e17], ["x"]),
+)
 INTERESTING = (b"", b"\0", b"\xff" * 4, b"{", b"[" * 64, b"NaN", b'"', b"\xed\xa0\x80", b"1e999")
 
 
@@ -29,3 +38,36 @@ def damaged(seeds: tuple[bytes, ...], dice: random.Random) -> bytes:
             other = dice.choice(seeds)
             data[at:] = other[dice.randrange(len(other) + 1) :]
     return bytes(data)
+
+
+def damaged_text(seed: bytes, dice: random.Random) -> bytes:
+    """Return JSON, or lines of it, with other values in it; or whatever it is, with other bytes."""
+    lines = seed.splitlines() if b"\n{" in seed else [seed]
+    at = dice.randrange(len(lines))
+    try:
+        lines[at] = _other_values(json.loads(lines[at]), dice)
+    except ValueError:
+        return damaged((seed,), dice)
+    return b"\n".join(lines) if dice.random() < 0.8 else damaged((seed,), dice)
+
+
+def _other_values(tree: Any, dice: random.Random) -> bytes:
+    """Change, drop or replace one to three values."""
+    for _ in range(dice.randrange(1, 4)):
+        places = list(_places(tree))
+        if not places:
+            break
+        holder, key = dice.choice(places)
+        if dice.random() < 0.15:
+            del holder[key]
+        else:
+            holder[key] = copy.deepcopy(dice.choice(VALUES))
+    return json.dumps(tree).encode()
+
+
+def _places(tree: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield each value's holder, and where in it the value stands."""
+    for key in list(tree) if isinstance(tree, dict) else range(len(tree)):
+        yield tree, key
+        if isinstance(tree[key], (dict, list)):
+            yield from _places(tree[key])

@@ -87,7 +87,8 @@ def _record(kind: RecordKind, subject: str, writer: str, content: dict[str, Any]
     return records.sign_record(record, _signers()[1](writer))
 
 
-def _records() -> list[SignedRecord]:
+def signed_records() -> list[SignedRecord]:
+    """Return one record of each kind that is read from others."""
     slot = {
         "endpoint": "10.0.0.1:7447",
         "observed_endpoint": "",
@@ -201,7 +202,7 @@ def targets() -> dict[str, Target]:
     answer = ProbeAnswer(0, 1, "x", frozenset({"/s"}), detail="why", types=types, offered=offered)
     behind = GatewayView(1, 2, LinkState.UP, frozenset({"/s"}), rtt_s=0.01, through="lab/edge")
     gateway = replace(answer, types={}, behind=(behind, behind), accepts=compression.ACCEPTED)
-    plain = [json.dumps(records.to_plain(one)).encode() for one in _records()]
+    plain = [json.dumps(records.to_plain(one)).encode() for one in signed_records()]
     known = Membership("p", UID, 1, 2, (Member(ReplicaId(UID, 0, 1), "h:1"),), frozenset({ROBOT}))
     greeting = _greeting()
     origin = frame.origin("ada", TOKEN)
@@ -211,7 +212,7 @@ def targets() -> dict[str, Target]:
             frames.challenge(bytes(frames.NONCE_BYTES), "10.0.0.1"),
             frames.greeting(*_signers()[1](ROBOT)(b"proof")),
             frames.have({("slot", "0"): (1, 1)}),
-            *frames.records(_records()),
+            *frames.records(signed_records()),
         ]
     )
     return {
@@ -257,7 +258,7 @@ def targets() -> dict[str, Target]:
         "refusal": Target(frame.decode_refusal, framed, (frame.encode_refusal(STAMP, ID, "lost"),)),
         "cancel": Target(frame.decode_cancel, framed, (frame.encode_cancel([ID, ID]),)),
         "probe": Target(
-            probe_frames.decode_probe, framed, (probe_frames.encode_probe(Probe("ada", 1.0)),)
+            probe_frames.decode_probe, framed, (probe_frames.encode_probe(Probe("ada")),)
         ),
         "probe answer": Target(
             probe_frames.decode_probe_answer,
@@ -277,7 +278,7 @@ def targets() -> dict[str, Target]:
         "content of a record": Target(
             _content,
             recorded,
-            tuple(json.dumps(records.read_body(one).content).encode() for one in _records()),
+            tuple(json.dumps(records.read_body(one).content).encode() for one in signed_records()),
         ),
         "greeting": Target(
             frame.decode_greeting, framed, (greeting, frame.encode_greeting(Greeting(TOKEN)))
@@ -301,14 +302,14 @@ def targets() -> dict[str, Target]:
         "record": Target(
             lambda data: records.read_body(SignedRecord(data, b"", b"")),
             recorded,
-            tuple(one.body for one in _records()),
+            tuple(one.body for one in signed_records()),
         ),
         "record, judged": Target(_offer, recorded, tuple(plain)),
         "certificate": Target(
-            lambda data: _verifier()(data, b"", b""), recorded, (_records()[0].certificate,)
+            lambda data: _verifier()(data, b"", b""), recorded, (signed_records()[0].certificate,)
         ),
         "record stream": Target(_stream, recorded, (stream,)),
-        "records of a link": Target(frames.unpack, recorded, (frames.pack(_records()),)),
+        "records of a link": Target(frames.unpack, recorded, (frames.pack(signed_records()),)),
         "message of a topic": Target(
             topic_frames.decode_message, framed, (topic_frames.encode_message(TOKEN, 7, b"cdr"),)
         ),

@@ -55,7 +55,7 @@ def sends(session: zenoh.Session, token: bytes, dice: random.Random) -> Callable
     packed = frame.encode_request(request_id(4), 1.0, origin, packed=True)
     cancel = frame.encode_cancel([request_id(1), request_id(2)])
     greeting = frame.encode_greeting(frame.Greeting(token))
-    probe = probe_frames.encode_probe(Probe("eve", 1.0, describe=True))
+    probe = probe_frames.encode_probe(Probe("eve", describe=True))
     asked = [(names.probe_key, probe), (names.records_key, b"{}"), (names.answers_key, b"")]
 
     def send() -> None:

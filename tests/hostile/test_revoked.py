@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -23,6 +23,7 @@ from fogft.pool.manager.announcing import ManagerRecords
 from fogft.proxy.config import read_server
 from fogft.records import cache
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
+from fogft.records.roster import ServingLease
 from fogft.records.signing import Signer
 from tests.link.wire_pool import POOL_UID, Owner, ReplicaProcess, keys, peer, wait_for
 
@@ -47,12 +48,13 @@ def _robot(paths: PoolPaths, name: str, *, revoked: bool) -> CredentialPaths:
     return CredentialPaths(folder / "ca.crt", folder / f"{name}.crt", folder / f"{name}.key")
 
 
-def _launched(paths: PoolPaths) -> ServerProxyConfig:
+def _launched(paths: PoolPaths, manager: ManagerRecords | None = None) -> ServerProxyConfig:
     """What a replica is told that is launched now, as it reads it on its machine."""
     identity = Identity("pool", POOL_UID, "mock", str(paths.folder / "pool.yaml"), 0.0)
     planned = PlannedLaunch(SLOT, GENERATION, Offer(Placement("c", "r", "z", "i"), 0.2), "because")
-    told = ManagerRecords(paths, POOL_UID, 1).revocations()
-    order = configuration.build_order(paths, identity, SPEC, planned, revocations=told)
+    manager = manager or ManagerRecords(paths, POOL_UID, 1)
+    told = manager.announcements(ServingLease(1e9, 60.0))
+    order = configuration.build_order(paths, identity, SPEC, planned, announcements=told)
     machine = paths.folder / "machine"
     machine.mkdir()
     for name, content in order.files.items():
@@ -64,8 +66,15 @@ def _launched(paths: PoolPaths) -> ServerProxyConfig:
 def dial() -> Iterator[Callable[..., ZenohLink]]:
     dialers: list[ZenohDialer] = []
 
-    def start(endpoint: str, files: CredentialPaths, robot: str, owner: Owner) -> ZenohLink:
+    def start(
+        endpoint: str,
+        files: CredentialPaths,
+        robot: str,
+        owner: Owner,
+        told: Sequence[SignedRecord] = (),
+    ) -> ZenohLink:
         dialers.append(ZenohDialer(files, robot=robot, pool_uid=POOL_UID))
+        dialers[-1].tell(told)
         return dialers[-1].dial(peer(endpoint, SLOT, GENERATION), keys(SLOT), owner)
 
     yield start
@@ -80,7 +89,7 @@ def test_a_replica_launched_later_never_lets_a_revoked_robot_in(
     eve, ada = _robot(paths, "eve", revoked=True), _robot(paths, "ada", revoked=False)
     config = _launched(paths)
     replica = start_replica(
-        files=config.credentials, slot=SLOT, generation=GENERATION, records=config.revocations
+        files=config.credentials, slot=SLOT, generation=GENERATION, records=config.announcements
     )
     hers, his = Owner(), Owner()
     shut_out = dial(replica.endpoint, eve, "eve", hers)
@@ -91,10 +100,28 @@ def test_a_replica_launched_later_never_lets_a_revoked_robot_in(
     assert replica.count("records_refused") == 0
 
 
-def test_where_nothing_was_taken_back_a_launch_carries_no_list(paths: PoolPaths) -> None:
-    """Most pools never revoke anything: no manager's certificate is made for that."""
-    assert _launched(paths).revocations is None
-    assert not (paths.credentials / "manager.crt").exists()
+def test_only_the_manager_prolongs_a_replica_s_life(
+    paths: PoolPaths, dial: Callable[..., ZenohLink], start_replica: Callable[..., ReplicaProcess]
+) -> None:
+    """A robot's own lease is refused; one that it passes on counts, and a launch brings the first.
+
+    So no robot, and nobody who has a robot's keys, can keep a machine running.
+    """
+    eve = _robot(paths, "eve", revoked=False)
+    manager = ManagerRecords(paths, POOL_UID, 1)
+    config = _launched(paths, manager)
+    replica = start_replica(
+        files=config.credentials, slot=SLOT, generation=GENERATION, records=config.announcements
+    )
+    assert replica.count("lease") == 1
+    manager.announcements(ServingLease(1e9 + 60.0, 60.0))
+    genuine = cache.read(paths.announcements)
+    content = {"at": 1e9, "lasts_s": 1e7}
+    forged = Record(POOL_UID, RecordKind.LEASE, "", 7, 7, content)
+    signed = sign_record(forged, Signer(eve.certificate, eve.key))
+    dial(replica.endpoint, eve, "eve", Owner(), (*genuine, signed))
+    wait_for(lambda: replica.count("lease") == 2)
+    assert replica.count("records_refused") == 1
 
 
 def test_a_list_that_a_robot_signed_takes_nobody_back(

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from fogft.errors import FrameError
 from fogft.link import frame, probe_frames
-from fogft.link.port import Probe, ProbeAnswer
+from fogft.link.port import GatewayView, Probe, ProbeAnswer
+from fogft.model.names import NAMES_BYTES_LIMIT
+from fogft.model.replica import LinkState
 from fogft.model.type_definition import Definition
 from fogft.requests.load import Load
 
@@ -42,11 +44,7 @@ answers = st.builds(
     detail=texts,
     work=st.dictionaries(texts, st.floats(0, 1e9, allow_nan=False), max_size=4),
 )
-probes = st.builds(
-    Probe,
-    robot=texts,
-    manager_age_s=st.none() | st.floats(0, 1e9, allow_nan=False),
-)
+probes = st.builds(Probe, robot=texts, describe=st.booleans())
 
 DECODERS: list[Callable[[bytes], Any]] = [
     frame.decode_request,
@@ -163,7 +161,8 @@ def test_json_of_the_wrong_shape_is_a_frame_error_or_a_frame(
     good = {
         "v": 1,
         "robot": "r",
-        "manager_age_s": 1.0,
+        "describe": True,
+        "lease_left_s": 1.0,
         "slot": 0,
         "generation": 1,
         "incarnation": "i",
@@ -180,6 +179,17 @@ def test_json_of_the_wrong_shape_is_a_frame_error_or_a_frame(
     except FrameError:
         return
     assert isinstance(value, (Probe, ProbeAnswer))
+
+
+@pytest.mark.parametrize("impossible", [-1e-9, -1e17, 1e13, 1e999])
+@pytest.mark.parametrize("key", ["lease_age_s", "lease_left_s", "work", "behind"])
+def test_a_duration_that_cannot_be_is_refused(key: str, impossible: float) -> None:
+    """Negative, or longer than any machine lives: nothing is reckoned with it."""
+    view = {"slot": 0, "generation": 1, "state": "up", "rtt_s": impossible}
+    value = {"work": {"ran": impossible}, "behind": [view]}.get(key, impossible)
+    said = {"v": frame.VERSION, "slot": 0, "generation": 1, "incarnation": "i", key: value}
+    with pytest.raises(FrameError):
+        probe_frames.decode_probe_answer(json.dumps(said).encode())
 
 
 @given(request_id=ids, cut=st.integers(0, 100), grown=st.binary(max_size=80))
@@ -212,8 +222,8 @@ def test_an_impossible_remaining_time_is_refused(remaining_s: float) -> None:
     "content",
     [
         b"[" * 5000,
-        b'{"v":1,"robot":"r","manager_age_s":NaN}',
-        b'{"v":1,"robot":"r","manager_age_s":1e999}',
+        b'{"v":1,"robot":"r","describe":NaN}',
+        b'{"v":1,"robot":"r","describe":1e999}',
         b'{"v":1,"robot":"\\ud800"}',
         b'{"v":true,"robot":"r"}',
         b'{"robot":"r"}',
@@ -281,7 +291,7 @@ def test_what_a_program_prints_travels_as_one_line(said: str) -> None:
 
 def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels() -> None:
     """Health never depends on how long a type is."""
-    large = {"a/srv/B": Definition("h", {"request": (("x" * 70_000, "int32"),)})}
+    large = {"a/srv/B": Definition("h", {"request": (("x" * 300_000, "int32"),)})}
     small = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
     for types, told in ((large, {}), (small, small)):
         answer = ProbeAnswer(0, 1, "i", frozenset({"/s"}), types=types, offered={"/s": "a/srv/B"})
@@ -290,9 +300,22 @@ def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels()
         assert decoded.offered == {"/s": "a/srv/B"}
 
 
+@pytest.mark.parametrize("count", [400, 2000])
+def test_the_most_that_a_pool_file_may_name_fits_into_a_probes_answer(count: int) -> None:
+    """As ready and as told of; views of replicas behind a gateway are what is left out."""
+    each = NAMES_BYTES_LIMIT // count
+    names = [f"/{number:0{each - 1}}" for number in range(count)]
+    behind = (GatewayView(0, 1, LinkState.UP, frozenset(names)),) * 20
+    told = dict.fromkeys(names[: count // 3], "std_srvs/srv/SetBool")
+    answer = ProbeAnswer(0, 1, "i", frozenset(names), offered=told, behind=behind)
+    decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
+    assert (decoded.ready, decoded.offered) == (frozenset(names), told)
+    assert len(decoded.behind) < 20
+
+
 def test_too_many_services_for_a_frame_are_an_error_at_the_sender() -> None:
     """A frame that nobody could read is not sent."""
-    answer = ProbeAnswer(0, 1, "i", ready=frozenset(f"/{n:0100}" for n in range(1000)))
+    answer = ProbeAnswer(0, 1, "i", ready=frozenset(f"/{n:0100}" for n in range(3000)))
     with pytest.raises(ValueError, match="probe's answer"):
         probe_frames.encode_probe_answer(answer)
 

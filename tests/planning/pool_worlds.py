@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 
 from hypothesis import strategies as st
 
+from fogft.model.choices import OnDemandSpec, Spread
+from fogft.model.groups import STAND_INS, is_stand_in
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
@@ -39,6 +41,7 @@ PLACES = [
     )
 ]
 OFFERS = tuple(Offer(place, 0.1 + 0.01 * index) for index, place in enumerate(PLACES))
+ON_DEMAND = tuple(Offer(replace(place, spot=False), 0.3) for place in PLACES)
 
 
 def spec(replicas: int = 2, **others: object) -> PoolSpec:
@@ -236,7 +239,7 @@ def parts(draw: st.DrawFn, of: PoolSpec, slot: int, generation: int) -> Part:
         slot,
         generation,
         state=state,
-        at=draw(st.sampled_from(PLACES)),
+        at=replace(draw(st.sampled_from(PLACES)), spot=not is_stand_in(slot)),
         age_s=draw(age),
         silent_s=draw(st.floats(2.5, 100)) if state == "silent" else 0.0,
         in_flight=draw(st.integers(0, 2)),
@@ -257,13 +260,14 @@ def worlds(draw: st.DrawFn, *, links_known: bool | None = None) -> World:
         draw(st.integers(1, 4)),
         max_surge=draw(st.integers(0, 2)),
         max_usd_per_hour=draw(st.sampled_from([None, None, 0.3, 0.5, 1.0])),
+        on_demand=OnDemandSpec(0, fallback=draw(st.booleans())),
+        spread=draw(st.sampled_from(Spread)),
     )
-    ids = draw(
-        st.lists(
-            st.tuples(st.integers(0, 5), st.integers(1, 3)), unique=True, min_size=0, max_size=7
-        )
-    )
-    world = World(asked, offers=tuple(draw(st.lists(st.sampled_from(OFFERS), unique=True))))
+    mixed = asked.on_demand.fallback
+    slots = st.sampled_from([*range(6), *range(STAND_INS, STAND_INS + 3 * mixed)])
+    ids = draw(st.lists(st.tuples(slots, st.integers(1, 3)), unique=True, min_size=0, max_size=7))
+    sold = (*OFFERS, *ON_DEMAND) if mixed else OFFERS
+    world = World(asked, offers=tuple(draw(st.lists(st.sampled_from(sold), unique=True))))
     world = world.having(*(draw(parts(asked, slot, generation)) for slot, generation in ids))
     known = draw(st.booleans()) if links_known is None else links_known
     ending = frozenset(
@@ -291,6 +295,12 @@ def worlds(draw: st.DrawFn, *, links_known: bool | None = None) -> World:
         )
         for index, place in enumerate(failures)
         for kind in (EventKind.LAUNCH, EventKind.REFUSED)
+    ]
+    losses = draw(st.sampled_from([0, 0, 5]))  # so many within the hour
+    past += [
+        Event(NOW - 600.0 * n, kind, 8, 9 - n, PLACES[n % 4].location)
+        for n in range(1, 1 + losses)
+        for kind in (EventKind.LAUNCH, EventKind.READY, EventKind.GONE)
     ]
     foreign = replace(
         replica(draw(st.integers(0, 2)), of=asked).machine, id=ReplicaId(STRANGER, 0, 1)

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.model.choices import OnDemandSpec
+from fogft.model.choices import OnDemandSpec, Spread
 from fogft.model.groups import STAND_INS
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
-from fogft.planning.fallback import SETTLED_S
+from fogft.planning.fallback import OFTEN, OFTEN_S, SETTLED_S
 from fogft.planning.observed.history import Event, EventKind
 from tests.planning.pool_worlds import NOW, PLACES, World, replica, spec
 
@@ -93,6 +93,19 @@ def test_on_demand_stands_in_rather_than_a_second_spot_machine_in_one_location()
     assert (1, True) in ordered(alone)
 
 
+@pytest.mark.parametrize(("spread", "shared"), [(Spread.PREFER, True), (Spread.REQUIRE, False)])
+def test_a_second_spot_machine_in_one_location_is_a_choice(spread, shared):
+    """Of four replicas two are in two locations, and no third one has room."""
+    four = spec(4, on_demand=OnDemandSpec(0, fallback=True), spread=spread)
+    here = [replica(slot, at=PLACES[slot], of=four) for slot in (0, 1)]
+    asked = world(*here, of=four, offers=(SPOT[0], SPOT[1], *ON_DEMAND))
+    spots = [is_spot for _, is_spot in ordered(asked)]
+    assert (True in spots) is shared
+    assert len(spots) == 2
+    alone = replace(asked, offers=SPOT[:2])  # no on-demand machine can be had
+    assert [is_spot for _, is_spot in ordered(alone)] == [True, True]
+
+
 def test_where_spot_machines_were_lost_less_often_the_next_one_goes():
     """Three losses outweigh a tenth of the price, until they are forgotten."""
     places = [Placement("c", "r", zone, "m") for zone in ("a", "b")]
@@ -110,6 +123,20 @@ def test_where_spot_machines_were_lost_less_often_the_next_one_goes():
     assert [x.offer.placement.zone for x in seen.plan().launches] == ["b"]
     later = replace(seen, now=NOW + 30 * 86_400)
     assert [x.offer.placement.zone for x in later.plan().launches] == ["a"]
+
+
+@pytest.mark.parametrize(("losses", "is_held"), [(OFTEN - 1, False), (OFTEN, True)])
+def test_where_spot_machines_are_lost_too_often_a_stand_in_is_held_in_place_of_one(losses, is_held):
+    gone = [
+        Event(NOW - 900 * age_of, kind, 7, age_of + 1, PLACES[2].location)
+        for age_of in range(losses)
+        for kind in (EventKind.LAUNCH, EventKind.GONE)
+    ]
+    asked = world(spot(0, age_s=9000.0), stand_in(age_s=9000.0))
+    asked = replace(asked, events=(*gone, *asked.events))
+    assert ordered(asked) == [(1, True)] * (not is_held)
+    later = replace(asked, now=NOW + OFTEN_S)
+    assert ordered(later) == [(1, True)]
 
 
 @pytest.mark.parametrize(("stands_in_for_s", "goes"), [(300.0, False), (900.0, True)])

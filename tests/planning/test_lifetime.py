@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,6 +16,20 @@ from tests.planning.pool_worlds import spec
 
 TWO_HOURS = spec(max_hours=2.0)
 moments = st.floats(1.0, 4e9)
+
+
+@pytest.mark.parametrize(
+    ("hours", "at_s", "left_s"),
+    [
+        (None, 9e5, 86_400.0),
+        (48.0, 3600.0, 86_400.0),
+        (2.0, 3600.0, 3600.0),
+        (2.0, 7200.0, 0.0),
+        (2.0, 1e9, 0.0),
+    ],
+)
+def test_replicas_without_a_manager_never_outlive_the_pool(hours, at_s, left_s):
+    assert lifetime.unmanaged_s(spec(max_hours=hours), 1e9, 1e9 + at_s) == left_s
 
 
 @given(created=moments, now=moments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 import re
 import textwrap
 from dataclasses import replace
@@ -44,7 +45,7 @@ fogft:
     suspect_after_s: 3
     replace_after_s: 20.5
     start_limit_s: 600
-  orphan_after_s: 60
+  unmanaged_max_hours: 2
 """
 
 
@@ -75,7 +76,7 @@ def test_a_whole_file():
         max_usd_per_hour=1.5,
         max_hours=12.0,
         health=HealthSpec(3.0, 20.5, 600.0),
-        orphan_after_s=60.0,
+        unmanaged_max_hours=2.0,
         task=task,
     )
 
@@ -752,3 +753,14 @@ def test_a_file_without_services_leaves_it_to_what_run_offers():
     found = replace(spec, discovered=(ServiceSpec("/a", "a/srv/A"),))
     assert found.proxied == found.discovered
     assert found.replica_hash == spec.replica_hash
+
+
+def test_names_that_no_probe_could_tell_are_refused_before_anything_starts():
+    def named(length):
+        names = [f"/{number:0{length - 1}}x" for number in range(400)]
+        services = [{"name": name.replace("/0", "/a"), "type": "a/srv/B"} for name in names]
+        return f"run: x\nfogft: {json.dumps({'services': services})}\n"
+
+    assert len(file.parse(named(120), file="pool.yaml").services) == 400
+    with pytest.raises(SpecError, match="have names of 80400 bytes together; 65536 are the most"):
+        file.parse(named(200), file="pool.yaml")

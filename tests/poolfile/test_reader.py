@@ -89,7 +89,7 @@ specs = st.builds(
         replace_after_s=st.floats(0.1, 86_400),
         start_limit_s=st.floats(0.1, 86_400),
     ),
-    orphan_after_s=st.floats(0.1, 2_592_000),
+    unmanaged_max_hours=st.floats(0.1, 8000),
 )
 
 
@@ -134,7 +134,7 @@ def test_any_tree_is_read_or_is_one_spec_error(top, fogft, service):
             assert spec.hint
 
 
-@pytest.mark.parametrize("key", ["timeout_s", "suspect_after_s", "orphan_after_s"])
+@pytest.mark.parametrize("key", ["timeout_s", "suspect_after_s", "unmanaged_max_hours"])
 @pytest.mark.parametrize("value", [0, -1, -0.0, math.nan, math.inf, -math.inf, 1e300, True, "1"])
 def test_impossible_durations_are_refused(key, value):
     """No duration is zero, negative, infinite, not a number, a truth value or a text."""

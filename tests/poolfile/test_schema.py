@@ -12,7 +12,7 @@ from tests.docs.documents import ROOT
 
 SCHEMA = jsonschema.Draft202012Validator(schema.pool_schema())
 POOL_FILES = sorted((ROOT / "templates").glob("*/pool.yaml"))
-PAGE = (ROOT / "docs" / "pool-file.md").read_text()
+PAGE = (ROOT / "docs" / "reference" / "pool-file.md").read_text()
 EXAMPLES = [part.split("```")[0] for part in PAGE.split("```yaml\n")[1:4]]
 TEXTS = [*(path.read_text() for path in POOL_FILES), *EXAMPLES]
 

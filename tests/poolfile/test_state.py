@@ -67,7 +67,12 @@ def test_running_replicas_are_replaced_when_a_service_becomes_stateful():
         ("{snapshot: /a}", "state.restore", "is missing", "set_state"),
         ("{snapshot: /a, restor: /b}", "state.restor", "unknown key", "restore"),
         ("{snapshot: /a b, restore: /b}", "state.snapshot", "is not a service name", "/svc"),
-        ("{snapshot: /a, restore: /b, shared: true}", "state.shared", "one robot", "docs/state.md"),
+        (
+            "{snapshot: /a, restore: /b, shared: true}",
+            "state.shared",
+            "one robot",
+            "docs/how-to/state.md",
+        ),
         ("{snapshot: 3, restore: /b}", "state.snapshot", "must be text", "quotes"),
         ("{snapshot: {name: /a, type: x/srv/A}, restore: /b}", "field", "is missing", "type"),
         ("{snapshot: {name: /a, field: x}, restore: /b}", "type", "is missing", "type"),

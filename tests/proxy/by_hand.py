@@ -39,6 +39,9 @@ class Parts:
     Args:
         services: As a configuration file has them.
         node: What a replica runs, with an argument.
+
+    Attributes:
+        tree: Where the fogft lies by which what is started from now on runs.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class Parts:
     ) -> None:
         self.services, self.node = services, node
         self.folder = folder
+        self.tree = ROOT
         self._domain = domain
         self._processes: list[subprocess.Popen[bytes]] = []
         self._version = 0
@@ -70,12 +74,14 @@ class Parts:
         return self._domain()
 
     def start(
-        self, command: str, config: Path, environ: Mapping[str, str] = {}
+        self, command: str, config: Path, environ: Mapping[str, str] = {}, *options: str
     ) -> subprocess.Popen[bytes]:
+        path = os.pathsep.join(filter(None, [str(self.tree), os.environ.get("PYTHONPATH")]))
         with config.with_suffix(".log").open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "fogft", command, "--config", str(config)],
-                cwd=ROOT, stdout=log, stderr=log, env={**os.environ, **environ},
+                [sys.executable, "-m", "fogft", command, "--config", str(config), *options],
+                cwd=self.tree, stdout=log, stderr=log,
+                env={**os.environ, "PYTHONPATH": path, **environ},
             )  # fmt: skip
         self._processes.append(process)
         return process
@@ -143,18 +149,18 @@ class Robot:
         self._parts = parts
         self._members = parts.folder / f"{name}-members.json"
         self._status = parts.folder / f"{name}-status.json"
-        self._config = parts.folder / f"{name}.yaml"
+        self.config = parts.folder / f"{name}.yaml"
         self.domain = parts.domain()
         parts.issue(names.robot_certificate_name(UID, name), authority.Role.ROBOT, name)
-        self._config.write_text(
+        self.config.write_text(
             f'pool: p\npool_uid: "{UID}"\nrobot: {name}\nmembership: {self._members.name}\n'
-            f"status: {self._status.name}\nlease: lease.json\nlock: {name}.lock\n"
+            f"status: {self._status.name}\nlock: {name}.lock\n"
             f"credentials: {{ca: ca/ca.crt, certificate: {name}.crt, key: {name}.key}}\n"
             f"services: {parts.services}\ndomain_id: {self.domain}\n{extra}"
         )
         if replicas:
             self.follow(*replicas)
-        self.process = parts.start("proxy", self._config)
+        self.process = parts.start("proxy", self.config)
 
     def follow(self, *replicas: Replica, topology: Topology | None = None) -> None:
         """Write the membership, whole, as a manager would."""
@@ -168,12 +174,20 @@ class Robot:
 
     def restart(self) -> None:
         self.kill()
-        self.process = self._parts.start("proxy", self._config)
+        self.process = self._parts.start("proxy", self.config)
 
     def kill(self) -> None:
         self.process.kill()
         self.process.wait()
         self._status.unlink()
+
+    def start_standby(self) -> subprocess.Popen[bytes]:
+        """Start another one that takes over, and wait until it could."""
+        log = self.config.with_suffix(".log")
+        ready = log.read_text().count("standby_ready")
+        process = self._parts.start("proxy", self.config, {}, "--standby")
+        wait_for(lambda: log.read_text().count("standby_ready") > ready, "the standby")
+        return process
 
     def report(self) -> dict[str, Any]:
         try:
@@ -268,6 +282,10 @@ class Caller:
             asked = f"{self._asked} asked, {self.right} right"
             print(f"{asked}, unanswered: {sorted(self._open)}, wrong: {self.wrong}")
         return not self._open and not self.wrong
+
+    def servers(self) -> int:
+        """Count who serves, as discovery has it."""
+        return len(self._node.get_subscriptions_info_by_topic("rq/planRequest", no_mangle=True))
 
     def close(self) -> None:
         self._node.destroy_node()

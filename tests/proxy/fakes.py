@@ -7,8 +7,11 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.link.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
+from fogft.model.plain import to_plain
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
+from fogft.records.record import Record, RecordKind
+from fogft.records.roster import ServingLease
 from fogft.requests.load import Handling, Load
 
 UID = "0123456789abcdef"
@@ -153,6 +156,7 @@ class FakeClient:
 
     def __init__(self) -> None:
         self.there = True
+        self.stranger = ""
         self.count = 1
         self.broken: RosError | None = None
         self.calls: list[tuple[bytes, Callable[[bytes], None]]] = []
@@ -164,6 +168,9 @@ class FakeClient:
 
     def servers(self) -> int:
         return self.count if self.there else 0
+
+    def mismatch(self) -> str:
+        return self.stranger
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         if self.broken is not None:
@@ -185,6 +192,10 @@ class FakeServer:
         self.on_request = on_request
         self.responses: list[tuple[Any, bytes]] = []
         self.closed = False
+        self.stranger = ""
+
+    def mismatch(self) -> str:
+        return self.stranger
 
     def respond(self, handle: Any, payload: bytes) -> None:
         self.responses.append((handle, payload))
@@ -223,6 +234,12 @@ class FakeNode:
         self.closed = True
 
 
+def lease(number: int, *, at: float, lasts_s: float, epoch: int = 1) -> Record:
+    """Return the lease of that number in the manager's epoch, its signature checked."""
+    content = to_plain(ServingLease(at, lasts_s))
+    return Record("0123456789abcdef", RecordKind.LEASE, "", epoch, number, content)
+
+
 class FakeListener:
     """A listener whose requests and probes the test makes."""
 
@@ -230,7 +247,11 @@ class FakeListener:
 
     def __init__(self) -> None:
         self.closed = False
+        self.signed: Record | None = None
         self.services: dict[str, str] = {}
+
+    def lease(self) -> Record | None:
+        return self.signed
 
     def serve(self, services, on_request, on_probe, on_cancel) -> None:
         self.on_cancel = on_cancel
@@ -264,6 +285,9 @@ class FakeSupervisor:
             self.restarts += 1
         self.alive = True
         return died
+
+    def restart(self) -> None:
+        self.dies = True
 
     def stop(self) -> None:
         self.alive = False

@@ -24,6 +24,7 @@ from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.supervisor import Supervisor
+from fogft.records.record import RecordKind
 
 
 class EchoNode:
@@ -53,6 +54,9 @@ class EchoNode:
 
     def servers(self) -> int:
         return 1
+
+    def mismatch(self) -> str:
+        return ""
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         ticket = next(self._tickets)
@@ -96,10 +100,11 @@ def main() -> None:
         presence = Presence(config, proxy.endpoint)
         while not stop.wait(0.05):
             proxy.run_once()
-            revoked = presence.look(
+            known = presence.look(
                 proxy.ready, draining=proxy.draining, in_flight=proxy.responder.in_flight
             )
-            proxy.revoke(revoked)
+            proxy.revoke(known.revoked)
+            proxy.renew(known.of(RecordKind.LEASE))
     finally:
         if presence is not None:
             presence.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +14,8 @@ import pytest
 from fogft.ros import environment
 from tests.cloud.fake_metadata import serving
 from tests.freezing import freeze
-from tests.proxy.by_hand import LIMIT_S, Caller, Parts, Robot, wait_for
+from tests.needs import BEFORE, needs
+from tests.proxy.by_hand import LIMIT_S, ROOT, Caller, Parts, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 environment.prepare(os.environ)
@@ -157,6 +159,24 @@ def test_a_machine_that_is_told_of_its_end_gets_no_more_requests(parts, call):
         assert robot.links()[0]["in_flight"] == 0
 
 
+def test_where_no_cloud_gives_notice_the_machines_sigterm_is_one(parts, call):
+    """The robot asks the others, what is under way is answered, then it ends."""
+    nowhere = {
+        "AWS_EC2_METADATA_SERVICE_ENDPOINT": "http://127.0.0.1:1/",
+        "GCE_METADATA_HOST": "127.0.0.1:1",
+    }
+    told = parts.replica(0, **nowhere)
+    robot = parts.robot("robot", told, parts.replica(1))
+    caller = call(robot)
+    wait_for(lambda: robot.ready() == [0, 1], "both replicas")
+    caller.ask(20)
+    told.process.send_signal(signal.SIGTERM)
+    wait_for(lambda: robot.links()[0]["draining"], "the notice")
+    caller.ask(100)
+    assert caller.all_answered()
+    assert told.process.wait(LIMIT_S) == 0
+
+
 def test_a_proxy_starts_again_without_a_manager(parts, call):
     """Its configuration and the last membership on disk are all that it needs."""
     robot = parts.robot("robot", parts.replica(0))
@@ -168,6 +188,26 @@ def test_a_proxy_starts_again_without_a_manager(parts, call):
     assert caller.all_answered()
 
 
+@needs("history")
+@pytest.mark.parametrize("old", ["replica", "robot"])
+def test_a_robot_and_a_replica_one_minor_version_apart_work_together(parts, call, old):
+    """The version before is taken out of the history: 0.2.0, the first that others stay true to."""
+    before = parts.folder / "before"
+    before.mkdir()
+    archive = subprocess.run(
+        ["git", "archive", BEFORE, "fogft", "templates"], cwd=ROOT, check=True, capture_output=True
+    )
+    subprocess.run(["tar", "-x"], cwd=before, input=archive.stdout, check=True)
+    parts.tree = before if old == "replica" else ROOT
+    replicas = [parts.replica(0), parts.replica(1)]
+    parts.tree = ROOT if old == "replica" else before
+    robot = parts.robot("robot", *replicas)
+    caller = call(robot)
+    caller.ask(200)
+    assert caller.all_answered()
+    assert robot.ready() == [0, 1]
+
+
 def test_a_proxy_ends_when_its_folder_is_gone(parts):
     """Who removes a pool's folder by hand leaves no process behind."""
     robot = parts.robot("robot")
@@ -176,3 +216,42 @@ def test_a_proxy_ends_when_its_folder_is_gone(parts):
     assert robot.process.wait(LIMIT_S) == 0
     gone.rename(parts.folder)
     assert "folder_gone" in (parts.folder / "robot.log").read_text()
+
+
+def test_a_killed_client_proxy_is_replaced_by_the_one_in_line(parts, call):
+    """It serves under the same name; ROS knows at once that the first is gone, not by its lease.
+
+    A third is refused: one works, one waits.
+    """
+    robot = parts.robot("robot", parts.replica(0))
+    caller = call(robot)
+    for _ in range(2):
+        standby = robot.start_standby()
+        assert parts.start("proxy", robot.config, {}, "--standby").wait(LIMIT_S) == 1
+        wait_for(lambda: robot.report().get("participant"), "its id in DDS")
+        robot.process.kill()
+        robot.process.wait()
+        caller.wait()
+        assert caller.servers() == 1
+        robot.process = standby
+        wait_for(lambda: robot.report()["pid"] == robot.process.pid, "the standby's report")
+        caller.ask(50)
+        assert caller.all_answered()
+
+
+def test_a_client_proxy_that_is_told_to_end_hands_over_without_losing_a_request(parts, call):
+    """The standby serves before the old one leaves; twice, under load."""
+    replica = parts.replica(0)
+    robot = parts.robot("robot", replica)
+    caller = call(robot)
+    for _ in range(2):
+        leaving, robot.process = robot.process, robot.start_standby()
+        caller.ask(20)
+        leaving.terminate()
+        while leaving.poll() is None:
+            caller.ask()
+            caller.spin(0.01)
+        caller.ask(20)
+        assert caller.all_answered()
+        assert leaving.returncode == 0
+    wait_for(lambda: robot.report()["pid"] == robot.process.pid, "the standby's report")

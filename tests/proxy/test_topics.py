@@ -152,6 +152,23 @@ def test_every_message_reaches_every_replica_once_and_in_order(seed):
         world.carry()
     for node in world.nodes:
         assert node.published["/to"] == said
+    assert world.robot.report()["/to"]["passed"] == len(said)
+
+
+def test_the_rate_is_that_of_the_last_seconds_and_what_goes_nowhere_is_counted():
+    world = World(TO, replicas=0)
+    for _ in range(4):
+        for _ in range(5):
+            world.robot_node.heard["/to"](b"m")
+        world.clock.now += 1.0
+        world.carry()
+    counted = world.robot.report()["/to"]
+    assert counted["rate_hz"] == 5.0
+    assert (counted["messages"], counted["passed"], counted["dropped"]) == (20, 0, 20)
+    for _ in range(8):
+        world.clock.now += 1.0
+        world.carry()
+    assert world.robot.report()["/to"]["rate_hz"] == 0.0
 
 
 @pytest.mark.parametrize("seed", range(by_day(6, at_night=200)))

@@ -112,7 +112,7 @@ def messages(slot: int, service_key: str) -> Iterator[tuple[Send, bytes, bytes |
         yield _published(service_key), b"x", content
     yield _published(service_key), b"x", None
     for content in (None, greeting[:5], b"\x07" + greeting[1:], bytes(5000)):
-        yield probe, b'{"v":2,"robot":"eve","manager_age_s":null}', content
+        yield probe, b'{"v":2,"robot":"eve"}', content
     for payload in (b"", b"{}", b"[" * 5000, b'{"v":9,"robot":"eve"}', bytes(100_000)):
         yield probe, payload, greeting
     for content in (None, b"", greeting[:5], b"\x07" + greeting[1:], bytes(5000)):

@@ -53,7 +53,7 @@ class Rendezvous:
                  "--config", str(self.config)],
                 cwd=ROOT, stdout=log, stderr=log,
             )  # fmt: skip
-        wait_for(self._status.exists)
+        wait_for(self._status.exists, 120.0)
 
     def forget(self) -> None:
         (self.folder / "records.json").unlink(missing_ok=True)

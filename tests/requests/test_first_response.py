@@ -78,7 +78,7 @@ def may_ask(requests: FirstResponse[str], replica: int, now: float = 0.0) -> boo
     """Whether a replica may be asked for request A, and somebody looks whether it should be."""
     return any(
         request == A and requests.candidates(pending, [replica], now)
-        for request, pending in requests.short()
+        for request, pending in requests.short(0.0)[0]
     )
 
 
@@ -126,7 +126,7 @@ def test_nobody_is_asked_for_a_request_that_has_ended():
     requests.succeeded(A, 0.0)
     requests.came(2)
     requests.reconsider()
-    assert requests.short() == []
+    assert requests.short(0.0)[0] == []
     assert list(requests.idle()) == []
 
 

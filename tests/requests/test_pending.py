@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from fogft.model.choices import FallbackSpec
 from fogft.model.refusal import Refusal
+from fogft.requests.alarms import ALARM_S, FALSE_ALARMS, LATELY_S
 from fogft.requests.choose import All
 from fogft.requests.decide import FirstSuccess, Means
 from fogft.requests.fallback import FallbackTimer
@@ -105,39 +104,43 @@ def test_the_fallback_ends_a_request_once():
     assert answer(requests, 1, OK)[1] is None
 
 
-step = st.tuples(
-    st.sampled_from(["ok", "no", "refuse", "decline", "stop", "expire", "more"]),
-    st.integers(0, 3),
-    st.integers(0, 5),
-)
+def wolf(requests: PendingRequests[Item], number: int, now: float) -> int:
+    """Have replica 0 say that its service died over a request, and 1 answer it; return deaths."""
+    id = bytes([number]) * 16
+    requests.begin(id, Item(b"x"), (0, 1), deadline=9999.0, now=now)
+    for replica in (0, 1):
+        requests.attempt(id, replica, now)
+    requests.refused(id, 0, Refusal.CRASHED, now)
+    deaths = requests.get(id).deaths
+    requests.answered(id, id, 1, OK, True, None, now)
+    return deaths
 
 
-@given(st.lists(step, max_size=40))
-def test_each_request_is_closed_once_and_its_bytes_are_given_back(steps):
-    """Whatever happens in whatever order: as many ends as beginnings, and nothing is held."""
-    spy, able = Spy(), (0, 1, 2, 3)
-    requests: PendingRequests[Item] = PendingRequests(All(), spy)
-    ids = [bytes([n]) * 16 for n in range(6)]
-    for n, id in enumerate(ids):
-        requests.begin(id, Item(bytes(n)), able, deadline=20.0 + n, now=0.0)
-    now = 1.0
-    for what, replica, n in steps:
-        now += 0.5
-        if what in ("ok", "no"):
-            payload = OK if what == "ok" else NO
-            requests.answered(ids[n], ids[n], replica, payload, payload == OK, None, now)
-        elif what == "refuse":
-            requests.refused(ids[n], replica, Refusal.CRASHED, now)
-        elif what == "decline":
-            requests.declined(ids[n], replica)
-        elif what == "stop":
-            requests.stop(ids[n], now)
-        elif what == "expire":
-            requests.expire(now)
-        else:
-            for request, to in requests.more(able, now, newest_first=False):
-                requests.attempt(request, to, now)
-        assert requests.held_bytes == sum(n for n, id in enumerate(ids) if id in requests)
-    requests.expire(100.0)
-    assert sorted(spy.ended) == ids
-    assert (len(requests), requests.held_bytes) == (0, 0)
+def test_who_cries_wolf_is_not_believed():
+    """A replica whose service dies over all that others answer has nothing run alone, for long."""
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    deaths = [wolf(requests, n, n * ALARM_S) for n in range(FALSE_ALARMS + 2)]
+    assert deaths == [1] * FALSE_ALARMS + [0, 0]
+    requests.begin(A, Item(b"x"), (0, 1), deadline=99.0, now=0.0)
+    requests.attempt(A, 1, 0.0)
+    requests.refused(A, 1, Refusal.CRASHED, 1.0)
+    assert requests.get(A).deaths == 1, "the other one is"
+    assert wolf(requests, 99, FALSE_ALARMS * ALARM_S + LATELY_S) == 1, "it may have been mended"
+
+
+def test_one_death_over_many_requests_is_one_alarm():
+    """All that a service had ends with it: that others answer most of it makes nobody a liar."""
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    assert [wolf(requests, n, 0.0) for n in range(100)] == [1] * 100
+
+
+def test_a_replica_whose_service_was_really_killed_is_believed_the_next_time():
+    """A request that kills, found out each time, among innocent ones that others answer."""
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    for n in range(3 * FALSE_ALARMS):
+        now = 2 * n * ALARM_S
+        requests.begin(A, Item(b"x"), (0, 1), deadline=9999.0, now=now)
+        requests.attempt(A, 0, now)
+        requests.refused(A, 0, Refusal.CRASHED, now)
+        assert wolf(requests, n, now) == 1
+        requests.give_up(A, now)

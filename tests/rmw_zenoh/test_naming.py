@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -86,13 +85,6 @@ def test_a_response_carries_the_request_s_number_and_client(
 @given(st.binary(max_size=80).filter(lambda raw: len(raw) not in (32, 33)))
 def test_an_attachment_of_another_form_goes_back_as_it_came(raw: bytes) -> None:
     assert naming.response_attachment(raw, 5) == raw
-
-
-@pytest.mark.parametrize(
-    ("payload", "is_one"), [(b"", False), (b"\0\1\0", False), (b"\0\1\0\0", True), (b"abcd", False)]
-)
-def test_a_message_begins_with_its_byte_order(payload: bytes, is_one: bool) -> None:
-    assert naming.is_message(payload) is is_one
 
 
 def test_hashes_of_one_kind_are_compared_and_others_are_not() -> None:

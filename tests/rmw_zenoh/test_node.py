@@ -5,18 +5,24 @@ What it promises as a node of ROS is tested with the others' (`tests/contract/te
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import struct
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
+from zenoh import handlers
 
-from fogft.errors import RosError
+from fogft.errors import RosError, Unreadable
+from fogft.model.type_definition import REQUEST, RESPONSE
 from fogft.rmw_zenoh import session as rmw_session
-from fogft.rmw_zenoh.naming import CLIENT, NO_HASH, SERVER, Token, request_attachment
+from fogft.rmw_zenoh.naming import CLIENT, NO_HASH, SERVER, Token, request_attachment, service_key
 from fogft.rmw_zenoh.node import RmwZenohNode
 from tests.needs import needs
 from tests.rmw_zenoh.rmw_router import Router
@@ -111,6 +117,105 @@ def test_a_response_carries_the_client_s_number_and_identifier(
     assert (number, size) == (42, 16)
     assert sent_ns > 1
     assert reply.ok.attachment.to_bytes()[17:] == GID
+
+
+def test_bytes_of_another_shape_go_to_nobody(
+    make: Callable[..., RmwZenohNode], peer: zenoh.Session, rmw_router: Router
+) -> None:
+    """They come from elsewhere, and may end the process of a node that reads them."""
+    faults = {REQUEST: "no request", RESPONSE: "no response"}
+    node = RmwZenohNode(
+        "fogft_q", 7, hash_of=lambda _: HASH, environ=rmw_router.environ,
+        fault_of=lambda type_name, part: lambda payload: faults[part] if payload == BODY else "",
+    )  # fmt: skip
+    with contextlib.closing(node):
+        with pytest.raises(Unreadable, match="no request"):
+            node.client("/arm/grasp", TYPE).call(BODY, lambda _: None)
+        held: list[Any] = []
+        server = node.serve("/arm/grasp", TYPE, lambda payload, handle: held.append(handle))
+        attachment = request_attachment(1, 1, GID)
+        peer.get(KEY, payload=BODY, attachment=attachment, timeout=LIMIT_S)
+        handle = wait_for(lambda: held, "the request")[0]
+        with pytest.raises(Unreadable, match="no response"):
+            server.respond(handle, BODY)
+        server.respond(handle, BODY + b"!")
+    with pytest.raises(Unreadable, match="without the header"):
+        make().client("/arm/grasp", TYPE).call(b"\0\1\0", lambda _: None)
+
+
+class PlainClient:
+    """A client of `rmw_zenoh` with its default queue of ten, and an executor that is slow.
+
+    In each turn the executor takes one answer and answers one request of its parameter service.
+    """
+
+    TYPES = "rcl_interfaces/srv/GetParameterTypes"
+
+    def __init__(self, session: zenoh.Session, *, answers_probes: bool) -> None:
+        self.lost = self.taken = 0
+        self._session = session
+        self._answers: deque[bytes] = deque(maxlen=10)
+        self._probes: deque[Any] = deque()
+        self._declared = [client_token(session, HASH)]
+        self._open = True
+        if answers_probes:
+            name = "/robot/get_parameter_types"
+            token = Token(7, str(session.zid()), "0", "2", SERVER, "robot", "/", name, self.TYPES)
+            said = str(dataclasses.replace(token, hash=HASH))
+            key = service_key(7, name, self.TYPES, HASH)
+            held = handlers.Callback(self._probes.append, indirect=False)
+            self._declared += [
+                session.declare_queryable(key, held, complete=True),
+                session.liveliness().declare_token(said),
+            ]
+        self._executor = threading.Thread(target=self._spin, daemon=True)
+        self._executor.start()
+
+    def _spin(self) -> None:
+        while self._open:
+            time.sleep(0.01)  # its callback
+            if self._answers:
+                self._answers.popleft()
+                self.taken += 1
+            if self._probes:
+                query = self._probes.popleft()
+                query.reply(query.key_expr, BODY, attachment=query.attachment)
+                query.drop()
+
+    def _answered(self, reply: Any) -> None:
+        self.lost += len(self._answers) == 10
+        self._answers.append(reply.ok.payload.to_bytes())
+
+    def call(self, number: int) -> None:
+        self._session.get(
+            KEY,
+            handlers.Callback(self._answered, indirect=False),
+            payload=BODY,
+            attachment=request_attachment(number, time.time_ns(), GID),
+            timeout=LIMIT_S,
+        )
+
+    def close(self) -> None:
+        self._open = False
+        self._executor.join()
+        for one in self._declared:
+            one.undeclare()
+
+
+def test_a_burst_of_a_plain_client_loses_no_answer(
+    make: Callable[..., RmwZenohNode], peer: zenoh.Session
+) -> None:
+    """Its executor takes one in 10 ms; what its queue has no room for waits here."""
+    client = PlainClient(peer, answers_probes=True)
+    with contextlib.closing(client):
+        node = make()
+        wait_for(lambda: node.services_of("robot", "/"), "the client's node")
+        echo(node)
+        wait_for(lambda: any("/SS/" in t and "grasp" in t for t in tokens(peer)), "the service")
+        for number in range(64):
+            client.call(number)
+        wait_for(lambda: client.taken + client.lost >= 64, "all answers")
+        assert (client.taken, client.lost) == (64, 0)
 
 
 def test_what_is_not_answered_ends_without_a_reply(

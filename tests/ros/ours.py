@@ -20,7 +20,7 @@ REQUEST = b"\x00\x01\x00\x00\x01"
 
 
 def serve(node) -> None:
-    from fogft.ros.types import default_response
+    from fogft.ros.messages import default_response
 
     response = default_response(TYPE)
     server = []

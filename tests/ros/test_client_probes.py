@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fogft.errors import RosError
-from fogft.ros.client_probes import KEPT, NodeProbes, ServiceProbes
+from fogft.ros.pacing.client_probes import KEPT, NodeProbes, ServiceProbes
 
 CLIENT = b"c" * 16
 

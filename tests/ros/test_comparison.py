@@ -85,7 +85,7 @@ def test_padding_does_not_count():
 
 
 def test_noise_is_no_response():
-    with pytest.raises(RosError, match="not a response"):
+    with pytest.raises(RosError, match="not a serialised"):
         Comparison(PLAN, {}).read(b"noise")
 
 

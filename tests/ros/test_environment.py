@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import pytest
 
 from fogft.ros import environment
+from tests.needs import needs
 
 
 def test_the_profile_is_chosen_where_nothing_is_set() -> None:
@@ -65,6 +66,7 @@ def test_the_profile_goes_to_the_variable_that_the_sourced_fast_dds_reads(
 
 
 @pytest.mark.ros
+@needs("fastdds")
 @pytest.mark.parametrize("prepared", [True, False])
 def test_a_node_maps_a_segment_as_large_as_its_profile_says(prepared: bool) -> None:
     """What is in force is seen in the memory of a process, whatever its variables say."""

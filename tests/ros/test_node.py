@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -31,6 +32,17 @@ def echo_pair(make_node: Callable[[int], Any], domain: int) -> tuple[Any, Any]:
     client = make_node(domain).client("/flag", SET_BOOL)
     wait_for(client.available, "discovery")
     return server, client
+
+
+def test_no_other_user_can_read_what_a_node_sends(
+    make_node: Callable[[int], Any], ros_domain: int
+) -> None:
+    """Fast DDS makes its segments readable by all; ports hold no message, and stay as they are."""
+    echo_pair(make_node, ros_domain)
+    maps = Path("/proc/self/maps").read_text()
+    segments = set(re.findall(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]{16}\b", maps))
+    assert segments
+    assert {Path(one).stat().st_mode & 0o777 for one in segments} == {0o600}
 
 
 def test_a_callback_that_raises_costs_only_its_own_message(

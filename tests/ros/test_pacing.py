@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import RosError
-from fogft.ros.pace import (
+from fogft.ros.pacing.pace import (
     EVERY_S,
     PROBED_WINDOW,
     QUEUE,
@@ -24,7 +24,7 @@ from fogft.ros.pace import (
     Pace,
     Probing,
 )
-from fogft.ros.pacing import Pacer
+from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import NotFoundYet
 from tests.nightly import by_day
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import pytest
 
+from fogft.ros.messages import default_response
 from fogft.ros.node import SerialisedNode
-from fogft.ros.types import default_response
 
 pytestmark = pytest.mark.ros
 

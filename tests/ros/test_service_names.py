@@ -10,7 +10,7 @@ from fogft.errors import SpecError
 from fogft.model import ros_names
 from fogft.poolfile import file
 from fogft.poolfile.pool import Checks
-from fogft.ros import types
+from fogft.ros import messages, types
 from tests.needs import need
 
 pytestmark = pytest.mark.ros
@@ -51,14 +51,14 @@ def test_the_longest_name_that_we_accept_is_accepted_by_ros():
 def fault(service):
     source = f"run: x\nfogft:\n  services: [{{name: a, {service}}}]\n"
     with pytest.raises(SpecError) as caught:
-        file.parse(source, "p.yaml", Checks(types.check_type, types.check_ok_field))
+        file.parse(source, "p.yaml", Checks(types.check_type, messages.check_ok_field))
     return caught.value.message, caught.value.hint
 
 
 def test_a_type_that_is_not_installed():
     assert fault("type: std_srvs/srv/SetBol") == (
         "p.yaml:3: fogft.services[0].type: package `std_srvs` has no service type `SetBol`",
-        "does the sourced workspace hold its newest build? Did you mean `std_srvs/srv/SetBool`?",
+        "is the sourced workspace's build up to date? Did you mean `std_srvs/srv/SetBool`?",
     )
 
 
@@ -71,4 +71,4 @@ def test_a_field_that_is_not_boolean():
 
 
 def test_a_boolean_field_and_its_type():
-    assert types.check_ok_field("std_srvs/srv/SetBool", "success") is None
+    assert messages.check_ok_field("std_srvs/srv/SetBool", "success") is None

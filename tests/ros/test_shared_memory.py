@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from fogft.ros import shared_memory
+from tests.needs import needs
 
 from .conftest import LIMIT_S, SET_BOOL, wait_for
 
@@ -220,6 +221,7 @@ time.sleep(600)
 
 
 @pytest.mark.ros
+@needs("fastdds")
 def test_a_live_node_survives_and_a_killed_one_is_swept(
     make_node: Callable[[int], Any], ros_domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

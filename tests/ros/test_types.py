@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from fogft.errors import RosError
 from fogft.model.type_definition import difference
 from fogft.proxy.replica.interruption import CANCEL_TYPE, EMPTY_REQUEST
-from fogft.ros import types
+from fogft.ros import messages, types
 from fogft.ros.types import definition
 
 from .conftest import SET_BOOL
@@ -31,11 +31,11 @@ pytestmark = pytest.mark.ros
         ("std_msgs/msg/String", "not the name", "write `package/srv/Type`"),
         ("../srv/Evil", "not the name", "write `package/srv/Type`"),
         ("", "not the name", "write `package/srv/Type`"),
-        ("my_msgs/srv/Detect", "no package `my_msgs`", "workspace sourced?"),
+        ("my_msgs/srv/Detect", "no package `my_msgs`", "source its workspace"),
         ("std_srv/srv/SetBool", "no package `std_srv`", "Did you mean `std_srvs/srv/SetBool`?"),
         ("std_srvs/srv/SetBoll", "no service type `SetBoll`", "`std_srvs/srv/SetBool`?"),
         ("nav_msgs/srv/SetBool", "no service type `SetBool`", "`std_srvs/srv/SetBool`?"),
-        ("json/srv/Dumps", "no package `json` with services", "installed"),
+        ("json/srv/Dumps", "no package `json` with services", "install"),
     ],
 )
 def test_a_wrong_type_says_what_is_wrong_and_what_to_do(name: str, message: str, hint: str) -> None:
@@ -106,7 +106,7 @@ def test_the_default_response_reads_back_as_the_default() -> None:
     from nav_msgs.srv import GetPlan
     from rclpy.serialization import deserialize_message
 
-    payload = types.default_response("nav_msgs/srv/GetPlan")
+    payload = messages.default_response("nav_msgs/srv/GetPlan")
     assert deserialize_message(payload, GetPlan.Response) == GetPlan.Response()
 
 
@@ -118,7 +118,7 @@ def test_a_boolean_at_a_fixed_place(success: bool, text: str) -> None:
     from std_srvs.srv import SetBool
 
     payload = bytes(serialize_message(SetBool.Response(success=success, message=text)))
-    assert types.bool_field(SET_BOOL, "success")(payload) is success
+    assert messages.bool_field(SET_BOOL, "success")(payload) is success
 
 
 @settings(max_examples=30, deadline=None)
@@ -129,33 +129,33 @@ def test_a_boolean_behind_numbers_and_text(success: bool, text: str) -> None:
     from test_msgs.srv import Arrays, BasicTypes
 
     basic = BasicTypes.Response(bool_value=success, uint64_value=7, string_value=text)
-    read = types.bool_field("test_msgs/srv/BasicTypes", "bool_value")
+    read = messages.bool_field("test_msgs/srv/BasicTypes", "bool_value")
     assert read(bytes(serialize_message(basic))) is success
     with pytest.raises(RosError, match="no boolean field"):
-        types.bool_field("test_msgs/srv/Arrays", "bool_values")
+        messages.bool_field("test_msgs/srv/Arrays", "bool_values")
     assert Arrays.Response().bool_values == [False] * 3
 
 
 @pytest.mark.parametrize("field", ["message", "nothing", "success.deep", ""])
 def test_a_field_that_is_no_boolean_is_an_error(field: str) -> None:
     with pytest.raises(RosError, match="no boolean field") as caught:
-        types.bool_field(SET_BOOL, field)
+        messages.bool_field(SET_BOOL, field)
     assert caught.value.hint == "its boolean fields: success"
 
 
 def test_offsets_follow_cdr_alignment() -> None:
     """Each number is aligned to its own size, counted from after the header."""
     fields = {"a": "uint8", "b": "double", "c": "boolean", "d": "uint16", "e": "boolean"}
-    assert types.fixed_offset(fields, "c") == 4 + 16
-    assert types.fixed_offset(fields, "e") == 4 + 20
-    assert types.fixed_offset({"t": "string", "b": "boolean"}, "b") is None
-    assert types.fixed_offset({"t": "uint8[3]", "b": "boolean"}, "b") is None
+    assert messages.fixed_offset(fields, "c") == 4 + 16
+    assert messages.fixed_offset(fields, "e") == 4 + 20
+    assert messages.fixed_offset({"t": "string", "b": "boolean"}, "b") is None
+    assert messages.fixed_offset({"t": "uint8[3]", "b": "boolean"}, "b") is None
 
 
 @pytest.mark.parametrize("payload", [b"", b"\x00\x01\x00\x00", b"\xff\xff\x00\x00\x01"])
 def test_reading_a_field_of_noise_is_an_error(payload: bytes) -> None:
-    with pytest.raises(RosError, match="not a response of `std_srvs/srv/SetBool`"):
-        types.bool_field(SET_BOOL, "success")(payload)
+    with pytest.raises(RosError, match="not a serialised SetBool_Response"):
+        messages.bool_field(SET_BOOL, "success")(payload)
 
 
 def test_the_request_of_a_cancel_service_is_what_ros_would_serialise():

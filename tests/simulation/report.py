@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +106,7 @@ def arithmetic_errors(*, quick: bool = False) -> Iterator[dict[str, Any]]:
                     "replicas": replicas,
                     "policy": policy.split(",", maxsplit=1)[0],
                     "independent": system_unavailability([one] * replicas),
-                    "simulated": estimate(down).to_json(),
+                    "simulated": asdict(estimate(down)),
                 }
         print(f"arithmetic checked: correlation {rho:g}", flush=True)
 
@@ -133,7 +133,8 @@ def page(found: dict[str, Report], errors: list[dict[str, Any]]) -> Iterator[str
         "[the design](../design/simulation.md).",
         "",
         "The pool is [pool.yaml](pool.yaml): two spot replicas of 16 cores, on-demand machines in",
-        "their place while no spot can be had. Prices are the local cloud's ten zones: made up, in",
+        "their place while no spot can be had. Prices are the local "
+        "cloud's ten zones: simulated, in",
         f"the proportions of real ones. Each market has {len(scenario.seeds)} seeds of "
         f"{scenario.days:g} days.",
         f"A boot takes {timing.boot_s:g} s, a notice comes {timing.notice_s:g} s ahead, a loss",

@@ -44,6 +44,18 @@ def test_a_made_up_market_is_as_its_model_says(asked):
     assert found.together == pytest.approx(asked.together, abs=0.03)
 
 
+def test_each_zone_can_have_its_own_times_and_is_fitted_back():
+    """From one hour to ten with room; correlated as before."""
+    zones = {place: (3600.0 * (1 + i), 1800.0 * (1 + i % 3)) for i, place in enumerate(LOCATIONS)}
+    lines = generate(MarketModel(), LOCATIONS, YEARS, random.Random(7), zones)
+    found = fitting.of_zones(lines)
+    for place, (mttf_s, mttr_s) in zones.items():
+        assert found[place][0] == pytest.approx(mttf_s, rel=0.1)
+        assert found[place][1] == pytest.approx(mttr_s, rel=0.1)
+    assert fitting.fit(lines).correlation_region > 0.2
+    assert fitting.of_zones({"c/r/z": of_samples([1, 1, 1], 60)}) == {}
+
+
 def test_the_same_seed_makes_the_same_market():
     one, two, other = (
         generate(MarketModel(), LOCATIONS, 86_400.0, random.Random(seed)) for seed in (1, 1, 2)

@@ -204,6 +204,7 @@ def test_policies_meet_the_same_markets_and_the_same_seeds_give_the_same_report(
         "SpotHedge",
         "naive",
         "round robin",
+        "omniscient",
     ]
     assert first != simulate(replace(wanted, seeds=(5, 6))).to_json()
 

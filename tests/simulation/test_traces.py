@@ -57,11 +57,25 @@ def write(folder, name, value=None):
 
 
 @pytest.mark.parametrize(
-    "name", ["local/us-west-2/a.json", "us-west-2a_v100_1.json", "us-west-2-a.json"]
+    "name",
+    [
+        "local/us-west-2/a.json",
+        "us-west-2a_v100_1.json",
+        "us-west-2-a.json",
+        "1-node/aws-02-15-2023/us-west-2a_v100_1.json",
+        "preemption/1-node/aws-04-22-2023/us-west-2a_v100_1.json",
+    ],
 )
 def test_a_file_s_name_tells_its_location(tmp_path, name):
     write(tmp_path, name)
     assert list(traces.located(traces.read(tmp_path), PLACES)) == ["local/us-west-2/a"]
+
+
+def test_traces_of_different_gaps_are_told(tmp_path):
+    write(tmp_path, "us-west-2a.json")
+    write(tmp_path, "us-west-2b.json", trace() | {"metadata": {"gap_seconds": 600}})
+    with pytest.raises(FogftError, match="gap_seconds is 600, but 300"):
+        traces.located(traces.read(tmp_path), PLACES)
 
 
 def test_a_region_that_does_not_exist_is_told(tmp_path):

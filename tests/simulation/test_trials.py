@@ -21,6 +21,13 @@ def test_with_a_notice_it_is_up_as_often_as_the_naive_policy_at_about_its_cost(m
     assert ours.usd_per_hour <= 1.08 * naive.usd_per_hour
 
 
+def test_where_zones_flap_it_is_up_far_more_often_than_the_naive_policy():
+    """A zone has room for twelve minutes, then none for eight."""
+    ours, naive = (run(Trial("flapping", policy, days=1)) for policy in ("fogft", "naive"))
+    assert ours.available >= 0.9998 > naive.available
+    assert ours.usd_per_hour <= 1.15 * naive.usd_per_hour
+
+
 def test_where_spot_machines_hardly_vanish_it_costs_no_more_than_them():
     outcome = run(Trial("rich", "fogft"))
     assert outcome.available == 1.0

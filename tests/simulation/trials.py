@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from fogft.model.choices import OnDemandSpec
 from fogft.model.replica import Offer, Placement
 from fogft.model.spec import PoolSpec, ServiceSpec
-from fogft.simulation.comparison import SETTLE_S, Scenario, policies, unlogged
+from fogft.simulation.comparison import BOUND, SETTLE_S, Scenario, bound, policies, unlogged
 from fogft.simulation.meter import DAY_S, Outcome
 from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.timeline import UNLIMITED, Timeline, of_changes
@@ -55,9 +55,9 @@ class Kind(NamedTuple):
 NINE = {"us-east-1": 3, "us-east-2": 3, "us-west-2": 3}
 FOUR = {"us-east-1": 2, "us-west-2": 2}
 KINDS = {
-    "nine": Kind(NINE, (0.9, 12), (0.5, 4)),
-    "scarce": Kind(FOUR, (0.7, 5), (0.7, 4)),
-    "cpu": Kind({"us-west-2": 3}, (0.8, 5.3), (0.33, 0.42), scarcity=3.0),
+    "nine": Kind(NINE, (0.7, 10.5), (0.4, 3), 0.1, 1.5),
+    "scarce": Kind(FOUR, (1, 8), (0.5, 3), 0.1, 2.0),
+    "cpu": Kind({"us-west-2": 3}, (1.2, 5.3), (0.33, 0.42), scarcity=1.5),
     "tight": Kind({"us-east-1": 1, "us-west-2": 1}, (1.5, 3), (2, 5)),
     "rich": Kind(FOUR, (60, 200), (0.5, 2), together=0.02, scarcity=2.0),
     "regions": Kind(NINE, (5, 20), (0.5, 2), together=0.02),
@@ -191,6 +191,10 @@ def run(trial: Trial) -> Outcome:
         days=trial.days,
         seeds=(trial.seed,),
     )
+    if trial.policy == BOUND:
+        found = bound(scenario, scenario.market(trial.seed))
+        assert found is not None
+        return found
     length_s = scenario.length_s
     world = World(
         scenario.market(trial.seed), seed=trial.seed, length_s=length_s, settle_s=SETTLE_S
@@ -203,7 +207,7 @@ def main() -> None:
     """Run what is asked for and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--markets", default=",".join(KINDS))
-    parser.add_argument("--policies", default="fogft;naive;SpotHedge")
+    parser.add_argument("--policies", default="fogft;naive;SpotHedge;omniscient")
     parser.add_argument("--replicas", type=int, default=2)
     parser.add_argument("--notice", default="0,120")
     parser.add_argument("--answer", type=float, default=28.0)

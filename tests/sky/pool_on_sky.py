@@ -38,7 +38,7 @@ class PoolOnSky:
         self.scene.sky.boots = True
         self.scene.sky.sold = [Offer(place, price, "catalogue") for place, price in PRICES.items()]
         task = {"run": "serve", "resources": {"infra": "aws"}}
-        self.spec = PoolSpec("perception", (SERVICE,), replicas, task=task, **spec)
+        self.spec = PoolSpec("perception", (SERVICE,), replicas=replicas, task=task, **spec)
         identity = Identity("perception", UID, "sky", "/pool.yaml", self.scene.now)
         self.store = MemoryStore(identity, self.spec)
         self.draining: set[ReplicaId] = set()

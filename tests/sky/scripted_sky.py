@@ -19,6 +19,7 @@ from fogft.cloud.sky.sdk import (
     JobState,
     RefusedError,
     Request,
+    Sale,
 )
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Offer, Placement, ReplicaId
@@ -48,6 +49,8 @@ class ScriptedProvider:
     terminated: list[str] = field(default_factory=list)
     prices: dict[tuple[str, str], float] = field(default_factory=dict)
     mighty: str = ""
+    ends_at: float | None = None
+    quotas: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def _meet(self) -> None:
         if not self.allowed:
@@ -71,6 +74,13 @@ class ScriptedProvider:
             self.terminated.append(instance.key)
             self.found.pop(instance.key, None)
 
+    def credentials_end_at(self) -> float | None:
+        return self.ends_at
+
+    def quota(self, region: str, code: str) -> float | None:
+        self._meet()
+        return self.quotas.get((region, code))
+
     def warning(self) -> str:
         return self.mighty
 
@@ -92,11 +102,16 @@ class ScriptedSky:
         self.down_lies = False  # "down" returns, and the machine runs on
         self.down_forgets = False  # "down" removes the record, and the machine runs on
         self.sold = [Offer(EAST, 0.02, "catalogue"), Offer(WEST, 0.03, "catalogue")]
+        self.asked_for: Mapping[str, Any] = {}
+        self.left_out: dict[str, str] = {}
+        self.vcpus: dict[str, float] = {}
+        self.quotas: dict[tuple[str, bool], str] = {}
         self.boots = boots  # whether a launch ends by itself when it is looked at
-        self.full: set[str] = set()  # locations without capacity, for launches that do
+        self.full: set[str] = set()  # locations and types without capacity, for such launches
         self.unreachable = False
         self.credentials = {"aws": "", "gcp": "run `gcloud auth login`"}
         self.uploaded: list[str] | None = []
+        self.server_told = ""
         self.mapped: dict[str, str] = {}  # cluster -> where its port is reached
         self.launched: list[_Launch] = []
         self.errors: dict[str, list[CloudError]] = {}
@@ -120,7 +135,7 @@ class ScriptedSky:
         for one in self.launched:
             if one.request.id == id:
                 if self.boots and one.request.active:
-                    if one.task["resources"]["infra"] in self.full:
+                    if one.task["resources"]["infra"] in self.full or not self._room(one.task):
                         self.fail(one.name, "ResourcesUnavailableError", "no spot capacity")
                     else:
                         self.finish(one.name)
@@ -174,13 +189,19 @@ class ScriptedSky:
         if not self.down_forgets:
             self.preempt(name)
 
-    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+    def offers(self, resources: Mapping[str, Any]) -> Sale:
         self._meet("offers", "")
-        return [o for o in self.sold if resources.get("region") in (None, o.placement.region)]
+        self.asked_for = resources
+        found = [o for o in self.sold if resources.get("region") in (None, o.placement.region)]
+        return Sale(found, self.left_out, self.vcpus, self.quotas)
 
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
         self._meet("check", "")
         return {c: self.credentials.get(c, "no such") for c in clouds or self.credentials}
+
+    def renew_server(self) -> str:
+        self._meet("renew_server", "")
+        return self.server_told
 
     def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:
         self._meet("uploaded_credentials", "")
@@ -202,7 +223,8 @@ class ScriptedSky:
         _, region, zone = resources["infra"].split("/")
         id = naming.replica_of(name)
         assert id is not None
-        place = Placement("aws", region, zone, resources["instance_type"], resources["use_spot"])
+        kind = (self._room(self.task(name)) or [""])[0]
+        place = Placement("aws", region, zone, kind, resources["use_spot"])
         number = next(self._counter)
         self.records[name] = Cluster(
             name,
@@ -216,6 +238,11 @@ class ScriptedSky:
         self.provider.found[f"i-{number}"] = Instance(
             id, f"i-{number}", place, resources["labels"], f"10.0.0.{number}", 1.0
         )
+
+    def queue(self, name: str, *, waits: bool = True) -> None:
+        """Let a launch wait for a worker, or be taken by one."""
+        one = self._of(name)
+        one.request = replace(one.request, queued=waits)
 
     def finish(self, name: str, job: JobState = JobState.RUNNING) -> None:
         """Let a launch succeed."""
@@ -249,6 +276,12 @@ class ScriptedSky:
 
     def _of(self, name: str) -> _Launch:
         return next(one for one in reversed(self.launched) if one.name == name)
+
+    def _room(self, task: Mapping[str, Any]) -> list[str]:
+        """Return the types that a task would take, and that are not full."""
+        resources = task["resources"]
+        kinds = [one["instance_type"] for one in resources.get("ordered", [resources])]
+        return [kind for kind in kinds if kind not in self.full]
 
     def _runs(self, name: str) -> bool:
         id = naming.replica_of(name)

@@ -190,6 +190,34 @@ def test_a_launch_that_hangs_is_aborted_and_taken_down(scene: Scene):
     assert not scene.provider.found
 
 
+def test_a_launch_that_queues_behind_others_has_its_whole_time_when_it_begins(scene: Scene):
+    """A local API server on two cores launches two at a time; a third may wait for minutes."""
+    scene.cloud.launch(scene.order())
+    scene.sky.queue(NAME)
+    for _ in range(2):
+        scene.work()
+        scene.pass_s(LAUNCH_LIMIT_S)
+    scene.cloud = scene.another_process()
+    assert scene.machine().failure is None
+    scene.sky.queue(NAME, waits=False)
+    scene.work()
+    scene.pass_s(LAUNCH_LIMIT_S - 60)
+    scene.work()
+    assert scene.machine().failure is None
+    scene.pass_s(100)
+    scene.work()
+    assert scene.machine().failure.words.startswith("still launching after 900 s")
+
+
+def test_one_that_no_worker_ever_takes_is_given_up(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.queue(NAME)
+    scene.work()
+    scene.pass_s(SETUP_LIMIT_S)
+    scene.work()
+    assert scene.machine().failure.words.startswith("still queued after 3600 s")
+
+
 def test_a_failed_setup_shows_the_end_of_its_log_and_ends_the_vm(scene: Scene):
     scene.cloud.launch(scene.order())
     scene.sky.job_logs[NAME] = "collecting\nERROR: no such package: yolo\n"
@@ -697,3 +725,40 @@ def test_a_cloud_that_opens_no_port_is_told_with_what_helps(scene: Scene):
         scene.cloud.launch(scene.order())
     assert "Opening ports is not supported" in caught.value.message
     assert "`fogft.dial_in`" in caught.value.hint
+
+
+def test_credentials_that_end_before_the_pool_are_told_and_counted_down(scene: Scene):
+    assert scene.cloud.credentials_end_at() is None
+    scene.cloud.offers({"infra": "aws"})
+    scene.provider.ends_at = scene.now + 2 * 3600
+    scene.pass_s(60)
+    assert scene.cloud.credentials_end_at() == scene.provider.ends_at
+    assert scene.cloud.hindrances(["aws"], scene.now + 3600) == []
+    for until in (None, scene.now + 9 * 3600):
+        [said] = scene.cloud.hindrances(["aws"], until)
+        assert said.startswith(
+            "the credentials of `aws` end in 2.0 h: from then on nothing is launched"
+        )
+    assert scene.cloud.hindrances(["gcp"], None) == []
+    scene.sky.server_told = (
+        "SkyPilot's API server is 0.14.0, and 0.14.1 is installed here: it is busy"
+    )
+    assert scene.cloud.hindrances(["gcp"], None) == [scene.sky.server_told]
+    scene.provider.ends_at += 3600  # renewed
+    assert scene.cloud.credentials_end_at() == scene.provider.ends_at - 3600
+    scene.pass_s(60)
+    assert scene.cloud.credentials_end_at() == scene.provider.ends_at
+
+
+def test_when_a_machine_ran_and_when_it_was_set_up_is_known_to_the_next_process(scene: Scene):
+    begun_at = scene.now
+    scene.cloud.launch(scene.order())
+    scene.pass_s(40)
+    scene.sky.finish(NAME, JobState.SETTING_UP)
+    scene.work(3)
+    scene.pass_s(100)
+    scene.sky.jobs[NAME] = JobState.RUNNING
+    scene.work()
+    machine = scene.machines(scene.another_process())[0]
+    assert 40 <= machine.running_at - begun_at < 45
+    assert 100 <= machine.set_up_at - machine.running_at < 115

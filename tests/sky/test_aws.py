@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator
+from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -176,3 +180,36 @@ def test_no_network_is_cannot_tell():
     aws.clients["us-east-1"] = Refusing(ConnectionError("no route"))
     with pytest.raises(CloudUnreachable):
         aws.instances(["us-east-1"])
+
+
+@needs("moto")
+@pytest.mark.parametrize("renews", [False, True])
+def test_a_login_that_ends_is_known_and_one_that_renews_itself_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renews: bool
+):
+    """`aws sso login` leaves a token and its end; login tools write it elsewhere."""
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_PROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    config = tmp_path / "config"
+    monkeypatch.setenv("AWS_CONFIG_FILE", str(config))
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+    assert Aws().credentials_end_at() is None
+    config.write_text(
+        "[default]\nsso_session = lab\nsso_account_id = 1\nsso_role_name = fogft\n"
+        "[sso-session lab]\nsso_start_url = https://lab.example.com\nsso_region = us-east-1\n"
+    )
+    name = hashlib.sha1(b"lab").hexdigest()
+    cache = tmp_path / ".aws/sso/cache" / f"{name}.json"
+    cache.parent.mkdir(parents=True)
+    token = {"accessToken": "x", "expiresAt": "2026-11-23T18:00:00Z"}
+    cache.write_text(json.dumps({**token, **({"refreshToken": "y"} if renews else {})}))
+    end = datetime(2026, 11, 23, 18, tzinfo=timezone.utc).timestamp()
+    assert Aws().credentials_end_at() == (None if renews else end)
+    monkeypatch.setenv("AWS_CREDENTIAL_EXPIRATION", "2026-11-23T17:30:00+00:00")
+    assert Aws().credentials_end_at() == end - 1800
+    cache.write_text("{")
+    config.write_text("[default]\nx_security_token_expires = 2026-11-23T17:00:00Z\n")
+    assert Aws().credentials_end_at() == end - 3600
+    config.write_text("[default\n")
+    assert Aws().credentials_end_at() is None

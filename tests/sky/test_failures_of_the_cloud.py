@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from fogft.cloud.sky import extras, task
 from fogft.cloud.sky.naming import cluster_name, infra
 from fogft.cloud.sky.presence import PROVIDER_SURE_AFTER_S
 from fogft.cloud.sky.sdk import JobState
 from fogft.errors import CloudUnreachable
 from fogft.model.intent import retry
-from fogft.model.replica import ReplicaId
+from fogft.model.replica import Offer, ReplicaId
 from fogft.planning.observed.backoff import LIMIT_S
 from fogft.planning.observed.history import EventKind
 from fogft.pool.manager import teardown
@@ -72,7 +74,7 @@ def test_no_capacity_goes_on_in_the_next_location_and_is_remembered(pool: PoolOn
     pool.sky.full = EVERYWHERE
     pool.sky.preempt(cluster_name(replica(0, 2)))
     pool.sky.records.clear()
-    pool.until(lambda: "every location rests" in pool.notes)
+    pool.until(lambda: "every location is backing off" in pool.notes)
     assert f"`{EAST.location}`: capacity" in pool.notes
     before = len(pool.ordered())
     pool.tick(30)
@@ -104,12 +106,27 @@ def test_credentials_that_expire_take_nothing_away(pool: PoolOnSky):
     )
     pool.sky.fail_next("clusters", expired, times=1000)
     pool.tick(100, seconds=60)
-    assert pool.notes.startswith("the cloud cannot be reached: nothing is changed")
+    assert pool.notes.startswith("the cloud cannot be reached: nothing is launched or ended")
     assert "ExpiredToken; renew the credentials of this cloud" in pool.notes
     assert (pool.ordered(), pool.store.published) == before
     pool.sky.errors.clear()
     pool.until(pool.ready)
     assert (pool.ordered(), pool.running()) == (before[0], ["0.1"])
+
+
+@pytest.mark.parametrize("minutes", [1, 10, 60])
+def test_an_api_server_that_hangs_or_answers_500_costs_no_replica(tmp_path: Path, minutes: int):
+    """Nothing is concluded, launched or ended; afterwards the same replicas are there."""
+    pool = PoolOnSky(tmp_path, replicas=2)
+    pool.until(lambda: len(pool.ready()) == 2)
+    before = pool.ordered(), pool.running(), pool.store.published
+    pool.sky.unreachable = True
+    pool.tick(60, seconds=minutes)
+    assert (pool.ordered(), pool.running(), pool.store.published) == before
+    assert "the cloud did not answer" in pool.notes
+    pool.sky.unreachable = False
+    pool.tick(30)
+    assert (pool.ordered(), pool.running(), len(pool.ready())) == (*before[:2], 2)
 
 
 def test_an_api_server_that_dies_in_mid_launch_costs_no_second_vm(by_hand: PoolOnSky):
@@ -266,7 +283,8 @@ def test_a_notice_is_answered_while_the_machine_still_runs(pool: PoolOnSky):
 
 def test_the_budget_counts_what_is_being_launched_and_is_never_exceeded(tmp_path: Path):
     """Two fit; a replacement waits for headroom, and says so."""
-    pool = PoolOnSky(tmp_path, replicas=2, max_usd_per_hour=0.055)
+    cap = 0.055 + 2 * extras.usd_per_hour(EAST, task.DISK_GB)
+    pool = PoolOnSky(tmp_path, replicas=2, max_usd_per_hour=cap)
     pool.sky.boots = False
     pool.tick(5)
     assert pool.ordered() == [infra(EAST), infra(WEST)]
@@ -281,14 +299,34 @@ def test_the_budget_counts_what_is_being_launched_and_is_never_exceeded(tmp_path
     pool.sky.records.pop(FIRST)
     pool.until(lambda: len(pool.ordered()) == 3)
     running = [i.labels["fogft-microusd"] for i in pool.scene.provider.found.values()]
-    assert sum(map(int, running)) <= 55_000
+    assert sum(map(int, running)) <= cap * 1e6
+
+
+def test_another_type_takes_the_place_of_one_without_capacity_where_the_cap_allows_it(
+    tmp_path: Path,
+):
+    """The place does not rest, and what the machine costs is what its own type costs."""
+    other = replace(EAST, instance="m5.large")
+    more = extras.usd_per_hour(EAST, task.DISK_GB)
+    for cap, came in ((None, "m5.large"), (0.06, "m5.large"), (0.04, "")):
+        pool = PoolOnSky(tmp_path / str(cap), max_usd_per_hour=cap)
+        pool.sky.sold = [Offer(EAST, 0.02, "catalogue"), Offer(other, 0.03, "catalogue")]
+        pool.sky.full = {"m6i.large"}
+        pool.tick(8)
+        if not came:
+            assert "capacity" in pool.said()
+            continue
+        assert pool.ready() == ["0.1"]
+        assert "capacity" not in pool.said()
+        [machine] = pool.scene.machines()
+        assert (machine.placement, machine.usd_per_hour) == (other, pytest.approx(0.03 + more))
 
 
 def test_hours_that_are_over_end_every_vm(pool: PoolOnSky):
     pool.until(pool.ready)
     pool.change(max_hours=1.0)
     pool.tick(70, seconds=60)
-    assert "`max_hours` is over" in pool.said()
+    assert "`max_hours` has passed" in pool.said()
     assert pool.running() == []
     assert pool.ordered() == [infra(EAST)]
 

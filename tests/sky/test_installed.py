@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,7 @@ import pytest
 
 from fogft.cloud.sky import answers, guard, settings, task
 from fogft.cloud.sky.installed import InstalledSky
-from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
+from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, Sale
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Placement
 from tests.needs import needs
@@ -58,7 +59,7 @@ def test_the_reasons_of_sky_check_are_found_in_its_text():
 
 def test_without_skypilot_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "sky", None)
-    with pytest.raises(Exception, match="not usable here") as caught:
+    with pytest.raises(Exception, match="cannot be used here") as caught:
         InstalledSky().request("r1")
     assert "fogft[cloud]" in caught.value.hint  # type: ignore[attr-defined]
 
@@ -387,17 +388,147 @@ def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: P
 def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, Any, Any]):
     """With no network the catalogue's zones have ids, not names: then the region is the offer."""
     installed, _, _ = real
-    offers = installed.offers({"infra": "aws/us-west-2", "cpus": "2", "use_spot": True})
-    assert {o.placement for o in offers} == {Placement("aws", "us-west-2", "", "m6i.large")}
-    assert offers[0].usd_per_hour == pytest.approx(0.026)
-    assert {offer.source for offer in offers} == {"catalogue"}
+
+    def sold(**resources: Any) -> Sale:
+        return installed.offers(task.as_launched(resources))
+
+    found = sold(infra="aws/us-west-2", cpus="2", use_spot=True)
+    kinds = ["m6i.large", "m5.large", "r5.large", "c5.large"]
+    assert [o.placement for o in found.offers] == [
+        Placement("aws", "us-west-2", "", kind) for kind in kinds[:3]
+    ], "no less memory than the one that SkyPilot chooses, none on Arm, none that is burstable"
+    assert found.offers[0].usd_per_hour == pytest.approx(0.026)
+    assert {offer.source for offer in found.offers} == {"catalogue"}
+    assert (found.vcpus["m6i.large"], found.quotas["m6i.large", True]) == (2, "L-34B43A08")
     catalogue = home / ".sky/catalogs/v8/aws/vms.csv"
-    assert {offer.as_of for offer in offers} == {catalogue.stat().st_mtime}
-    steady = installed.offers({"infra": "aws/us-west-2", "cpus": "4", "use_spot": False})
+    assert {offer.as_of for offer in found.offers} == {catalogue.stat().st_mtime}
+    steady = sold(infra="aws/us-west-2", cpus="4", use_spot=False).offers
     assert {(o.placement.instance, o.placement.spot) for o in steady} == {("m6i.xlarge", False)}
-    assert installed.offers({"infra": "aws", "cpus": "1000+"}) == []
+    nothing = sold(infra="aws", cpus="1000+")
+    assert (nothing.offers, nothing.left_out) == ([], {"aws": "it sells nothing that fits"})
     with pytest.raises(RefusedError, match="cpus"):
-        installed.offers({"infra": "aws", "cpus": "two"})
+        sold(infra="aws", cpus="two")
+
+
+@needs("skypilot")
+def test_a_cloud_that_refuses_the_launch_is_left_out_with_the_reason(
+    home: Path, real: tuple[InstalledSky, Any, Any]
+):
+    """Asked with ports, spot and autodown, as it will be launched; nobody's prices are needed."""
+    installed, _, _ = real
+    asked = task.as_launched({"infra": "hyperbolic", "use_spot": True})
+    assert installed.offers(asked).left_out == {
+        "hyperbolic": "a machine there cannot end itself; it opens no ports, which `fogft.dial_in` "
+        "does not need; it sells no spot machines"
+    }
+
+
+@needs("skypilot")
+def test_the_pages_table_of_clouds_is_what_skypilot_says(home: Path):
+    """Of the pool that is the default: spot machines, one port, and a machine that ends itself."""
+    import sky
+
+    from fogft.cloud.sky.catalogue import missing
+    from fogft.model.names import VM_CLOUDS
+
+    page = (Path(__file__).parents[2] / "docs/how-to/clouds.md").read_text()
+    for name in VM_CLOUDS:
+        cloud = sky.CLOUD_REGISTRY.from_str(name)
+        on = {"cloud": name, "use_spot": True}
+        (wanted,) = sky.Resources.from_yaml_config(task.as_launched(on))
+        steady = missing(cloud, wanted.copy(use_spot=False))
+        why = missing(cloud, wanted)
+        default = "no" if steady else "on demand only" if why else "yes"
+        assert f"| `{name}` | {default} | {why} |" in page
+
+
+@needs("skypilot")
+def test_a_task_with_several_types_is_one_that_skypilot_takes_in_this_order(
+    home: Path, tmp_path: Path
+):
+    import sky
+
+    others = [replace(EAST, instance=kind) for kind in ("m5.large", "r5.large")]
+    built = task.build(
+        Scene(tmp_path).order(), task.read(), files=tmp_path, wheel=tmp_path, owner="ann",
+        base=tmp_path, instead=others,
+    )  # fmt: skip
+    resources = sky.Task.from_yaml_config(built).resources
+    assert isinstance(resources, list), "in order"
+    assert [one.instance_type for one in resources] == ["m6i.large", "m5.large", "r5.large"]
+    for one in resources:
+        assert (one.region, one.zone, one.use_spot) == (EAST.region, EAST.zone, True)
+        assert (one.ports, one.disk_size, one.labels["fogft-slot"]) == (["7448"], 64, "0")
+
+
+@needs("skypilot")
+def test_skypilot_tries_the_next_type_where_one_has_no_capacity(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Its own optimizer, told what was refused; also after the way to the API server."""
+    import sky
+    from sky import optimizer
+
+    monkeypatch.setattr(
+        "sky.check.get_cached_enabled_clouds_or_refresh", lambda *_, **__: [sky.AWS()]
+    )
+    place = replace(EAST, zone="")
+    others = [replace(place, instance=kind) for kind in ("m5.large", "r5.large")]
+    built = task.build(
+        Scene(tmp_path).order(place=place), task.read(), files=tmp_path, wheel=tmp_path,
+        owner="ann", base=tmp_path, instead=others,
+    )  # fmt: skip
+    sent = sky.Task.from_yaml_config(sky.Task.from_yaml_config(built).to_yaml_config())
+    refused: list[Any] = []
+    came = []
+    for _ in range(3):
+        with sky.Dag() as dag:
+            dag.add(sent)
+        optimizer.Optimizer.optimize(dag, blocked_resources=refused, quiet=True)
+        best = sent.best_resources
+        came.append(best.instance_type)
+        assert (best.region, best.use_spot, best.autostop_config.down) == ("us-east-1", True, True)
+        refused.append(
+            sky.Resources(
+                cloud=sky.AWS(), instance_type=came[-1], region=best.region, use_spot=True
+            )
+        )
+        sent.best_resources = None
+    assert came == ["m6i.large", "m5.large", "r5.large"]
+
+
+@needs("skypilot")
+def test_an_api_server_of_another_skypilot_is_named_and_ended_only_when_idle(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """One elsewhere is left to its administrator."""
+    import sky
+    from sky.schemas.api.responses import APIHealthResponse
+
+    assert {"version"} <= set(APIHealthResponse.model_fields)
+    installed, sdk = InstalledSky(), mock.create_autospec(sky.client.sdk)
+    installed.modules = (sky, sdk)
+    local = mock.Mock(return_value=True)
+    monkeypatch.setattr("sky.server.common.is_api_server_local", local)
+    sdk.api_info.return_value = SimpleNamespace(version=sky.__version__)
+    assert installed.renew_server() == ""
+    sdk.api_info.return_value = SimpleNamespace(version="0.13.0")
+    sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="RUNNING")]
+    assert (
+        f"is 0.13.0, and {sky.__version__} is installed here: it is busy"
+        in installed.renew_server()
+    )
+    sdk.api_stop.assert_not_called()
+    sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="SUCCEEDED")]
+    assert installed.renew_server().endswith("it was idle, and is started anew")
+    sdk.api_stop.assert_called_once()
+    local.return_value = False
+    assert installed.renew_server().endswith("is installed here")
+    sdk.api_stop.assert_called_once()
+    sdk.api_info.side_effect = sky.exceptions.APIVersionMismatchError("too old")
+    with pytest.raises(CloudUnreachable, match="too old") as caught:
+        installed.renew_server()
+    assert "sky api stop" in caught.value.hint
 
 
 @needs("skypilot")

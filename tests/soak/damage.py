@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
 
+from tests.proxy.breaking import without_descriptors
 from tests.soak.schedule import Fault
 from tests.soak.world import REPLICAS, World
 
@@ -97,6 +99,31 @@ def _certificate_rotation(world: World, fault: Fault) -> Iterator[None]:
     yield
 
 
+@contextlib.contextmanager
+def _all_killed(world: World, fault: Fault) -> Iterator[None]:
+    for machine in world.machines:
+        machine.end()
+    yield
+    for slot in range(REPLICAS):
+        world.relaunch(slot)
+
+
+@contextlib.contextmanager
+def _suspend(world: World, fault: Fault) -> Iterator[None]:
+    """Stop everything, as a machine does that sleeps."""
+    for pid in world.pids():
+        os.kill(pid, signal.SIGSTOP)
+    yield
+    for pid in world.pids():
+        os.kill(pid, signal.SIGCONT)
+
+
+@contextlib.contextmanager
+def _no_descriptors(world: World, fault: Fault) -> Iterator[None]:
+    with without_descriptors(world.folder, world.pids()):
+        yield
+
+
 DAMAGES: dict[str, Damage] = {
     "kill": _kill,
     "freeze": _freeze,
@@ -108,6 +135,9 @@ DAMAGES: dict[str, Damage] = {
     "gateway death": _gateway_death,
     "uplink loss": _uplink_loss,
     "certificate rotation": _certificate_rotation,
+    "all killed": _all_killed,
+    "suspend": _suspend,
+    "no descriptors": _no_descriptors,
 }
 
 

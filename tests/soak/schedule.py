@@ -21,6 +21,9 @@ KINDS = (
     "gateway death",
     "uplink loss",
     "certificate rotation",
+    "all killed",
+    "suspend",
+    "no descriptors",
 )
 SHORTEST_S, LONGEST_S = 1.5, 4.0
 

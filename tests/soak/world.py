@@ -6,7 +6,7 @@
 ```
 
 Replicas are admitted by the membership file and found by their own records, as on clouds where
-nobody knows an address beforehand. No ROS: robots' callers and the service are stand-ins; all
+unknown an address beforehand. No ROS: robots' callers and the service are stand-ins; all
 else is the real thing.
 """
 
@@ -130,6 +130,13 @@ class World(GatewayPool):
         old, new = self.robots[name].files, self.authority.robot(name, self.generations[name])
         os.replace(new.key, old.key)
         os.replace(new.certificate, old.certificate)
+
+    def pids(self) -> list[int]:
+        """Return every process of it."""
+        processes = [p.process for p in (*self.gateways.values(), *self.robots.values())]
+        processes += [machine.process for machine in self.machines]
+        assert self.rendezvous.process is not None
+        return [process.pid for process in (*processes, self.rendezvous.process)]
 
     # -- what people would see ------------------------------------------------------------------
 

@@ -96,8 +96,8 @@ class LocalCloud:
             except OSError as error:
                 remove(folder.path)
                 raise CloudError(
-                    f"machine `{order.id.short}` cannot be started: {error}",
-                    "check free memory and the limit of processes (`ulimit -u`)",
+                    f"cannot start machine `{order.id.short}`: {error}",
+                    "check free memory and the process limit (`ulimit -u`)",
                 ) from error
         log.info("machine_launched replica=%s zone=%s", order.id.short, zone.location)
 
@@ -221,7 +221,7 @@ class LocalCloud:
         place = Placement("local", zone.region, zone.name, "")
         for location in wrong.out(time.time()):
             if place.within(location):
-                raise NoCapacity(f"no capacity in `{zone.location}`: `{location}` is out")
+                raise NoCapacity(f"no capacity in `{zone.location}`: outage in `{location}`")
         limits = {zone.location: zone.capacity}
         limits |= {where: n for where, n in wrong.capacity.items() if place.within(where)}
         taken = [placement for folder, placement in self.living() if folder.id != id]
@@ -255,6 +255,7 @@ def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machi
         progress=state.progress,
         setting_up=state.setting_up,
         set_up_at=state.set_up_at,
+        pool=order.pool,
     )
 
 

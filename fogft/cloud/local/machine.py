@@ -200,7 +200,7 @@ class Machine:
             *("--workdir", str(workdir)),
             *("--notice-file", str(folder / NOTICE)),
         ]
-        environ = {**os.environ, "ROS_DOMAIN_ID": str(domain.number)}
+        environ = task_commands.server_environment(self._record.order.task, domain.number)
         return self._spawn(task_commands.sourced(command, workdir), folder, environ)
 
     def _spawn(self, command: list[str], workdir: Path, environ: Mapping[str, str]) -> int:

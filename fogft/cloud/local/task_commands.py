@@ -20,11 +20,24 @@ def environment(task: Mapping[str, Any]) -> dict[str, str]:
     environ = child_environment(os.environ)
     if sys.prefix != sys.base_prefix:
         environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
-    for key in ("envs", "secrets"):
-        values = task.get(key)
-        if isinstance(values, Mapping):
-            environ |= {str(k): "" if v is None else str(v) for k, v in values.items()}
-    return environ
+    return environ | variables(task)
+
+
+def server_environment(task: Mapping[str, Any], domain: int) -> dict[str, str]:
+    """Return the environment of the server proxy: the task's variables hold for it, too.
+
+    So both ends on a machine have one `RMW_IMPLEMENTATION`, as on a VM.
+    """
+    given = variables(task)
+    if "PYTHONPATH" in given and "PYTHONPATH" in os.environ:  # where fogft itself may lie
+        given["PYTHONPATH"] += os.pathsep + os.environ["PYTHONPATH"]
+    return {**os.environ, **given, "ROS_DOMAIN_ID": str(domain)}
+
+
+def variables(task: Mapping[str, Any]) -> dict[str, str]:
+    """Return a task's own variables."""
+    found = {**(task.get("envs") or {}), **(task.get("secrets") or {})}
+    return {str(k): "" if v is None else str(v) for k, v in found.items()}
 
 
 def sourced(command: list[str], workdir: Path) -> list[str]:

@@ -7,6 +7,7 @@ Not here: each step's own module: `task`, `journal`, `following`, `ending`, `pre
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -35,6 +36,7 @@ from fogft.model.replica import Machine, Offer, ReplicaId
 log = logging.getLogger(__name__)
 
 _LOG_LINES = 1000
+_ENDS_FRESH_S = 60.0
 
 
 def _on_thread(run: Callable[[], None]) -> None:
@@ -77,11 +79,13 @@ class SkyCloud:
         self._lock = threading.Lock()
         self._followed: set[ReplicaId] = set()
         self._closed = threading.Event()
+        self._ends_asked_at = -math.inf
+        self._ends_at: float | None = None
 
     # -- the port -------------------------------------------------------------------------
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """See `Cloud`. Of each location the cheapest machine that SkyPilot would choose."""
+        """See `Cloud`. Of each location the cheapest machine; see `Prices.instead` for others."""
         refuse_what_cannot_be_honoured({"resources": resources})
         return self._prices.offers(resources)
 
@@ -96,6 +100,7 @@ class SkyCloud:
 
     def launch(self, order: Launch) -> None:
         """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
+        instead = self._prices.instead(order.placement, order.limit_usd_per_hour)
         made = task.build(
             order,
             task.read(),
@@ -103,10 +108,12 @@ class SkyCloud:
             wheel=self.make_wheel(self.folder / "wheels"),
             owner=self.owner,
             base=self.base,
+            instead=[offer.placement for offer in instead],
         )
         begun = Entry(
             *(order.id, order.placement, order.usd_per_hour, order.spec_hash, self.clock()),
             port=0 if order.dials_out else order.link_port,
+            instead={offer.placement.instance: offer.usd_per_hour for offer in instead},
         )
         if not self.journal.open(begun, order.files):
             return
@@ -161,6 +168,33 @@ class SkyCloud:
     def check_task(self, task: Mapping[str, Any]) -> None:
         """See `Accounts`."""
         refuse_what_cannot_be_honoured(task)
+
+    def credentials_end_at(self) -> float | None:
+        """See `Accounts`. What is known is looked at again after a minute."""
+        now = self.clock()
+        if not 0 <= now - self._ends_asked_at < _ENDS_FRESH_S:
+            self._ends_asked_at = now
+            used = [one for one in self.providers if one.cloud in self._prices.regions]
+            ends = [provider.credentials_end_at() for provider in used]
+            self._ends_at = min((at for at in ends if at is not None), default=None)
+        return self._ends_at
+
+    def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
+        """See `Accounts`. An API server of another SkyPilot is ended where it is idle."""
+        found = [self.sky.renew_server()]
+        for provider in self.providers:
+            at = provider.credentials_end_at() if provider.cloud in clouds else None
+            if at is not None and (until is None or at < until):
+                hours = max(0.0, at - self.clock()) / 3600
+                found.append(
+                    f"the credentials of `{provider.cloud}` end in {hours:.1f} h: from then on "
+                    "nothing is launched, replaced or ended until they are renewed"
+                )
+        return [one for one in found if one]
+
+    def left_out(self) -> Sequence[str]:
+        """See `Accounts`."""
+        return self._prices.left_out()
 
     def exposures(self, clouds: Sequence[str], *, open_port: int | None) -> Sequence[str]:
         """See `Accounts`."""

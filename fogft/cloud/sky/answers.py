@@ -36,6 +36,7 @@ JOBS = {
 
 
 ENDED = frozenset(("SUCCEEDED", "FAILED", "CANCELLED"))
+_QUEUED = frozenset(("PENDING", "WAITING"))
 _SAID_BY_SERVER = ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
                    "InvalidCloudCredentials")  # fmt: skip
 
@@ -80,6 +81,8 @@ def _texts(error: BaseException) -> list[str]:
 def _hint(kind: str) -> str:
     if kind in ("CloudUserIdentityError", "InvalidCloudCredentials", "NoCloudAccessError"):
         return "renew the credentials of this cloud; `sky check` tests them"
+    if kind == "APIVersionMismatchError":
+        return "the API server is of another SkyPilot: `sky api stop` ends it once it is idle"
     return "`sky api info` and `sky check` tell what is wrong"
 
 
@@ -109,7 +112,9 @@ def cluster_of(record: Any) -> Cluster:
 
 def request_of(payload: Any) -> Request:
     """Return a `RequestPayload` of SkyPilot's as our record."""
-    return Request(payload.request_id, active=payload.status not in ENDED)
+    return Request(
+        payload.request_id, active=payload.status not in ENDED, queued=payload.status in _QUEUED
+    )
 
 
 def told_reasons(output: str) -> dict[str, str]:

@@ -6,13 +6,18 @@ ours. Credentials and regions come from the same places as SkyPilot's.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import functools
+import hashlib
 import importlib
 import itertools
+import json
+import os
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, TypeVar
 
 from fogft.cloud.sky import naming
@@ -28,7 +33,10 @@ _ALIVE = ["pending", "running", "stopping", "stopped"]  # a stopped one's disk s
 _FORBIDDEN = ("UnauthorizedOperation", "AccessDenied", "AccessDeniedException")
 _HOME = "us-east-1"  # any region lists the others
 _ROLE_OF = "the role of VMs"  # IAM's place among the regions: it has none
+_QUOTAS_OF = "the quotas of"
 ROLE = "skypilot-v1"
+_ENDS_IN_ENVIRONMENT = ("AWS_CREDENTIAL_EXPIRATION", "AWS_SESSION_EXPIRATION")
+_ENDS_IN_PROFILE = ("aws_expiration", "expiration", "x_security_token_expires")  # of login tools
 _MIGHTY = ("AdministratorAccess", "PowerUserAccess")
 
 
@@ -69,6 +77,39 @@ class Aws:
         """See `Provider`."""
         for instance in instances:  # one by one: a single unknown key fails a whole call
             self._ask(instance.placement.region, functools.partial(_terminate, instance.key))
+
+    def credentials_end_at(self) -> float | None:
+        """See `Provider`. Of a login by `aws sso login`, or of what says when it ends.
+
+        A login that renews itself has no end that is known.
+        """
+        try:
+            session = importlib.import_module("botocore.session").Session()
+            told = dict(session.get_scoped_config())
+        except Exception:  # not installed, or a profile that is not there: the check of it tells
+            return None
+        found = [os.environ.get(name, "") for name in _ENDS_IN_ENVIRONMENT]
+        found += [str(told.get(name, "")) for name in _ENDS_IN_PROFILE]
+        login = told.get("sso_session") or told.get("sso_start_url")
+        if login and "AWS_ACCESS_KEY_ID" not in os.environ:
+            name = hashlib.sha1(str(login).encode(), usedforsecurity=False).hexdigest()
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                cache = Path("~/.aws/sso/cache").expanduser() / f"{name}.json"
+                token = json.loads(cache.read_text())
+                found.append("" if token.get("refreshToken") else str(token.get("expiresAt", "")))
+        return min((at for at in map(_moment, found) if at), default=None)
+
+    def quota(self, region: str, code: str) -> float | None:
+        """See `Provider`. By the code of AWS's Service Quotas."""
+
+        def value(quotas: Any) -> float | None:
+            try:
+                found = quotas.get_service_quota(ServiceCode="ec2", QuotaCode=code)
+            except quotas.exceptions.NoSuchResourceException:
+                return None
+            return float(found["Quota"]["Value"])
+
+        return self._ask(f"{_QUOTAS_OF} {region}", value)
 
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         """See `Provider`."""
@@ -131,14 +172,14 @@ class Aws:
         if names is None:
             return (
                 f"AWS has no role `{ROLE}`: at the first launch SkyPilot makes one for every VM, "
-                "with full access to EC2 and S3. Make the one of docs/clouds.md before"
+                "with full access to EC2 and S3. Make the one of docs/how-to/clouds.md before"
             )
         mighty = [f"`{n}`" for n in names if n.endswith("FullAccess") or n in _MIGHTY]
         if not mighty:
             return ""
         return (
             f"AWS's role `{ROLE}`, which every VM has and your `run` can use, has "
-            f"{', '.join(mighty)}: give it what docs/clouds.md lists, and nothing else"
+            f"{', '.join(mighty)}: give it what docs/how-to/clouds.md lists, and nothing else"
         )
 
     def _client(self, region: str) -> Any:
@@ -150,9 +191,13 @@ class Aws:
                 config = importlib.import_module("botocore.config").Config(
                     connect_timeout=5, read_timeout=10, retries=retries
                 )
-                service = "iam" if region == _ROLE_OF else "ec2"
+                service, where = "ec2", region
+                if region == _ROLE_OF:
+                    service, where = "iam", _HOME
+                elif region.startswith(_QUOTAS_OF):
+                    service, where = "service-quotas", region.rsplit(maxsplit=1)[-1]
                 self.clients[region] = self._session.client(
-                    service, region_name=_HOME if service == "iam" else region, config=config
+                    service, region_name=where, config=config
                 )
             return self.clients[region]
 
@@ -173,6 +218,15 @@ class Aws:
                     self.clients.clear()
                 hint = "renew the AWS credentials; `sky check aws` tests them"
             raise CloudUnreachable(f"AWS cannot tell about `{region}`: {error}", hint) from error
+
+
+def _moment(text: str) -> float:
+    """Return a time of AWS's in seconds since the epoch; 0 for what is none."""
+    try:
+        read = datetime.datetime.fromisoformat(text.replace("UTC", "+00:00").replace("Z", "+00:00"))
+    except ValueError:
+        return 0.0
+    return (read if read.tzinfo else read.replace(tzinfo=datetime.timezone.utc)).timestamp()
 
 
 def _terminate(key: str, ec2: Any) -> None:

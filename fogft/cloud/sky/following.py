@@ -37,7 +37,7 @@ ended, and the pause grows with the time that an answer takes."""
 ASK_LIMIT_S = 180.0
 """Until SkyPilot has accepted the order; then it is known that it never will."""
 LAUNCH_LIMIT_S = 900.0
-"""From the order to the running machine; `SETUP_LIMIT_S` is from the order to the running job."""
+"""From when SkyPilot began to the running machine; `SETUP_LIMIT_S`: from the order to the job."""
 
 
 @dataclass
@@ -62,10 +62,7 @@ class Following:
         entry = self.journal.get(id)
         if entry is None or entry.stage not in UNDER_WAY:
             return False
-        if self._age(entry) > SETUP_LIMIT_S:
-            doing = "setting up" if entry.stage is Stage.SETTING_UP else "launching"
-            self._fail(entry, self._hung(entry, SETUP_LIMIT_S, doing))
-        elif entry.stage is Stage.ASKING:
+        if entry.stage is Stage.ASKING:
             self._asking(entry)
         elif entry.stage is Stage.LAUNCHING:
             self._launching(entry)
@@ -85,8 +82,13 @@ class Following:
         request = self.sky.request(entry.request)
         if request is None:
             self._lost(entry)
+        elif request.queued:  # behind others, which takes them no time limit of its own
+            if self._age(entry) > SETUP_LIMIT_S:
+                self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "queued"))
         elif request.active:
-            if self._age(entry) > LAUNCH_LIMIT_S:
+            if not entry.begun_at:
+                self._move(entry, begun_at=self.clock())
+            elif self.clock() - entry.begun_at > LAUNCH_LIMIT_S:
                 self._fail(entry, self._hung(entry, LAUNCH_LIMIT_S, "launching"))
         else:
             try:
@@ -94,7 +96,7 @@ class Following:
             except RefusedError as error:
                 self._fail(entry, self._refused(entry, error))
             else:
-                self._move(entry, stage=Stage.SETTING_UP, job=job)
+                self._move(entry, stage=Stage.SETTING_UP, job=job, running_at=self.clock())
                 self._find_endpoint(entry)
 
     def _find_endpoint(self, entry: Entry) -> None:
@@ -112,7 +114,7 @@ class Following:
         """SkyPilot lost the request (its database, or a server that was put in place of it)."""
         clusters = self.sky.clusters(cluster_name(entry.id), refresh=True)
         if any(c.state is ClusterState.UP for c in clusters):
-            self._move(entry, stage=Stage.SETTING_UP)
+            self._move(entry, stage=Stage.SETTING_UP, running_at=self.clock())
         else:
             self._fail(entry, Reason(Cause.ERROR, words="SkyPilot lost this launch"))
 
@@ -125,7 +127,7 @@ class Following:
             job = self.sky.job(cluster_name(entry.id), entry.job)
         except RefusedError as error:  # the cluster is gone, or not up: its absence will tell
             log.info("job_unknown replica=%s reason=%r", entry.id.short, str(error))
-            return
+            job = JobState.PENDING
         finally:
             now = self.clock()
             pause_s = max(JOB_PAUSE_S, 3 * (now - asked_at))
@@ -139,6 +141,8 @@ class Following:
         elif job is JobState.ENDED:
             words = "`fogft serve` ended on the machine" + self._job_tail(entry)
             self._fail(entry, Reason(Cause.ERROR, words=words))
+        elif self._age(entry) > SETUP_LIMIT_S:  # it was asked: who hears nothing concludes nothing
+            self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "setting up"))
 
     # -- failures ---------------------------------------------------------------------------
 

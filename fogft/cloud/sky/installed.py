@@ -11,18 +11,16 @@ import copy
 import functools
 import importlib
 import io
-import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
+from fogft.cloud.sky import catalogue
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
 from fogft.cloud.sky.calls import Calls
-from fogft.cloud.sky.sdk import Cluster, JobState, RefusedError, Request
+from fogft.cloud.sky.sdk import Cluster, JobState, RefusedError, Request, Sale
 from fogft.cloud.sky.settings import Settings, report_nothing
 from fogft.errors import CloudError
-from fogft.model.replica import Offer, Placement
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,8 +30,6 @@ CHECK_LIMIT_S = 300.0  # asks every cloud, and may start the API server: minutes
 JOB_LIMIT_S = 120.0  # starts a Python on the machine, over ssh
 LAUNCH_LIMIT_S = 120.0  # uploads `workdir` and `file_mounts`, and may start the API server
 DOWN_LIMIT_S = 300.0
-
-_ZONE_ID = re.compile(r"[a-z]{2,5}\d-[a-z]{2,4}\d")  # `use1-az1`: a zone whose name is not known
 
 
 def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
@@ -166,23 +162,15 @@ class InstalledSky:
                 raise
 
     @_limited(REFRESH_LIMIT_S, "the catalogue of prices")
-    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """List what the catalogue sells for a `resources` section, cheapest first."""
+    def offers(self, resources: Mapping[str, Any]) -> Sale:
+        """Return what the catalogue sells for a `resources` section as it will be launched."""
         sky, sdk = self._sky()
-        found: dict[Placement, float] = {}
         with as_answer():
             asked = sky.Resources.from_yaml_config(copy.deepcopy(dict(resources)))
-        for one in asked:
-            clouds = [one.cloud]
-            if one.cloud is None:
-                enabled = sdk.get(sdk.enabled_clouds())
-                clouds = [sky.CLOUD_REGISTRY.from_str(name) for name in enabled]
-            for cloud in clouds:
-                for place, price in _sold_by(cloud, one.copy(cloud=cloud)):
-                    found[place] = min(found.get(place, price), price)
-        fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in found}}
-        offers = [Offer(p, price, "catalogue", fetched[p.cloud]) for p, price in found.items()]
-        return sorted(offers, key=lambda o: (o.usd_per_hour, o.placement))
+        if any(one.cloud is None for one in asked):
+            enabled = sdk.get(sdk.enabled_clouds())
+            return catalogue.sale(asked, [sky.CLOUD_REGISTRY.from_str(name) for name in enabled])
+        return catalogue.sale(asked, ())
 
     @_limited(CHECK_LIMIT_S, "the check of credentials")
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
@@ -203,6 +191,29 @@ class InstalledSky:
             cloud: "" if cloud in usable else reasons.get(cloud, "SkyPilot may not use it")
             for cloud in sorted(asked)
         }
+
+    @_limited(ASK_LIMIT_S, "the version of the API server")
+    def renew_server(self) -> str:
+        """End a local API server of another SkyPilot if it is idle; return what to say of it.
+
+        The next call starts one of the installed SkyPilot.
+        """
+        sky, sdk = self._sky()
+        try:
+            found = str(getattr(sdk.api_info(), "version", None) or sky.__version__)
+        except Exception as error:
+            if type(error).__name__ in ("ApiServerConnectionError", "RuntimeError"):
+                return ""  # there is none: it will be of this version
+            raise
+        if found == sky.__version__:
+            return ""
+        both = f"SkyPilot's API server is {found}, and {sky.__version__} is installed here"
+        if not importlib.import_module("sky.server.common").is_api_server_local():
+            return both
+        if any(request_of(one).active for one in sdk.api_status()):
+            return f"{both}: it is busy; `sky api stop` when it is not, and the next one is new"
+        sdk.api_stop()
+        return f"{both}: it was idle, and is started anew"
 
     @_limited(REFRESH_LIMIT_S, "the credentials that a VM would get")
     def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:
@@ -230,7 +241,7 @@ class InstalledSky:
                     )
                 except ImportError as error:
                     raise CloudError(
-                        f"SkyPilot is not usable here: {error}",
+                        f"SkyPilot cannot be used here: {error}",
                         "`pip install 'fogft[cloud]'`, or run with `--cloud local`",
                     ) from error
             return self.modules
@@ -243,30 +254,3 @@ def _asked(sdk: Any, **filters: Any) -> list[Any]:
     except Exception:
         sdk.status(["fogft-is-the-server-there"])  # starts a local one; says what ails a remote one
     return list(sdk.api_status(**filters))
-
-
-def _sold_by(cloud: Any, resources: Any) -> Iterator[tuple[Placement, float]]:
-    for launchable in cloud.get_feasible_launchable_resources(
-        resources, num_nodes=1
-    ).resources_list:
-        instance = launchable.instance_type
-        if launchable.accelerators and str(cloud).lower() == "gcp":
-            name, count = next(iter(launchable.accelerators.items()))
-            instance = f"{instance}+{name}:{count}"  # there the type does not imply them
-        for region in launchable.get_valid_regions_for_launchable():
-            zones = [zone.name for zone in region.zones or ()]
-            for zone in zones or [None]:
-                named = None if zone is None or _ZONE_ID.fullmatch(zone) else zone
-                place = Placement(
-                    str(cloud).lower(), region.name, named or "", instance, launchable.use_spot
-                )
-                yield place, float(launchable.copy(region=region.name, zone=zone).get_cost(3600))
-
-
-def _fetched_at(cloud: str) -> float:
-    """Return when SkyPilot last fetched a cloud's catalogue: seconds since the epoch, 0 unknown."""
-    try:
-        common = importlib.import_module("sky.catalog.common")
-        return Path(common.get_catalog_path(f"{cloud}/vms.csv")).stat().st_mtime
-    except (ImportError, AttributeError, OSError):
-        return 0.0

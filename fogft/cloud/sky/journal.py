@@ -15,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -57,9 +57,13 @@ class Entry:
     request: str = ""  # SkyPilot's id of the launch request; empty until it is known
     # SkyPilot's number of the job that runs the server proxy; None until known
     job: int | None = None
+    begun_at: float = 0.0  # when a worker of SkyPilot's had begun; 0 while it is queued
     failure: Reason | None = None  # as in `Machine.failure`
+    running_at: float = 0.0  # when SkyPilot said that the machine runs
     set_up_at: float = 0.0  # when the job was seen to run
     port: int = LINK_PORT  # the link's; 0 where the replica dials out
+    # Types that may have come in place of the one ordered, and their prices (USD per hour).
+    instead: Mapping[str, float] = field(default_factory=dict)
     endpoint: str = ""  # `host:port`, on a cloud that maps ports; empty until it is known
 
 

@@ -6,6 +6,8 @@ failed; the provider is heard where SkyPilot is silent.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.journal import Entry, Stage
 from fogft.cloud.sky.provider import Instance
@@ -34,7 +36,7 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         progress = cluster.progress or progress
     placement = entry.placement
     if cluster is not None and cluster.placement is not None:
-        placement = _with_zone(placement, cluster.placement)
+        placement = _as_found(entry, cluster.placement)
     ip = (cluster.head_ip if cluster else "") or (instance.public_ip if instance else "")
     return Machine(
         id=entry.id,
@@ -42,12 +44,14 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         phase=phase,
         launched_at=entry.launched_at,
         endpoint=_endpoint(entry, ip) if phase is not MachinePhase.FAILED else None,
-        usd_per_hour=entry.usd_per_hour,
+        usd_per_hour=entry.instead.get(placement.instance, entry.usd_per_hour),
         spec_hash=entry.spec_hash,
         failure=failure,
         progress=progress,
         setting_up=phase is MachinePhase.RUNNING and entry.stage is Stage.SETTING_UP,
+        running_at=entry.running_at,
         set_up_at=entry.set_up_at,
+        pool=cluster.labels.get(naming.NAME, "") if cluster else "",
     )
 
 
@@ -74,6 +78,7 @@ def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
         spec_hash=cluster.labels.get(naming.SPEC, ""),
         failure=failure,
         progress=cluster.progress if phase is MachinePhase.PROVISIONING else "",
+        pool=cluster.labels.get(naming.NAME, ""),
     )
 
 
@@ -87,6 +92,7 @@ def of_instance(instance: Instance) -> Machine:
         usd_per_hour=naming.usd_per_hour(instance.labels),
         spec_hash=instance.labels.get(naming.SPEC, ""),
         failure=_error(f"SkyPilot does not know {instance.placement.cloud} `{instance.key}`"),
+        pool=instance.labels.get(naming.NAME, ""),
     )
 
 
@@ -100,8 +106,10 @@ def _error(words: str) -> Reason:
     return Reason(Cause.ERROR, words=words)
 
 
-def _with_zone(asked: Placement, found: Placement) -> Placement:
-    """Keep what was ordered, but for a zone that the cloud has chosen."""
-    if asked.zone or (asked.cloud, asked.region) != (found.cloud, found.region):
+def _as_found(entry: Entry, found: Placement) -> Placement:
+    """Keep what was ordered, but for a zone that the cloud has chosen, and a type in its place."""
+    asked = entry.placement
+    if (asked.cloud, asked.region) != (found.cloud, found.region):
         return asked
-    return Placement(asked.cloud, asked.region, found.zone, asked.instance, asked.spot)
+    instance = found.instance if found.instance in entry.instead else asked.instance
+    return replace(asked, zone=asked.zone or found.zone, instance=instance)

@@ -21,6 +21,7 @@ OWNER = "fogft-owner"
 SPEC = "fogft-spec"
 PRICE = "fogft-microusd"
 PORT = "fogft-port"
+NAME = "fogft-name"
 MAPPING_CLOUDS = frozenset({"runpod", "vast", "yotta"})
 """Clouds whose machines are reached at another address and port than their own."""
 
@@ -64,7 +65,7 @@ def labels(
         SPEC: label_value(spec_hash),
         PRICE: str(round(usd_per_hour * 1e6)),
         PORT: str(port),
-        "fogft-name": label_value(pool),
+        NAME: label_value(pool),
     }
 
 

@@ -1,4 +1,4 @@
-"""What can be bought, and for how much: SkyPilot's catalogue, and live spot prices.
+"""What can be bought, and for how much: SkyPilot's catalogue, live spot prices, disks, quotas.
 
 The catalogue is a file that SkyPilot renews every few hours; spot prices move meanwhile. So an
 offer says where its price comes from and how old it is. Prices are kept for a while: the
@@ -18,11 +18,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
+from fogft.cloud.sky import extras
+from fogft.cloud.sky.catalogue import best
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.provider import NotAllowedError, Provider
-from fogft.cloud.sky.sdk import RefusedError
+from fogft.cloud.sky.sdk import RefusedError, Sale
+from fogft.cloud.sky.task import DISK_GB, alternative, as_launched
 from fogft.errors import CloudUnreachable, SpecError
-from fogft.model.replica import Offer
+from fogft.model.replica import Offer, Placement
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +46,9 @@ class Prices:
         self._lock = threading.Lock()
         self._kept: dict[str, tuple[float, tuple[Offer, ...]]] = {}
         self._renewing: set[str] = set()
+        self._instead: dict[Placement, Sequence[Offer]] = {}
+        self._left_out: dict[str, dict[str, None]] = {}  # by what was asked: sentences
+        self._quotas: dict[tuple[str, str], tuple[float, float | None]] = {}
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """See `fogft.cloud.port.Cloud.offers`. The first call takes seconds, later ones none.
@@ -58,6 +64,21 @@ class Prices:
         if age_s > FRESH_S:
             self._renew_later(key, resources)
         return offers
+
+    def instead(self, placement: Placement, limit: float | None) -> Sequence[Offer]:
+        """Return what else would do in the place of an offer, the cheapest first.
+
+        Args:
+            limit: US dollars per hour that one may cost; None for no limit.
+        """
+        with self._lock:
+            found = self._instead.get(placement, ())
+        return [offer for offer in found if limit is None or offer.usd_per_hour <= limit]
+
+    def left_out(self) -> Sequence[str]:
+        """Return, in sentences, what is not offered because it could not be launched."""
+        with self._lock:
+            return sorted({said for one in self._left_out.values() for said in one})
 
     @property
     def regions(self) -> Mapping[str, set[str]]:
@@ -88,20 +109,66 @@ class Prices:
 
     def _renewed(self, key: str, resources: Mapping[str, Any]) -> tuple[Offer, ...]:
         try:
-            listed = self.sky.offers(resources)
+            sale = self.sky.offers(as_launched(resources))
         except RefusedError as error:
             what = f"resources: SkyPilot refuses this section: {error.reason.words}"
             raise SpecError(what) from error
-        if not listed:
+        left_out = {f"`{name}` is left out: {why}": None for name, why in sale.left_out.items()}
+        within = self._within_quotas(sale, left_out)
+        if not within:
+            told = f" ({'; '.join(left_out)})" if left_out else ""
             raise SpecError(
-                "resources: no cloud that can be used here sells this",
-                "ask for less, or name more clouds and regions; `sky check` lists the clouds "
-                "that this account may use",
+                f"resources: no cloud you can use offers this{told}",
+                "relax the resources or name more clouds and regions; `sky check` lists the clouds "
+                "you can use",
             )
-        offers = tuple(sorted(self._priced(listed), key=lambda o: (o.usd_per_hour, o.placement)))
+        firsts, instead = best([_with_extras(o, resources) for o in self._priced(within)])
+        offers = tuple(firsts)
         with self._lock:
             self._kept[key] = self.clock(), offers
+            self._instead |= instead
+            self._left_out[key] = left_out
         return offers
+
+    def _within_quotas(self, sale: Sale, left_out: dict[str, None]) -> Sequence[Offer]:
+        """Return the offers that the account's quotas have room for, were nothing else running."""
+
+        def asked(offer: Offer) -> tuple[str, str, str]:
+            place = offer.placement
+            return place.cloud, place.region, sale.quotas.get((place.instance, place.spot), "")
+
+        wanted = {asked(o) for o in sale.offers if o.placement.cloud in self.providers}
+        wanted = {one for one in wanted if one[2]}
+        if not wanted:
+            return sale.offers
+        with ThreadPoolExecutor(min(8, len(wanted)), "quotas") as pool:
+            limits = dict(zip(wanted, pool.map(self._quota, wanted), strict=True))
+        kept = []
+        for offer in sale.offers:
+            limit, place = limits.get(asked(offer)), offer.placement
+            if limit is None or limit >= sale.vcpus.get(place.instance, 0.0):
+                kept.append(offer)
+                continue
+            kind = "spot" if place.spot else "on demand"
+            where = f"{place.cloud}/{place.region}"
+            left_out[
+                f"`{place.instance}` {kind} in `{where}` is left out: the quota {asked(offer)[2]} "
+                f"allows {limit:g} vCPUs, and it has {sale.vcpus[place.instance]:g}; ask for more"
+            ] = None
+        return kept
+
+    def _quota(self, wanted: tuple[str, str, str]) -> float | None:
+        cloud, region, code = wanted
+        key = f"{cloud}/{region}", code
+        at, value = self._quotas.get(key, (-math.inf, None))
+        if self.clock() - at > USABLE_S:
+            try:
+                value = self.providers[cloud].quota(region, code)
+            except (NotAllowedError, CloudUnreachable) as error:
+                log.info("quota_unknown region=%s/%s reason=%r", cloud, region, str(error))
+                value = None
+            self._quotas[key] = self.clock(), value
+        return value
 
     def _priced(self, listed: Sequence[Offer]) -> Sequence[Offer]:
         wanted: dict[tuple[str, str], set[str]] = {}
@@ -137,3 +204,9 @@ class Prices:
         except (NotAllowedError, CloudUnreachable) as error:
             log.info("live_prices_missing region=%s/%s reason=%r", cloud, region, str(error))
             return {}
+
+
+def _with_extras(offer: Offer, resources: Mapping[str, Any]) -> Offer:
+    disk_size = alternative(resources, offer.placement).get("disk_size", DISK_GB)
+    more = extras.usd_per_hour(offer.placement, disk_size)
+    return replace(offer, usd_per_hour=offer.usd_per_hour + more, extras_usd_per_hour=more)

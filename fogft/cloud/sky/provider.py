@@ -53,5 +53,11 @@ class Provider(Protocol):
     def warning(self) -> str:
         """Return what a VM there may do that it need not; empty where nothing is known."""
 
+    def credentials_end_at(self) -> float | None:
+        """Return when the credentials here end, in seconds since the epoch; None for unknown."""
+
+    def quota(self, region: str, code: str) -> float | None:
+        """Return how many vCPUs an account may run there at once; None where that is unknown."""
+
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         """Return live spot prices: (zone, instance type) -> US dollars per hour."""

@@ -8,7 +8,7 @@ from enum import Enum
 
 from fogft.cloud.sky.failures import classify
 from fogft.errors import CloudError
-from fogft.model.replica import Placement
+from fogft.model.replica import Offer, Placement
 
 
 class RefusedError(CloudError):
@@ -23,10 +23,15 @@ class RefusedError(CloudError):
 
 @dataclass(frozen=True)
 class Request:
-    """A launch request that the API server knows of, and whether it is still under way."""
+    """A launch request that the API server knows of, and whether it is still under way.
+
+    Attributes:
+        queued: No worker has begun with it: a local server on two cores has two.
+    """
 
     id: str
     active: bool
+    queued: bool = False
 
 
 class ClusterState(Enum):
@@ -49,6 +54,23 @@ class Cluster:
     launched_at: float = 0.0  # seconds since the epoch
     progress: str = ""  # what SkyPilot says it is doing, or why the state is what it is
     labels: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Sale:
+    """What SkyPilot could launch for a `resources` section.
+
+    Attributes:
+        offers: Of each location several machines that would do, at the catalogue's prices.
+        left_out: Cloud -> why no such machine can be launched there.
+        vcpus: Instance type -> how many it has, which quotas are about.
+        quotas: Instance type and whether spot -> the provider's code of the quota.
+    """
+
+    offers: Sequence[Offer]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    vcpus: Mapping[str, float] = field(default_factory=dict)
+    quotas: Mapping[tuple[str, bool], str] = field(default_factory=dict)
 
 
 class JobState(Enum):

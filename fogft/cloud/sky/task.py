@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ from fogft import template_files
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming
 from fogft.errors import CloudError, FogftError, SpecError
-from fogft.model.names import NO_VM_CLOUDS, SETUP_LIMIT_S
+from fogft.model.names import LINK_PORT, NO_VM_CLOUDS, SETUP_LIMIT_S
 from fogft.model.replica import Placement
 from fogft.poolfile.resources import alternatives, place
 
 OURS = "~/.fogft"
+DISK_GB = 64  # where the pool file names none; SkyPilot takes 256
 _CHOICES = (
     *("infra", "cloud", "region", "zone", "any_of", "ordered"),
     *("instance_type", "use_spot", "accelerators"),
@@ -43,23 +44,39 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
     """Raise `SpecError` for a field of a pool file's task that a pool decides itself."""
     for key, reason in _REFUSED_TASK.items():
         if key in task and not (key == "num_nodes" and task[key] == 1):
-            raise SpecError(f"{key}: cannot be honoured by a pool", reason)
+            raise SpecError(f"{key}: is not supported in a pool", reason)
     for target in task.get("file_mounts") or {}:
         if os.path.normpath(str(target)).startswith(OURS):
             raise SpecError(f"file_mounts.{target}: `{OURS}` is fogft's own folder")
     for where, entry in alternatives(task.get("resources") or {}):
         for key, reason in _REFUSED_RESOURCES.items():
-            if key in entry:
-                raise SpecError(f"{where}.{key}: cannot be honoured by a pool", reason)
+            if entry.get(key, []) != []:
+                raise SpecError(f"{where}.{key}: is not supported in a pool", reason)
         for label in entry.get("labels") or {}:
             if str(label).startswith(naming.PREFIX):
                 raise SpecError(f"{where}.labels.{label}: this prefix is fogft's own")
         cloud = place(entry)[0]
         if cloud in NO_VM_CLOUDS:
             raise SpecError(
-                f"{where}: `{cloud}` has no machines of its own",
+                f"{where}: `{cloud}` offers no VMs",
                 "name clouds that sell VMs, such as `infra: aws/us-west-2`",
             )
+
+
+def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a `resources` section with all that a launch adds and a cloud may not have."""
+    ours = dict(read()["resources"])
+    ours["ports"] = list(resources.get("ports", [LINK_PORT]))
+    if not ours["ports"]:
+        del ours["ports"]
+    kept = {key: value for key, value in resources.items() if key != "ports"}
+    return {"disk_size": DISK_GB, **kept, **ours}
+
+
+def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[str, Any]:
+    """Return the alternative of a section that a placement was bought by."""
+    found = (entry for _, entry in alternatives(resources) if _sells(entry, placement))
+    return next(found, resources)
 
 
 def build(
@@ -70,6 +87,7 @@ def build(
     wheel: Path,
     owner: str,
     base: Path,
+    instead: Sequence[Placement] = (),
 ) -> dict[str, Any]:
     """Return the task of one replica, for exactly one location.
 
@@ -80,6 +98,7 @@ def build(
         wheel: Folder with fogft's wheel.
         owner: Whose machine it is, for its labels.
         base: Folder that relative paths of the pool file start from.
+        instead: What else is tried there, in this order, where the first has no capacity.
     """
     refuse_what_cannot_be_honoured(order.task)
     setup = str(order.task.get("setup") or ":").rstrip()
@@ -101,22 +120,28 @@ def build(
         task["workdir"] = _absolute(task["workdir"], base)
     mounts = {k: _absolute(v, base) for k, v in (task.get("file_mounts") or {}).items()}
     task["file_mounts"] = {**mounts, **ours["file_mounts"]}
-    task["resources"] = _resources(order, owner) | ours["resources"]
+    resources = _resources(order, owner) | ours["resources"]
+    if instead:
+        del resources["instance_type"]
+        resources.pop("accelerators", None)
+        resources["ordered"] = [_kind(one) for one in (order.placement, *instead)]
+    task["resources"] = resources
     return task
 
 
+def _kind(placement: Placement) -> dict[str, str]:
+    instance, _, accelerators = placement.instance.partition("+")
+    kind = {"instance_type": instance}
+    return {**kind, "accelerators": accelerators} if accelerators else kind
+
+
 def _resources(order: Launch, owner: str) -> dict[str, Any]:
-    asked = order.task.get("resources") or {}
-    chosen = next(
-        (entry for _, entry in alternatives(asked) if _sells(entry, order.placement)), dict(asked)
-    )
+    chosen = alternative(order.task.get("resources") or {}, order.placement)
     out = {k: copy.deepcopy(v) for k, v in chosen.items() if k not in _CHOICES}
-    instance, _, accelerators = order.placement.instance.partition("+")
+    out.setdefault("disk_size", DISK_GB)
     out["infra"] = naming.infra(order.placement)
-    out["instance_type"] = instance
     out["use_spot"] = order.placement.spot
-    if accelerators:
-        out["accelerators"] = accelerators
+    out |= _kind(order.placement)
     out["labels"] = dict(chosen.get("labels") or {}) | naming.labels(
         order.id,
         pool=order.pool,
@@ -165,4 +190,4 @@ def read() -> dict[str, Any]:
         return dict(yaml.safe_load(template_files.read_text("sky_task.yaml")))
     except (FogftError, yaml.YAMLError, TypeError, ValueError) as error:
         what = f"fogft's own `sky_task.yaml` cannot be read: {error}"
-        raise CloudError(what, "install fogft again") from error
+        raise CloudError(what, "reinstall fogft") from error

@@ -62,8 +62,8 @@ class PriceTable:
                 best[key] = min(best.get(key, offer), offer, key=_order)
         if not best:
             raise SpecError(
-                f"resources: nothing in `{self._file}` suits them",
-                "ask for less, or for places that the table knows",
+                f"resources: nothing in `{self._file}` matches them",
+                "relax the resources, or name places in the table",
             )
         return sorted(best.values(), key=_order)
 

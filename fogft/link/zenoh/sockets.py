@@ -15,17 +15,18 @@ import fcntl
 import os
 import select
 import socket
+import stat
 import struct
 import termios
 import time
 from collections.abc import Iterator
-from pathlib import Path
+from itertools import chain
 
 from fogft.link.socket_progress import Flow
 
 Address = tuple[str, int]
 
-_DESCRIPTORS = Path("/proc/self/fd")
+_DESCRIPTORS = "/proc/self/fd"
 # struct tcp_info of linux/tcp.h: eight bytes of state, then 32 and 64 bit counts.
 _INFO_BYTES, _WITH_UNSENT_BYTES = 136, 148
 _RTT, _RTT_VARIATION = (struct.Struct("@I"), 68), (struct.Struct("@I"), 72)
@@ -38,6 +39,8 @@ _AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing waits for nothing,
 _NOWHERE = bytes(16)  # struct sockaddr of AF_UNSPEC: to connect there resets a connection
 _libc = ctypes.CDLL(None)
 _LOOK_AGAIN_S = 0.01
+_others: set[int] = set()  # sockets that are no TCP connections, by their inodes
+_OTHERS_LIMIT = 1024
 
 
 def address(endpoint: str) -> Address:
@@ -105,7 +108,7 @@ class OwnSocket:
 
         Kept open, it would keep the connection from ending.
         """
-        for number in (self._number, *_numbers()):
+        for number in chain((self._number,), _numbers()):
             connection = _duplicate(number)
             if connection is None:
                 continue
@@ -124,17 +127,18 @@ def count() -> int:
         return 0
 
 
-def _numbers() -> list[int]:
+def _numbers() -> Iterator[int]:
     try:
-        return [int(entry.name) for entry in _DESCRIPTORS.iterdir()]
+        yield from map(int, os.listdir(_DESCRIPTORS))
     except OSError:
-        return []  # no Linux: nothing can be seen to
+        return  # no Linux: nothing can be seen to
 
 
 def _duplicate(number: int) -> socket.socket | None:
     """Return a socket of ours to a TCP connection, None where a descriptor is no such."""
     try:
-        if number < 0 or not os.readlink(_DESCRIPTORS / str(number)).startswith("socket:"):
+        status = os.fstat(number)
+        if status.st_ino in _others or not stat.S_ISSOCK(status.st_mode):
             return None
         connection = socket.socket(fileno=os.dup(number))
     except OSError:
@@ -145,6 +149,9 @@ def _duplicate(number: int) -> socket.socket | None:
     ):
         return connection
     connection.close()
+    if len(_others) >= _OTHERS_LIMIT:
+        _others.clear()
+    _others.add(status.st_ino)
     return None
 
 

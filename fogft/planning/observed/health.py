@@ -43,10 +43,10 @@ class Verdict(str, Enum):
 
     GOOD = "good"  # serves, will serve, or nothing can be said against it
     FAILED = "failed"  # its launch has failed, or took longer than `start_limit_s`
-    LEAVING = "leaving"  # a preemption notice was given, or it asked to be left alone
+    LEAVING = "leaving"  # a preemption notice was given, or the replica is draining
     UNRESPONSIVE = "unresponsive"  # silent past `replace_after_s` while another answers
     AT_RISK = "at risk"  # serves, and its cloud recommends to move it
-    DISAGREES = "disagrees"  # its answers differ from those of a quorum, repeatedly
+    DISAGREES = "disagrees"  # its answers differ from a quorum's, or are none, repeatedly
     STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
 
 
@@ -184,13 +184,16 @@ def was_heard(link: LinkReport, record: Record | None) -> bool:
 def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
     """Whether a replica answers all that it was launched for.
 
-    An outdated one was launched for other services, so answering any counts.
+    An outdated one was launched for other services, so answering any counts. One of a changed file
+    that lists none need answer what it offers itself, until most of its kind have told.
     """
     if link is None or link.state is not _UP or machine.phase is not _RUNNING:
         return False
     if machine.spec_hash != replica_hash(spec, machine.id.slot):
         return bool(link.ready)
     wanted = ready_at(spec, machine.id.slot)
+    if spec.discovered and not spec.services and spec.discovered_by != machine.spec_hash:
+        wanted = frozenset(name for name, _ in link.offered)
     return bool(wanted) and wanted <= link.ready
 
 
@@ -264,7 +267,7 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     if link is not None and silent and context.may_doubt and link.silent_for_s > context.patience_s:
         return Verdict.UNRESPONSIVE, Reason(Cause.SILENT, seconds=link.silent_for_s)
     if link is not None and link.disagrees and context.may_doubt:
-        return Verdict.DISAGREES, Reason(Cause.DISAGREES)
+        return Verdict.DISAGREES, Reason(Cause.MISREAD if link.misread else Cause.DISAGREES)
     if serving and link is not None and link.at_risk and _has_settled(record, now):
         return Verdict.AT_RISK, Reason(Cause.AT_RISK)
     if serving or not context.may_doubt:

@@ -18,6 +18,7 @@ from enum import Enum
 from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
+from fogft.model.plain import Moment
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import supply
 from fogft.planning.observed.expiring import Expiring, TtlCache, outdate
@@ -64,7 +65,7 @@ class Event:
 
     omits_defaults: ClassVar = True  # written as plain data
 
-    at: float
+    at: Moment
     kind: EventKind
     slot: int
     generation: int

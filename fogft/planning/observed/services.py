@@ -1,20 +1,23 @@
-"""Which services a pool offers whose file lists none: what its replicas advertise. Pure.
+"""Which services a pool offers whose file lists none: what most of its replicas advertise. Pure.
 
-What was found is kept as long as the pool's replicas run the same: a replica that dies, or all of
-them, takes no name from the robot. A changed file begins anew, once a replica that runs it has
-told what it offers.
+One replica's word changes nothing: it may be broken, or in wrong hands. What was agreed on is kept
+as long as the pool's replicas run the same: a replica that dies, or all of them, takes no name from
+the robot. A changed file begins anew, once most replicas that run it have told what they offer.
 
-Owns: what is known, and how it grows.
+Owns: what is known, how it grows, and who is outvoted.
 Not here: what a replica offers (`fogft.proxy.replica.offering`), the file
 (`fogft.pool.folder.discovered`).
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fogft.model.replica import LinkReport, LinkState, Machine
+from fogft.model.plain import Line
+from fogft.model.replica import LinkReport, LinkState, Machine, MachinePhase
+from fogft.model.ros_names import is_below
 from fogft.model.spec import ServiceSpec
 
 
@@ -27,29 +30,63 @@ class Discovered:
         services: Name -> type.
     """
 
-    spec_hash: str = ""
-    services: Mapping[str, str] = field(default_factory=dict)
+    spec_hash: Line = ""
+    services: Mapping[Line, Line] = field(default_factory=dict)
 
-    def specs(self) -> tuple[ServiceSpec, ...]:
-        """Return them with the policy that a pool file's service has unless told."""
-        return tuple(ServiceSpec(name, kind) for name, kind in sorted(self.services.items()))
+    def specs(self, namespace: str = "") -> tuple[ServiceSpec, ...]:
+        """Return those below a namespace, with the policy of a service of which no file speaks."""
+        return tuple(
+            ServiceSpec(name, kind)
+            for name, kind in sorted(self.services.items())
+            if is_below(name, namespace)
+        )
 
 
-def offered(
-    spec_hash: str, machines: Sequence[Machine], links: Sequence[LinkReport]
-) -> dict[str, str]:
-    """Return name -> type of what the replicas of a hash offer now; the lowest slot's type wins."""
-    ours = {machine.id for machine in machines if machine.spec_hash == spec_hash}
-    found: dict[str, str] = {}
-    for link in sorted(links, key=lambda link: link.id):
-        if link.id in ours and link.state is LinkState.UP:
-            for name, kind in link.offered:
-                found.setdefault(name, kind)
-    return found
+@dataclass(frozen=True)
+class Claims:
+    """What replicas of one hash say that they offer.
+
+    Attributes:
+        count: How many offer a service: its name and type.
+        voters: Of how many.
+    """
+
+    count: Mapping[tuple[str, str], int]
+    voters: int
+
+    def agreed(self) -> dict[str, str]:
+        """Return name -> type of what more than half of the voters offer."""
+        return {name: kind for (name, kind), n in self.count.items() if 2 * n > self.voters}
+
+    def outvoted(self) -> list[str]:
+        """Return the names of which that cannot be said, sorted."""
+        return sorted({name for name, _ in self.count} - self.agreed().keys())
+
+
+def claims(
+    known: Discovered,
+    spec_hash: str,
+    machines: Sequence[Machine],
+    links: Sequence[LinkReport],
+    wanted: int,
+) -> Claims:
+    """Return what the replicas of a hash offer now.
+
+    Where nothing is known yet, the machines that there are decide, for others may not be had; later
+    on as many as are wanted, so that one that is left alone for a while cannot.
+    """
+    ours = {
+        machine.id
+        for machine in machines
+        if machine.spec_hash == spec_hash and machine.phase is not MachinePhase.FAILED
+    }
+    heard = [link for link in links if link.id in ours and link.state is LinkState.UP]
+    count = Counter(pair for link in heard for pair in link.offered)
+    return Claims(count, max(len(ours), wanted if known.services else 0))
 
 
 def grown(known: Discovered, spec_hash: str, now: Mapping[str, str]) -> Discovered:
-    """Return what is known after replicas of a hash offered this."""
+    """Return what is known after replicas of a hash agreed on this."""
     if not now:
         return known
     before = known.services if known.spec_hash == spec_hash else {}

@@ -86,8 +86,7 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
     if not found and any(replica.slot == slot for replica in status.by_hand):
         raise FogftError(
             f"the replica in slot {slot} of `{status.pool}` was started by hand",
-            "nobody replaces it: end it on its machine; "
-            f"`fogft credentials revoke replica {slot}` shuts it out",
+            f"end it on its own machine; `fogft credentials revoke replica {slot}` locks it out",
         )
     if not found:
         known = known_slots(replica.slot for replica in status.replicas)

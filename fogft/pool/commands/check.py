@@ -14,8 +14,9 @@ from fogft.poolfile.pool import Checks
 def checks_here() -> Checks:
     """Return what only this machine can tell: which types are installed, and what they hold."""
     from fogft.ros.comparison import check_tolerances
+    from fogft.ros.messages import check_ok_field
     from fogft.ros.state_bytes import check_state
-    from fogft.ros.types import check_ok_field, check_type
+    from fogft.ros.types import check_type
 
     return Checks(check_type, check_ok_field, check_state, check_tolerances)
 

@@ -46,6 +46,13 @@ class Seen:
     unanswered: Sequence[str] = ()
 
     @property
+    def lease_left_s(self) -> float | None:
+        """Seconds until the first replica shuts down where no manager runs; None if not known."""
+        rows = (*self.status.replicas, *self.status.by_hand)
+        known = [one.lease_left_s for one in rows if one.lease_left_s is not None]
+        return min(known, default=None)
+
+    @property
     def stale(self) -> bool:
         """Whether what the manager last saw says nothing of now."""
         return self.age_s is None or self.age_s > STALE_AFTER_S
@@ -101,11 +108,16 @@ def current(
     found = replace(
         status,
         proxy_alive=proxy_alive,
+        proxy_version=report.version if report is not None and proxy_alive else "",
         proxy_pid=report.pid if report is not None and proxy_alive else None,
         uplink_suspected=fresh is not None and fresh.uplink_suspected,
         replicas=replicas,
         by_hand=[_now(one, links, seen) for one in status.by_hand],
         services=services,
+        topics=[
+            one.seen(links.values(), report.topics if report is not None else {})
+            for one in status.topics
+        ],
         ready=sum(_is_ready(one) for one in replicas),
     )
     silent = [one.name for one in services if not one.ready_replicas]
@@ -134,7 +146,9 @@ def _now(one: ReplicaStatus, links: _Links, seen: Seen) -> ReplicaStatus:
     link = links.get((one.slot, one.generation))
     if link is None:
         known = not seen.stale and (seen.links_known or one.phase in _COMING)
-        return replace(one, link="", rtt_s=None, silent_for_s=0.0, in_flight=0, known=known)
+        return replace(
+            one, link="", rtt_s=None, silent_for_s=0.0, in_flight=0, known=known, lease_left_s=None
+        )
     found = replace(
         one,
         link=link.state.value,
@@ -143,6 +157,10 @@ def _now(one: ReplicaStatus, links: _Links, seen: Seen) -> ReplicaStatus:
         won=link.won,
         in_flight=link.in_flight,
         restarts=link.restarts,
+        strangers=link.strangers,
+        detail=one.detail or (link.detail if one.phase == Phase.READY.value else ""),
+        lease_left_s=link.lease_left_s,
+        version=link.version,
     )
     names = {service.name for service in seen.status.services}
     if found.phase in _COMING and link.state is LinkState.UP and names and names <= link.ready:

@@ -80,11 +80,11 @@ def _files(source: Path) -> Iterator[Path]:
 
 def _check_room(target: Path, names: list[Path], force: bool) -> None:
     if os.path.lexists(target) and not target.is_dir():
-        raise FogftError(f"`{target}` is not a folder", "choose another with `--into DIR`")
+        raise FogftError(f"`{target}` is not a folder", "choose another folder with `--into DIR`")
     taken = [target / name for name in names if os.path.lexists(target / name)]
     for path in taken:
         if path.is_dir():
-            raise FogftError(f"`{path}` is a folder", "choose another place with `--into DIR`")
+            raise FogftError(f"`{path}` is a folder", "choose another folder with `--into DIR`")
     if taken and not force:
         listed = ", ".join(f"`{path}`" for path in taken)
         hint = "choose another folder with `--into DIR`, or overwrite with `--force`"

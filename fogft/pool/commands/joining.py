@@ -27,6 +27,7 @@ from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.membership import Found, to_dict
 from fogft.model.names import is_endpoint
+from fogft.model.plain import stored
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.pool.credentials import bundle, claiming
@@ -115,7 +116,7 @@ def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
     add = "add `fogft.rendezvous` to the pool file, and `fogft up` it"
     if role is Role.REPLICA and Found.of(spec) is Found.BY_CLOUD:
         raise CredentialError(
-            f"nobody would find replica `{name}`: no rendezvous could tell where it is",
+            f"nobody could find replica `{name}`: no rendezvous could tell where it is",
             f"{add}, or `fogft.dial_in`, where it dials the robot",
         )
     if role in (Role.ROBOT, Role.GATEWAY) and Found.of(spec) is Found.BY_DOOR:
@@ -136,11 +137,13 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
     }
     if holder.role is Role.REPLICA:
         id = ReplicaId(identity.uid, int(holder.name), holder.generation)
-        taken_back = store.paths.revocations
-        known = taken_back.exists()
-        files["replica.yaml"] = configuration.replica_config(identity, spec, id, revocations=known)
+        signed = store.paths.announcements
+        known = signed.exists()
+        files["replica.yaml"] = configuration.replica_config(
+            identity, spec, id, announcements=known
+        )
         if known:
-            files[taken_back.name] = taken_back.read_text()
+            files[signed.name] = signed.read_text()
     elif holder.role is Role.RENDEZVOUS:
         files["rendezvous.yaml"] = configuration.rendezvous_config(identity)
     else:
@@ -183,11 +186,11 @@ def join(
     disk.make_folder(root / "joined")
     used = root / "joined" / "used.json"
     with disk.locked(root / "joined" / "used.lock"):
-        ids = list(disk.read_json(used) or ())
+        ids = stored(list[str], disk.read_json(used) or [], f"`{used}` is damaged")
         if label.id in ids:
             raise CredentialError(
-                f"this bundle for `{holder.short}` was used here before",
-                "each is good for one time: have a new one issued",
+                f"this bundle for `{holder.short}` was already used on this machine",
+                "a bundle can be used once: have a new one issued",
             )
         if endpoints:
             token = claiming.own_token(root / "joined" / "claims.json", label.id, now)
@@ -245,7 +248,7 @@ def read(file: Path) -> bytes:
     except OSError as error:
         raise CredentialError(
             f"the bundle `{file}` cannot be read: {error.strerror}",
-            "each is good for one time, and gone once it was used",
+            "a bundle can be used once, and is deleted afterwards",
         ) from None
 
 
@@ -285,5 +288,5 @@ def _destroy(file: Path, size: int) -> None:
     except OSError as error:
         raise FogftError(
             f"this machine has joined, but `{file}` cannot be removed: {error.strerror}",
-            "remove it by hand: it is good for nothing more here",
+            "remove it by hand: it cannot be used again",
         ) from None

@@ -45,6 +45,6 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
         known = known_slots(slot for slot, _ in launched)
         raise FogftError(
             f"there is no log of a replica in slot {slot} of `{store.paths.folder.name}`",
-            f"slots with one: {known}",
+            f"slots in use: {known}",
         )
     return found

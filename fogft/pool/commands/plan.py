@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fogft.cloud.port import Accounts
 from fogft.cloud.table import PriceTable
 from fogft.errors import CloudError, PoolNotFound, SpecError
 from fogft.model.groups import groups_of, with_spot
@@ -14,7 +15,7 @@ from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.explain import Explanation, explain
-from fogft.planning.observed.history import History
+from fogft.planning.observed.history import Event, EventKind, History
 from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.manager import offers
@@ -23,6 +24,8 @@ from fogft.pool.manager.offers import Seller
 from fogft.pool.manager.traffic import Measured, is_stated, measured, with_measured
 from fogft.poolfile import named_clouds
 from fogft.poolfile.file import parse, read_text
+
+LEAST_LAUNCHES = 5  # fewer say little
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,8 @@ class PlanShown:
         distances: ``cloud/region`` -> how far it is, and how that is known.
         traffic: Service name -> what its client proxy counted, where the file says nothing.
         notes: What may surprise, besides the plan's own notes.
+        ready_p90_s: By when nine in ten of this pool's launches were ready; None for too few.
+        launches: How many of them there were.
     """
 
     spec: PoolSpec
@@ -44,6 +49,8 @@ class PlanShown:
     distances: Mapping[str, Distance]
     notes: tuple[str, ...]
     traffic: Mapping[str, Measured] = field(default_factory=dict)
+    ready_p90_s: float | None = None
+    launches: int = 0
 
 
 def plan_file(
@@ -76,21 +83,26 @@ def plan_file(
         name = cloud or cloud_named_by(spec, source, file)
         seller = make_cloud(name, file.resolve().parent)
         if name != LOCAL:
-            told("asking for prices")
+            told("fetching prices")
     try:
         sold = offers.ask(seller, spec)
         on_demand = _on_demand(seller, spec)
     except SpecError as error:
         raise named_clouds.located(error, source, file) from None
     if not sold:
-        raise CloudError("nothing is offered for these resources now", "ask for less, or elsewhere")
+        raise CloudError(
+            "no cloud offers these resources at the moment",
+            "relax the resources, or name other places",
+        )
     distances, notes = far(spec, sold, offline=offline, told=told)
+    notes += seller.left_out() if isinstance(seller, Accounts) else ()
     try:
         store = make_store(spec.name)
-        intent, history = store.intent(), History(store.recent(1 << 30))
+        events = store.recent(1 << 30)
+        intent, history, took_s = store.intent(), History(events), ready_after(events)
         counted = measured(store.paths.proxy_status, store.identity().uid)
     except PoolNotFound:
-        intent, history, counted = Intent(), History(), {}
+        intent, history, counted, took_s = Intent(), History(), {}, []
     counted = {
         service.name: counted[service.name]
         for service in spec.services
@@ -99,8 +111,24 @@ def plan_file(
     spec = with_measured(spec, counted)
     now = time.time()
     observed = Observed(now, (), None, sold, rtt_s={r: d.rtt_s for r, d in distances.items()})
-    explained = explain(spec, intent, observed, history, on_demand)
-    return PlanShown(spec, now, name, explained, distances, tuple(notes), counted)
+    ready_p90_s = took_s[int(0.9 * len(took_s))] if len(took_s) >= LEAST_LAUNCHES else None
+    explained = explain(spec, intent, observed, history, on_demand, recovery_s=ready_p90_s)
+    return PlanShown(
+        spec, now, name, explained, distances, tuple(notes), counted, ready_p90_s, len(took_s)
+    )
+
+
+def ready_after(events: Sequence[Event]) -> list[float]:
+    """Return how long launches took from the order until they were ready, the shortest first."""
+    ordered: dict[tuple[int, int], float] = {}
+    took_s: list[float] = []
+    for event in events:
+        key = event.slot, event.generation
+        if event.kind is EventKind.LAUNCH:
+            ordered[key] = event.at
+        elif event.kind is EventKind.READY and key in ordered:
+            took_s.append(max(0.0, event.at - ordered.pop(key)))
+    return sorted(took_s)
 
 
 def far(
@@ -120,7 +148,7 @@ def far(
     """
     regions, latencies, notes = regions_of(sold), Latencies(latency_file()), []
     if not offline and (stale := latencies.stale(regions)):
-        told(f"measuring the way to {len(stale)} regions")
+        told(f"measuring round trips to {len(stale)} regions")
         failed = latencies.measure(stale)
         if failed:
             region, why = next(iter(failed.items()))

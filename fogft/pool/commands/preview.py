@@ -17,12 +17,14 @@ from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.buying import PlannedLaunch
+from fogft.planning.lifetime import HOUR_S
 from fogft.planning.observed.history import History
 from fogft.planning.planner import plan
 from fogft.planning.rollout import has_room
 from fogft.pool.commands.check import checks_here
 from fogft.pool.commands.composition import cloud_named_by, make_cloud, make_store
 from fogft.pool.commands.plan import far
+from fogft.pool.commands.sweep import left_of
 from fogft.pool.folder.store import PoolStore, digest
 from fogft.pool.manager import offers
 from fogft.poolfile.changes import changes, replaces_replicas
@@ -110,12 +112,16 @@ def order(
     sold: tuple[Offer, ...] = ()
     try:
         if isinstance(concrete, Accounts):
-            told("asking SkyPilot which clouds can be used, and for their prices")
+            told("asking SkyPilot for usable clouds and prices")
             concrete.check_task(spec.task)
             accounts, found = _tested(concrete, clouds_named(spec), may_fail=before is not None)
             notes += found
             usable = [name for name, problem in accounts.items() if not problem]
+            now, hours = time.time(), spec.max_hours
             try:
+                notes += concrete.hindrances(
+                    usable, None if hours is None else now + hours * HOUR_S
+                )
                 notes += concrete.exposures(
                     usable, open_port=None if spec.dial_in else spec.link_port
                 )
@@ -123,10 +129,13 @@ def order(
                 notes.append(f"what a VM is given cannot be told now: {error.message}")
         try:
             sold = offers.ask(concrete, spec)
+            notes += concrete.left_out() if isinstance(concrete, Accounts) else ()
         except CloudError as error:
             notes.append(f"prices cannot be had now: {error.message}")
     except SpecError as error:
         raise located(error, source, file) from None
+    if before is None:
+        notes += left_of(spec.name, cloud_name, concrete)
     known, _ = far(spec, sold, told=told)
     rtt_s = {region: distance.rtt_s for region, distance in known.items()}
     now = time.time()
@@ -178,7 +187,7 @@ def _tested(
     if not usable and not may_fail:
         listed = "\n".join(f"  `{name}`: {problem}" for name, problem in accounts.items())
         raise CloudError(
-            f"no cloud can be used with the credentials that are here\n{listed}".rstrip(),
-            "set one up as `sky check` says, or try the pool on this machine with `--cloud local`",
+            f"no cloud can be used with the credentials on this machine\n{listed}".rstrip(),
+            "set one up as `sky check` says, or try the pool locally with `--cloud local`",
         )
     return accounts, [reason for name in usable if (reason := cloud.unverified(name))]

@@ -19,7 +19,7 @@ from fogft.metrics.scrape import Scrape
 from fogft.model.proxy_config import RendezvousConfig
 from fogft.pool.manager.metrics import of_rendezvous
 from fogft.poolfile import config_file
-from fogft.process import ENDING_SIGNALS, start_log
+from fogft.process import ENDING_SIGNALS, Watchdog, notify, start_log
 from fogft.records import cache
 from fogft.records.exchange import Exchange
 from fogft.records.record_set import RecordSet
@@ -61,6 +61,7 @@ class _Rendezvous:
         self._restore()
         self._news = False
         self._reported = ""
+        self._trouble = ""
         self._server = RendezvousServer(
             config.listen, config.credentials, verify, Exchange(self._records, self._changed)
         )
@@ -80,10 +81,12 @@ class _Rendezvous:
             lambda: of_rendezvous(self._server.report()), {"pool_uid": self._config.pool_uid}
         )
         scrape.at(self._config.metrics)
-        serving = loop.create_task(self._server.serve())
+        serving, watchdog = loop.create_task(self._server.serve()), Watchdog()
+        notify("READY=1")
         try:
             while not stop.is_set() and not serving.done():
                 self._save()
+                watchdog.work()
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(stop.wait(), _SAVE_EVERY_S)
         finally:
@@ -106,14 +109,17 @@ class _Rendezvous:
     def _save(self) -> None:
         try:
             if self._news:
-                self._news = False
                 cache.write(self._config.records, self._records.lacking({}))
+                self._news = False
             report = {"pid": os.getpid(), "endpoint": self._server.endpoint}
             report.update(self._server.report())
             if self._config.status is not None and str(report) != self._reported:
-                self._reported = str(report)
                 disk.write_json(
                     self._config.status, {**report, "written_at": time.time()}, durable=False
                 )
+                self._reported = str(report)
+            self._trouble = ""
         except StateError as error:
-            log.error("file_failed reason=%r", error.message)
+            if error.message != self._trouble:
+                self._trouble = error.message
+                log.error("file_failed reason=%r", error.message)

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fogft import disk, logfile
+from fogft import __version__, disk, logfile
 from fogft.child import detached
 from fogft.errors import FogftError, PoolBusy, PoolNotFound, SpecError
 from fogft.model import intent
@@ -28,7 +28,7 @@ from fogft.pool.commands.composition import make_store
 from fogft.pool.commands.preview import Order
 from fogft.pool.credentials import authority
 from fogft.pool.folder.lease import read_pid
-from fogft.pool.folder.paths import home
+from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
 from fogft.pool.manager import process_control
 
@@ -120,24 +120,38 @@ def _check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> N
     if Path(identity.file) != file:
         raise SpecError(
             f"{file}: name: pool `{spec.name}` was started from `{identity.file}`",
-            f"give this one another `name`, or end that one with `fogft down {spec.name}`",
+            f"give this one another `name`, or shut that one down with `fogft down {spec.name}`",
         )
     if identity.cloud != cloud:
         raise SpecError(
             f"{file}: pool `{spec.name}` runs on cloud `{identity.cloud}`, not `{cloud}`",
-            f"end it with `fogft down {spec.name}` first",
+            f"shut it down with `fogft down {spec.name}` first",
         )
 
 
+def manager_version(paths: PoolPaths) -> str:
+    """Return by which version of fogft a pool's manager runs; empty where it has said nothing.
+
+    Raises:
+        StateError: What it said cannot be read.
+    """
+    said = disk.read_json(paths.status)
+    if not isinstance(said, dict):
+        return ""
+    return str(said.get("manager_version", "before 0.2.0"))
+
+
 def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None = None) -> bool:
-    """See to it that the pool has a manager; return whether one was started.
+    """See to it that the pool has a manager of this version; return whether one was started.
 
     Raises:
         FogftError: It ended at once (the message has the end of its log).
     """
     paths = store.paths
     if disk.is_locked(paths.manager_lock):
-        return False
+        if manager_version(paths) in ("", __version__):
+            return False
+        process_control.end_holder(paths.manager_lock, suspected_pid=read_pid(paths))
     name = paths.folder.name
     words = command(name) if command else [sys.executable, "-m", "fogft", "manager", name]
     child = detached(words, paths.manager_log)
@@ -152,5 +166,5 @@ def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None =
         time.sleep(process_control.POLL_S)
     raise FogftError(
         f"the manager of `{name}` did not start:\n{logfile.tail(paths.manager_log)}",
-        f"its log is `{paths.manager_log}`; `fogft doctor` may know more",
+        f"see `{paths.manager_log}`, and run `fogft doctor`",
     )

@@ -15,13 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fogft import disk
-from fogft.cloud.port import Auditing
+from fogft.cloud.port import Auditing, Cloud
 from fogft.errors import CloudError, FogftError, PoolNotFound
 from fogft.model.replica import Machine
 from fogft.pool.commands.composition import LOCAL, SKY, make_cloud
 from fogft.pool.folder import known_pools
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import read_identity
+
+_NAMED = 5  # in a sentence
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,12 @@ class Unowned:
 
     Attributes:
         why: Why it is nobody's, in words.
+        known: Its pool's folder is here.
     """
 
     machine: Machine
     why: str
+    known: bool
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,11 @@ def sweep_cloud(name: str) -> Swept:
         CloudError: There is no such cloud, or it is not usable here.
         StateError: A pool's identity cannot be read, so that its machines are not known.
     """
-    cloud = make_cloud(name, Path.cwd())
+    return swept(name, make_cloud(name, Path.cwd()))
+
+
+def swept(name: str, cloud: Cloud) -> Swept:
+    """Do the same with the cloud of that name."""
     if not isinstance(cloud, Auditing):
         raise FogftError(f"cloud `{name}` cannot be swept")
     audit = cloud.audit()
@@ -73,8 +81,29 @@ def sweep_cloud(name: str) -> Swept:
         pool, managed = pools.get(machine.id.pool_uid, ("", False))
         if not managed:
             why = f"pool `{pool}` has no manager" if pool else f"no pool of this uid in `{home()}`"
-            found.append(Unowned(machine, why))
+            found.append(Unowned(machine, why, bool(pool)))
     return Swept(name, found, audit.asked)
+
+
+def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
+    """Return, for who starts a pool, what still runs of one of this name whose folder is lost.
+
+    Its keys were in that folder: no manager can take these machines over.
+    """
+    try:
+        found = [one.machine for one in swept(name, cloud).unowned if not one.known]
+    except FogftError as error:
+        return [f"whether machines of an earlier `{pool}` run cannot be told now: {error.message}"]
+    left = [machine for machine in found if machine.pool.casefold() in ("", pool.casefold())]
+    if not left:
+        return []
+    usd_per_hour = sum(machine.usd_per_hour for machine in left)
+    ids = ", ".join(f"`{machine.id}`" for machine in left[:_NAMED])
+    more = f" and {len(left) - _NAMED} more" if len(left) > _NAMED else ""
+    return [
+        f"machines of an earlier pool run, and cost ${usd_per_hour:.3f}/h together: {ids}{more}. "
+        "Its folder is lost, and its keys with it: `fogft sweep` ends them"
+    ]
 
 
 def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:

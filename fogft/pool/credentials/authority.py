@@ -257,7 +257,8 @@ def _load_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePri
     except (OSError, ValueError, TypeError) as error:
         raise CredentialError(
             f"the key of the pool's CA, `{path}`, cannot be used: {_reason(error)}",
-            "without it no replica can be launched; `fogft down` and `up` make the pool anew",
+            "without it no replica can be launched; recreate the pool "
+            "with `fogft down` and `fogft up`",
         ) from None  # the cause could quote the file
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise CredentialError(f"`{path}` is not an EC key")

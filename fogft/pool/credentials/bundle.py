@@ -60,8 +60,8 @@ def check_passphrase(passphrase: str) -> None:
     """
     if len(passphrase.strip()) < PASSPHRASE_LEAST:
         raise CredentialError(
-            f"the passphrase has fewer than {PASSPHRASE_LEAST} characters",
-            "without a passphrase of yours, a good one is made and shown",
+            f"the passphrase is shorter than {PASSPHRASE_LEAST} characters",
+            "leave the passphrase out to have one generated",
         )
 
 
@@ -129,8 +129,7 @@ def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[s
         raise CredentialError("the bundle's content cannot be read") from None
     if now >= label.open_until:
         raise CredentialError(
-            f"this bundle for `{label.holder.short}` is too old: it could be opened until "
-            f"{_utc(label.open_until)}",
+            f"this bundle for `{label.holder.short}` expired at {_utc(label.open_until)}",
             f"by this machine's clock it is {_utc(now)}; if that is right, have a new one issued",
         )
     if not isinstance(content, dict):
@@ -159,7 +158,7 @@ def _parse(data: bytes) -> tuple[Label, dict[str, Any], bytes]:
             raise ValueError("its salt or nonce is of the wrong length")
     except (ValueError, RecursionError) as error:
         raise CredentialError(
-            f"this is no join bundle: {error}", "`fogft credentials issue` makes them"
+            f"this is not a join bundle: {error}", "`fogft credentials issue` creates one"
         ) from None
     return label, {key: value for key, value in raw.items() if key != "sealed"}, sealed
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.errors import CredentialError
 from fogft.model.credentials import CredentialPaths, Holder, Role
+from fogft.model.plain import stored
 from fogft.records.client import RendezvousClient
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import DialIn, SlotState
@@ -49,11 +50,11 @@ def own_token(claims: Path, id: str, now: float) -> str:
     Raises:
         StateError: It cannot be written down.
     """
-    known = dict(disk.read_json(claims) or {})
+    known = stored(dict[str, str], disk.read_json(claims) or {}, f"`{claims}` is damaged")
     if id not in known:
         latest = dict(list(known.items())[-_KEPT:])
         disk.write_json(claims, known := {**latest, id: new_token(now)})
-    return str(known[id])
+    return known[id]
 
 
 def claim(
@@ -124,7 +125,7 @@ def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record
 def _used_elsewhere(holder: Holder) -> CredentialError:
     return CredentialError(
         f"this bundle for `{holder.short}` was used before, on another machine",
-        "each is good for one time: have a new one issued. If nobody of yours has used it: "
+        "a bundle can be used once: have a new one issued. If nobody of yours has used it: "
         f"`fogft credentials revoke {holder.role.value} {holder.name}`",
     )
 

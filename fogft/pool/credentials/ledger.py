@@ -12,19 +12,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 from fogft import disk
-from fogft.errors import CredentialError, StateError
+from fogft.errors import CredentialError
 from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND
+from fogft.model.plain import Line, Moment, stored, to_plain
 from fogft.model.replica import ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Credential
 
 _DAY_S = 86_400.0
+_WAY_OUT = "without it nobody knows what was revoked; `fogft down` and `up` begin anew"
 
 
 @dataclass(frozen=True)
@@ -35,11 +37,11 @@ class Entry:
         revoked_at: When it was taken back; None if it was not.
     """
 
-    common_name: str
-    serial: str
-    issued_at: float
-    not_after: float
-    revoked_at: float | None = None
+    common_name: Annotated[str, holder_of]
+    serial: Line
+    issued_at: Moment
+    not_after: Moment
+    revoked_at: Moment | None = None
 
     @property
     def holder(self) -> Holder:
@@ -51,6 +53,11 @@ class Entry:
         if self.revoked_at is not None:
             return "revoked"
         return "expired" if now >= self.not_after else "good"
+
+
+@dataclass(frozen=True)
+class _Issued:
+    issued: tuple[Entry, ...]
 
 
 class Ledger:
@@ -76,13 +83,7 @@ class Ledger:
         raw = disk.read_json(self.path)
         if raw is None:
             return ()
-        try:
-            return tuple(_entry(one) for one in raw["issued"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise StateError(
-                f"`{self.path}` is damaged: {error}",
-                "without it nobody knows what was revoked; `fogft down` and `up` begin anew",
-            ) from error
+        return stored(_Issued, raw, f"`{self.path}` is damaged", _WAY_OUT).issued
 
     def revoked(self) -> frozenset[str]:
         """Return the common names that were taken back."""
@@ -192,22 +193,9 @@ class Ledger:
         ]
 
     def _write(self, entries: Iterable[Entry]) -> None:
-        disk.write_json(self.path, {"issued": [asdict(entry) for entry in entries]})
+        disk.write_json(self.path, to_plain(_Issued(tuple(entries))))
 
 
 def _is(entry: Entry, role: Role, name: str) -> bool:
     holder = entry.holder
     return (holder.role, holder.name) == (role, name)
-
-
-def _entry(raw: Any) -> Entry:
-    revoked_at = raw["revoked_at"]
-    entry = Entry(
-        common_name=str(raw["common_name"]),
-        serial=str(raw["serial"]),
-        issued_at=float(raw["issued_at"]),
-        not_after=float(raw["not_after"]),
-        revoked_at=None if revoked_at is None else float(revoked_at),
-    )
-    holder_of(entry.common_name)
-    return entry

@@ -13,20 +13,22 @@ from fogft import disk
 from fogft.errors import StateError
 from fogft.model import ros_names
 from fogft.model.choices import Speaks
+from fogft.model.plain import as_line, stored, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
-from fogft.planning.observed.services import Discovered, grown, offered
+from fogft.planning.observed.services import Discovered, claims, grown
 
 
 def read(path: Path) -> Discovered:
     """Return what was found; nothing where the file is missing or damaged."""
     try:
-        raw = disk.read_json(path)
-        services = {str(name): str(kind) for name, kind in raw["services"].items()}
-        return Discovered(str(raw["spec_hash"]), services)
-    except (StateError, KeyError, TypeError, AttributeError):
+        return stored(Discovered, disk.read_json(path) or {}, "")
+    except StateError:
         return Discovered()
+
+
+_NOTED = 5  # of what is not offered
 
 
 class Discovery:
@@ -42,8 +44,13 @@ class Discovery:
         self._refused: dict[tuple[str, str], str] = {}
         self.notes: list[Reason] = []
 
-    def look(self, spec: PoolSpec, observed: Observed) -> bool:
-        """Take up what replicas offer; return whether that changed the file.
+    def look(self, spec: PoolSpec, observed: Observed, wanted: int) -> bool:
+        """Take up what most replicas offer; return whether that changed the file.
+
+        Args:
+            spec: The pool file.
+            observed: What there is now.
+            wanted: How many replicas are wanted now.
 
         Raises:
             StateError: It cannot be written.
@@ -51,13 +58,21 @@ class Discovery:
         self.notes = []
         if spec.services:
             return False
-        told = offered(spec.replica_hash, observed.machines or (), observed.links or ())
-        usable = {name: kind for name, kind in told.items() if not self._refusal(spec, name, kind)}
+        told = claims(
+            self._known, spec.replica_hash, observed.machines or (), observed.links or (), wanted
+        )
+        agreed = told.agreed()
+        usable = {
+            name: kind for name, kind in agreed.items() if not self._refusal(spec, name, kind)
+        }
         more = grown(self._known, spec.replica_hash, usable)
+        new = [name for name in told.outvoted() if name not in more.services]
+        self.notes += [
+            Reason(Cause.OUTVOTED, name=as_line(name), of=told.voters) for name in new[:_NOTED]
+        ]
         if more == self._known:
             return False
-        plain = {"spec_hash": more.spec_hash, "services": dict(more.services)}
-        disk.write_json(self._path, plain)
+        disk.write_json(self._path, to_plain(more))
         self._known = more
         return True
 
@@ -66,7 +81,9 @@ class Discovery:
         if (name, kind) not in self._refused:
             self._refused[(name, kind)] = _check(name, kind, load=spec.rmw.robot is Speaks.RCLPY)
         why = self._refused[(name, kind)]
-        if why:
+        if not why and not ros_names.is_below(name, spec.namespace):
+            why = f"it is not below `namespace`, which is `{spec.namespace}`"
+        if why and len(self.notes) < _NOTED:
             self.notes.append(Reason(Cause.NOT_OFFERED, name=name, words=why))
         return why
 

@@ -32,7 +32,7 @@ def meant(root: Path, name: str | None) -> str:
     if name is None and known:
         raise PoolNotFound(f"there are {len(known)} pools: {listed}", "say which one you mean")
     if name is None:
-        raise PoolNotFound("there is no pool here", "start one with `fogft up FILE`")
+        raise PoolNotFound("no pools on this machine", "start one with `fogft up FILE`")
     if name not in known:
         hint = f"there are: {listed}" if known else "start one with `fogft up FILE`"
         raise PoolNotFound(f"there is no pool `{name}`", hint)

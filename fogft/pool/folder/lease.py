@@ -10,10 +10,19 @@ Owns: `manager.lock` and `lease.json`.
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 
 from fogft import disk
 from fogft.errors import PoolBusy, StateError
+from fogft.model.plain import Count, stored, to_plain
 from fogft.pool.folder.paths import PoolPaths
+
+
+@dataclass(frozen=True)
+class _Held:
+    epoch: Count = 0
+    pid: Count | None = None
+    beat: Count = 0
 
 
 class Lease:
@@ -39,7 +48,7 @@ class Lease:
                 f"pool `{paths.folder.name}` has a manager already"
                 + (f" (pid {pid})" if (pid := read_pid(paths)) else "")
             )
-        lease = cls(paths, lock, max(_read_epoch(paths), at_least) + 1)
+        lease = cls(paths, lock, max(_read(paths).epoch, at_least) + 1)
         lease._write()
         return lease
 
@@ -50,14 +59,14 @@ class Lease:
             PoolBusy: A later manager is in office: this one must stop at once.
             StateError: The lease cannot be written.
         """
-        if _read_epoch(self._paths) > self.epoch:
+        if _read(self._paths).epoch > self.epoch:
             raise PoolBusy(f"pool `{self._paths.folder.name}` has a later manager")
         self._beat += 1
         self._write()
 
     def _write(self) -> None:
-        value = {"epoch": self.epoch, "pid": os.getpid(), "beat": self._beat}
-        disk.write_json(self._paths.lease, value, durable=self._beat == 0)
+        held = _Held(self.epoch, os.getpid(), self._beat)
+        disk.write_json(self._paths.lease, to_plain(held), durable=self._beat == 0)
 
     def release(self) -> None:
         """Leave office. Repeatable."""
@@ -66,17 +75,12 @@ class Lease:
 
 def read_pid(paths: PoolPaths) -> int | None:
     """Return the process id of the manager last in office, if it is known."""
-    return _read_number(paths, "pid")
+    return _read(paths).pid
 
 
-def _read_epoch(paths: PoolPaths) -> int:
-    return _read_number(paths, "epoch") or 0
-
-
-def _read_number(paths: PoolPaths, key: str) -> int | None:
+def _read(paths: PoolPaths) -> _Held:
+    """Return what the file says; a damaged one says nothing, as where there is none."""
     try:
-        raw = disk.read_json(paths.lease)
+        return stored(_Held, disk.read_json(paths.lease) or {}, "")
     except StateError:
-        return None
-    value = raw.get(key) if isinstance(raw, dict) else None
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
+        return _Held()

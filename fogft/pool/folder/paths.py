@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from fogft import disk
+
 
 def home(environ: Mapping[str, str] = os.environ) -> Path:
     """Return the folder that holds all of fogft's state for this user."""
@@ -108,14 +110,19 @@ class PoolPaths:
         return self.folder / "manager-records.json"
 
     @property
-    def revocations(self) -> Path:
-        """The manager's signed revocations, which the client proxy passes on to replicas."""
-        return self.folder / "revocations.json"
+    def announcements(self) -> Path:
+        """What the manager has signed for all replicas; the client proxy passes it on to them."""
+        return self.folder / "announcements.json"
 
     @property
     def history(self) -> Path:
         """One JSON object a line: launches, ends, refusals; the generations used."""
         return self.folder / "history.jsonl"
+
+    @property
+    def costs(self) -> Path:
+        """What all pools of this user have cost, a file each, which stays when one has ended."""
+        return self.folder.parent.parent / "costs"
 
     @property
     def credentials(self) -> Path:
@@ -131,6 +138,16 @@ class PoolPaths:
     def proxy_lock(self) -> Path:
         """Held by the client proxy as long as it lives."""
         return self.folder / "proxy.lock"
+
+    @property
+    def standby_lock(self) -> Path:
+        """Held by the client proxy that is to take over from the one that holds `proxy_lock`."""
+        return disk.standby_lock(self.proxy_lock)
+
+    @property
+    def manager_start(self) -> Path:
+        """``{command, folder}``: how to start a killed manager; gone when it ended well."""
+        return self.folder / "manager.json"
 
     @property
     def proxy_status(self) -> Path:

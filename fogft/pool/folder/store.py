@@ -102,6 +102,7 @@ class PoolStore:
         self.paths = paths
         self._parse = parse
         self._events = HistoryFile(paths.history, clock)
+        self.heard: Callable[[Event], object] = lambda _: None  # each event, once it is written
         self._spec: tuple[bytes, PoolSpec] | None = None
         self._good: tuple[bytes, PoolSpec] | None = None
 
@@ -143,9 +144,11 @@ class PoolStore:
         """Add what was discovered to a spec that lists no services; the same object if known."""
         raw, spec = read
         if not spec.services:
-            found = discovered.read(self.paths.discovered).specs()
-            if found != spec.discovered:
-                return raw, replace(spec, discovered=found)
+            found = discovered.read(self.paths.discovered)
+            services = found.specs(spec.namespace)
+            if (services, found.spec_hash) != (spec.discovered, spec.discovered_by):
+                known = replace(spec, discovered=services, discovered_by=found.spec_hash)
+                return raw, known
         return read
 
     def _read(self, raw: bytes) -> PoolSpec:
@@ -233,6 +236,7 @@ class PoolStore:
             StateError: It cannot be written. The event did not happen.
         """
         self._events.append(event)
+        self.heard(event)
 
     def recent(self, count: int = 20) -> list[Event]:
         """Return the last events, oldest first."""

@@ -1,8 +1,8 @@
-"""What the manager tells the rendezvous: whom it admits, and whose certificates it took back.
+"""What the manager signs: whom it admits, whose certificates it took back, and its lease.
 
 The same membership goes to the client proxy of this machine as a file, and to everybody else
-as signed records. Without a rendezvous in the pool file only what was taken back is signed, for
-the client proxy to pass on.
+as signed records. Without a rendezvous in the pool file only what was taken back and the lease are
+signed, for the client proxy to pass on.
 
 Owns: the manager's certificate for signing, and its record client.
 Not here: what the membership is (`reconciler`).
@@ -11,10 +11,12 @@ Not here: what the membership is (`reconciler`).
 from __future__ import annotations
 
 import datetime
+from typing import Any
 
 from fogft.errors import CredentialError
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths, holder_of
+from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Membership
 from fogft.pool.credentials import authority
@@ -23,13 +25,15 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.records import cache
 from fogft.records.client import RendezvousClient
 from fogft.records.record import Record, RecordKind, sign_record
-from fogft.records.roster import admission_content
+from fogft.records.roster import ServingLease, admission_content
 from fogft.records.signing import Signer
 
 CERTIFICATE_DAYS = 365.0
 RENEW_BEFORE = datetime.timedelta(days=60)
 _CERTIFY_EVERY = datetime.timedelta(hours=1)
 _STEM = "manager"
+_LEASE_EVERY_S = 60.0
+_LEASE_SHARE = 0.1  # of a short lease, after which the next one is signed
 
 
 class ManagerRecords:
@@ -49,21 +53,25 @@ class ManagerRecords:
         self._client: RendezvousClient | None = None
         self._certified_at: datetime.datetime | None = None
         self._said: Membership | None = None
+        self._said_lease: ServingLease | None = None
         self._revoked: frozenset[str] = frozenset()
-        self._signed = b""  # that, as it was written last
+        self._lease: ServingLease | None = None
+        self._leases = 0  # how many were signed in this epoch
+        self._announced = b""  # what was written last
 
-    def look(self, endpoints: tuple[str, ...], membership: Membership | None) -> None:
+    def look(
+        self, endpoints: tuple[str, ...], membership: Membership | None, lease: ServingLease
+    ) -> None:
         """Publish what is new, to these rendezvous.
 
         Raises:
             CredentialError: The pool's CA cannot be used.
             StateError: The manager's certificate cannot be written.
         """
-        if membership is not None:
-            self._write_revocations(membership.revoked)
+        self._announce(self._revoked if membership is None else membership.revoked, lease)
         if endpoints != self._endpoints:
             self.close()
-            self._endpoints, self._said = endpoints, None
+            self._endpoints, self._said, self._said_lease = endpoints, None, None
         if not endpoints:
             return
         self._certify(datetime.datetime.now(datetime.timezone.utc))
@@ -75,36 +83,39 @@ class ManagerRecords:
         if membership is not None and membership != self._said:
             self._say(self._client, membership)
             self._said = membership
+        if self._lease is not None and self._lease is not self._said_lease:
+            self._client.publish(RecordKind.LEASE, "", self._epoch, to_plain(self._lease))
+            self._said_lease = self._lease
 
-    def revocations(self) -> bytes:
-        """Return what was taken back up to now, signed, for a launch; empty where nothing was.
+    def announcements(self, lease: ServingLease) -> bytes:
+        """Return what a launch takes along: what was taken back up to now, and a lease, signed.
 
         Raises:
             CredentialError: The pool's CA cannot be used.
             StateError: The list of certificates is damaged, or the result cannot be written.
         """
-        self._write_revocations(Ledger(self._paths.credentials).revoked())
-        return self._signed
+        self._announce(Ledger(self._paths.credentials).revoked(), lease)
+        return self._announced
 
-    def _write_revocations(self, more: frozenset[str]) -> None:
-        """Sign what was taken back, for the client proxy to pass on: there may be no rendezvous."""
+    def _announce(self, more: frozenset[str], lease: ServingLease) -> None:
+        """Sign what is new, for the client proxy to pass on: there may be no rendezvous."""
         revoked = self._revoked | more
-        if revoked == self._revoked:
+        if revoked == self._revoked and not _is_due(self._lease, lease):
             return
         self._certify(datetime.datetime.now(datetime.timezone.utc))
         files = self._files()
-        # Revocations only grow, so their number counts the writings of one epoch.
-        record = Record(
-            self._pool_uid,
-            RecordKind.REVOCATION,
-            "",
-            self._epoch,
-            len(revoked),
-            {"names": sorted(revoked)},
-        )
-        signed = sign_record(record, Signer(files.certificate, files.key))
-        cache.write(self._paths.revocations, [signed])
-        self._revoked, self._signed = revoked, self._paths.revocations.read_bytes()
+        signer = Signer(files.certificate, files.key)
+        self._leases += 1
+        records = [self._record(RecordKind.LEASE, self._leases, to_plain(lease))]
+        if revoked:  # they only grow, so their number counts the writings of one epoch
+            names_ = {"names": sorted(revoked)}
+            records.append(self._record(RecordKind.REVOCATION, len(revoked), names_))
+        cache.write(self._paths.announcements, [sign_record(one, signer) for one in records])
+        self._announced = self._paths.announcements.read_bytes()
+        self._revoked, self._lease = revoked, lease
+
+    def _record(self, kind: RecordKind, sequence: int, content: dict[str, Any]) -> Record:
+        return Record(self._pool_uid, kind, "", self._epoch, sequence, content)
 
     def _files(self) -> CredentialPaths:
         folder = self._paths.credentials
@@ -153,3 +164,11 @@ class ManagerRecords:
         client, self._client = self._client, None
         if client is not None:
             client.close()
+
+
+def _is_due(signed: ServingLease | None, now: ServingLease) -> bool:
+    """Whether a lease that could be signed now is worth it: it lasts longer than the last one."""
+    if signed is None:
+        return True
+    since_s = abs(now.at - signed.at)
+    return since_s >= min(_LEASE_EVERY_S, _LEASE_SHARE * now.lasts_s)

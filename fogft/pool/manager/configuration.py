@@ -96,7 +96,6 @@ def proxy_config(
         robot=name or robot_name(),
         membership=Path(paths.membership.name),
         status=Path(paths.proxy_status.name),
-        lease=Path(paths.lease.name),
         lock=Path(paths.proxy_lock.name),
         credentials=CredentialPaths(
             folder / "ca.crt", folder / f"{stem}.crt", folder / f"{stem}.key"
@@ -106,10 +105,10 @@ def proxy_config(
         rendezvous=spec.rendezvous,
         records=Path(paths.records.name),
     )
-    if role is Role.ROBOT:  # a gateway's replicas hear of revocations from a rendezvous
+    if role is Role.ROBOT:  # a gateway's replicas hear the manager through a rendezvous
         config = replace(
             config,
-            revocations=Path(paths.revocations.name),
+            announcements=Path(paths.announcements.name),
             rmw=spec.rmw.robot,
             topics=spec.topics,
         )
@@ -161,12 +160,13 @@ def build_order(
     spec: PoolSpec,
     planned: PlannedLaunch,
     *,
-    revocations: bytes = b"",
+    announcements: bytes = b"",
 ) -> Launch:
     """Return the order of a planned launch, with all that its server proxy needs.
 
     Args:
-        revocations: What was taken back, signed: it is let in by no replica, however new.
+        announcements: What the manager has signed: whom no replica lets in, however new, and for
+            how long it serves without hearing of the manager.
 
     Raises:
         CredentialError: The pool's CA cannot be used.
@@ -183,12 +183,12 @@ def build_order(
         task=workspace.with_build(absolute(task_at(spec, id.slot), Path(identity.file).parent)),
         files={
             "replica.yaml": replica_config(
-                identity, spec, id, revocations=bool(revocations)
+                identity, spec, id, announcements=bool(announcements)
             ).encode(),
             "ca.crt": issued.authority_pem,
             "replica.crt": issued.certificate_pem,
             "replica.key": issued.key_pem,
-            **({paths.revocations.name: revocations} if revocations else {}),
+            **({paths.announcements.name: announcements} if announcements else {}),
         },
         link_port=spec.link_port,
         dials_out=bool(spec.dial_in),
@@ -196,12 +196,12 @@ def build_order(
 
 
 def replica_config(
-    identity: Identity, spec: PoolSpec, id: ReplicaId, *, revocations: bool = False
+    identity: Identity, spec: PoolSpec, id: ReplicaId, *, announcements: bool = False
 ) -> str:
     """Return a replica's configuration. Address, domain and folder are the machine's to add.
 
     Args:
-        revocations: Whether the pool's signed revocations lie beside it.
+        announcements: Whether what the manager has signed lies beside it.
     """
     services = services_at(spec, id.slot)
     envs: dict[str, Any] = dict(spec.task.get("envs") or {})
@@ -216,10 +216,9 @@ def replica_config(
         run=str(spec.task.get("run") or ""),
         credentials=CredentialPaths(Path("ca.crt"), Path("replica.crt"), Path("replica.key")),
         envs={str(k): "" if v is None else str(v) for k, v in envs.items()},
-        orphan_after_s=spec.orphan_after_s,
         rendezvous=spec.rendezvous,
         records=Path("records.json"),
-        revocations=Path(PoolPaths(Path()).revocations.name) if revocations else None,
+        announcements=Path(PoolPaths(Path()).announcements.name) if announcements else None,
         dial_out=(spec.dial_in,) if spec.dial_in else (),
         # Those that the manager launches may share an address; others have one of their own.
         metrics=spec.metrics.of_replica(id.slot if id.slot < FIRST_BY_HAND else 0),

@@ -13,7 +13,6 @@ Not here: what answers where (`fogft.cloud.geography`), what they are for (`fogf
 
 from __future__ import annotations
 
-import contextlib
 import math
 import socket
 import statistics
@@ -24,11 +23,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from fogft import disk
 from fogft.cloud import geography
 from fogft.errors import StateError
 from fogft.model.choices import PlacementSpec
+from fogft.model.plain import Moment, stored, within
 from fogft.model.replica import LinkReport, LinkState, Machine, Offer
 from fogft.model.spec import PoolSpec
 
@@ -50,9 +51,9 @@ class Distance:
         as_of: When it was measured, in seconds since the epoch; 0 where that means nothing.
     """
 
-    rtt_s: float
-    source: str
-    as_of: float = 0.0
+    rtt_s: Annotated[float, within(1e-9, 60)]
+    source: str = "measured"
+    as_of: Moment = 0.0
 
 
 def connect_time(host: str, port: int) -> float:
@@ -98,11 +99,10 @@ class Latencies:
 
     def measured(self) -> Mapping[str, Distance]:
         """Return what was measured here, whatever its age. A damaged file holds nothing."""
-        with contextlib.suppress(StateError, OSError):
-            raw = disk.read_json(self._file)
-            if isinstance(raw, dict):
-                return {k: d for k, v in raw.items() if (d := _distance(v)) is not None}
-        return {}
+        try:
+            return stored(dict[str, Distance], disk.read_json(self._file) or {}, "")
+        except StateError:
+            return {}
 
     def stale(self, regions: Collection[str]) -> list[str]:
         """Return the regions that should be measured: never, or a day ago, or in the future."""
@@ -224,11 +224,3 @@ def _estimated(region: str, placement: PlacementSpec) -> Distance | None:
     if placement.robot_at is None or there is None:
         return None
     return Distance(geography.estimated_rtt_s(placement.robot_at, there), "estimated")
-
-
-def _distance(raw: object) -> Distance | None:
-    try:
-        rtt_s, as_of = float(raw["rtt_s"]), float(raw["as_of"])  # type: ignore[index]
-    except (KeyError, TypeError, ValueError):
-        return None
-    return Distance(rtt_s, "measured", as_of) if 0 < rtt_s < 60 and math.isfinite(as_of) else None

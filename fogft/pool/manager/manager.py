@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fogft import disk, logfile
-from fogft.cloud.port import Cloud, Launch
+from fogft import __version__, disk, logfile
+from fogft.cloud.port import Accounts, Cloud, Launch
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.metrics.scrape import Scrape
 from fogft.model.reason import Cause, Reason, because
@@ -28,23 +28,36 @@ from fogft.model.spec import PoolSpec
 from fogft.planning import lifetime
 from fogft.planning.planner import PlannedLaunch
 from fogft.pool.credentials.ledger import Ledger
+from fogft.pool.folder.costs import CostBook, path_of
 from fogft.pool.folder.discovered import Discovery
 from fogft.pool.folder.lease import Lease
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.folder.store import Identity, PoolStore
-from fogft.pool.manager import clocks, configuration, proxy_report, shutdown, status, teardown
+from fogft.pool.manager import (
+    clocks,
+    configuration,
+    proxy_report,
+    restarting,
+    shutdown,
+    status,
+    teardown,
+)
 from fogft.pool.manager.announcing import ManagerRecords
 from fogft.pool.manager.distances import Distances, Latencies
 from fogft.pool.manager.metrics import of_pool
+from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 from fogft.pool.manager.reconciler import Reconciler, Tick
-from fogft.process import start_log, stop_on_signal
+from fogft.pool.manager.tally import Tally
+from fogft.process import Watchdog, notify, start_log, stop_on_signal
+from fogft.records.roster import ServingLease
 
 log = logging.getLogger(__name__)
 
 TICK_S = 1.0
 WATCH_S = 0.05
 CERTIFY_EVERY_S = 3600.0
+RUN_ENDED_S = 300.0  # from the end of `run` to that of its machine
 LEAVE_LIMIT_S = 60.0  # then it is tried again in the next round
 
 
@@ -61,6 +74,7 @@ class Manager:
         cloud: Where its machines run.
         proxy_command: What to start as client proxy, in place of our own.
         metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
+        keeps_proxy: Whether it starts client proxies; else somebody else does.
 
     Raises:
         PoolBusy: The pool has a manager.
@@ -74,7 +88,9 @@ class Manager:
         *,
         proxy_command: Sequence[str] | None = None,
         metrics: str | None = None,
+        keeps_proxy: bool = True,
     ) -> None:
+        self._keeps_proxy = keeps_proxy
         self._store = store
         self._cloud = cloud
         self._paths = store.paths
@@ -82,7 +98,9 @@ class Manager:
         published = store.membership()
         self._lease = Lease.take(self._paths, at_least=published.epoch if published else 0)
         self._wake = threading.Event()
-        self._proxy = ProxySupervisor(self._paths, time.monotonic, proxy_command)
+        self._proxy = ProxySupervisor(
+            self._paths, time.monotonic, proxy_command, ended=self._wake.set
+        )
         self._ledger = Ledger(self._paths.credentials)
         self._certified_at: float | None = None
         self._revoked: frozenset[str] = frozenset()
@@ -92,9 +110,15 @@ class Manager:
         self._digest: object = None
         self._trouble: list[Reason] = []
         self._told: status.PoolStatus | None = None
-        self._scrape = Scrape(lambda: of_pool(self._told), {"pool": self._identity.name})
+        self._tally = Tally()
+        store.heard = self._tally.heard
+        self._scrape = Scrape(
+            lambda: of_pool(self._told, self._tally), {"pool": self._identity.name}
+        )
         self._metrics = metrics
         self._replicas: Sequence[status.ReplicaStatus] = ()
+        costs = path_of(self._paths.costs, self._identity.name, self._identity.uid)
+        self._costs = CostBook(costs, self._identity.name, self._identity.uid)
         self._reconciler = Reconciler(
             cloud,
             store,
@@ -119,10 +143,15 @@ class Manager:
         """
         log.info("manager_started pool=%s epoch=%d", self._identity.name, self._lease.epoch)
         try:
+            self._attempt(lambda: restarting.allow(self._paths))
+            watchdog = Watchdog()
             while not stop.is_set():
                 if self._work():
                     break
+                notify("READY=1")
+                watchdog.work()
                 self._rest(stop)
+            restarting.forbid(self._paths)
         except PoolNotFound:
             log.info("manager_stopped pool=%s reason=ended", self._identity.name)
         finally:
@@ -145,8 +174,9 @@ class Manager:
         if tick is None:
             return False
         self._scrape.at(tick.spec.metrics.manager if self._metrics is None else self._metrics)
+        self._attempt(lambda: self._charge(tick))
         self._attempt(lambda: self._discover(tick))
-        self._attempt(lambda: self._records.look(tick.spec.rendezvous, tick.membership))
+        self._attempt(lambda: self._announce(tick))
         if tick.over and tick.observed.machines == ():
             self._attempt(self._leave)
             if not self._trouble:
@@ -161,15 +191,31 @@ class Manager:
             logfile.bound(path)
 
     def _build_order(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
-        taken_back = self._records.revocations()
-        return configuration.build_order(
-            self._paths, identity, spec, planned, revocations=taken_back
-        )
+        signed = self._records.announcements(self._serving_lease(spec))
+        return configuration.build_order(self._paths, identity, spec, planned, announcements=signed)
+
+    def _announce(self, tick: Tick) -> None:
+        lease = self._serving_lease(tick.spec)
+        self._records.look(tick.spec.rendezvous, tick.membership, lease)
+
+    def _serving_lease(self, spec: PoolSpec) -> ServingLease:
+        now, begun_at = time.time(), self._begun_at()
+        return ServingLease(now, lifetime.unmanaged_s(spec, begun_at, now))
+
+    def _begun_at(self) -> float:
+        history = self._store.history()
+        return lifetime.begun_at(self._store.intent(), self._identity.created_at, history)
 
     def _discover(self, tick: Tick) -> None:
-        if self._discovery.look(tick.spec, tick.observed):
+        if self._discovery.look(tick.spec, tick.observed, tick.plan.wanted):
             log.info("services_discovered pool=%s", self._identity.name)
             self._wake.set()  # the client proxy is to know
+
+    def _charge(self, tick: Tick) -> None:
+        seen = tick.observed
+        if seen.machines is not None:
+            alone_s = tick.spec.unmanaged_max_hours * lifetime.HOUR_S + RUN_ENDED_S
+            self._costs.look(seen.now, seen.machines, seen.offers, alone_s)
 
     def _leave(self) -> None:
         """See to it that nothing of a pool that ends by itself is left but its folder."""
@@ -215,15 +261,19 @@ class Manager:
             configuration.certify_robot(self._paths, self._identity, self._store.spec(), utc)
             self._certified_at, self._revoked = now, revoked
         configuration.write_proxy_config(self._paths, self._identity, self._store.spec())
-        intent = self._store.intent()
-        begun_at = lifetime.begun_at(intent, self._identity.created_at, self._store.history())
-        over = lifetime.is_over(self._store.spec(), begun_at, time.time())
-        if not intent.stopping and not over:
-            self._proxy.look()
+        over = lifetime.is_over(self._store.spec(), self._begun_at(), time.time())
+        if self._keeps_proxy and not self._store.intent().stopping and not over:
+            report = self._fresh_report(time.time())
+            version = "" if report is None else report.version
+            self._proxy.look(outdated=version not in ("", __version__))
+
+    def _fresh_report(self, now: float) -> ProxyReport | None:
+        report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
+        return report if report is not None and report.fresh(now) else None
 
     def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...] | None:
-        report = proxy_report.read(self._paths.proxy_status, pool_uid)
-        return report.links if report is not None and report.fresh(now) else None
+        report = self._fresh_report(now)
+        return None if report is None else report.links
 
     def _write_status(self, tick: Tick, ended: str = "") -> None:
         report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
@@ -237,6 +287,7 @@ class Manager:
         if (report is None or not fresh) and not tick.over:
             cause = Cause.STALE_PROXY_REPORT if report else Cause.NO_PROXY_REPORT
             notes.append(Reason(cause))
+        ends_at = self._cloud.credentials_end_at() if isinstance(self._cloud, Accounts) else None
         seen = status.of_tick(
             tick,
             history=self._store.history(),
@@ -246,6 +297,8 @@ class Manager:
             manager_pid=os.getpid(),
             proxy_alive=fresh,
             notes=notes,
+            usd_to_date=self._costs.usd,
+            credentials_end_at=ends_at,
         )
         if seen.cloud_reachable:
             self._replicas = seen.replicas
@@ -257,6 +310,7 @@ class Manager:
             )
             log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
         self._told = seen
+        self._tally.seen(seen.replicas, tick.observed.now)
         disk.write_json(self._paths.status, seen.to_json(), durable=False)
 
     # -- waiting ----------------------------------------------------------------------------
@@ -290,6 +344,7 @@ def run(
     *,
     proxy_command: Sequence[str] | None = None,
     metrics: str | None = None,
+    keeps_proxy: bool = True,
 ) -> None:
     """Run a pool's manager in this process until a signal ends it, or the pool has ended.
 
@@ -298,6 +353,7 @@ def run(
         cloud_of: Returns the cloud that a pool runs on.
         proxy_command: What to start as client proxy, in place of our own.
         metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
+        keeps_proxy: Whether it starts client proxies; else somebody else does.
 
     Raises:
         PoolBusy: The pool has a manager, or a later one has taken over.
@@ -306,4 +362,6 @@ def run(
     start_log()
     stop = stop_on_signal()
     cloud = cloud_of(store.identity())
-    Manager(store, cloud, proxy_command=proxy_command, metrics=metrics).run(stop)
+    Manager(
+        store, cloud, proxy_command=proxy_command, metrics=metrics, keeps_proxy=keeps_proxy
+    ).run(stop)

@@ -9,17 +9,19 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fogft.metrics.families import gauge
+from fogft.metrics.families import counter, gauge
 from fogft.metrics.proxies import by_event
 from fogft.model.replica import Phase
 from fogft.pool.manager.status import PoolStatus
+from fogft.pool.manager.tally import Tally
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
 
-def of_pool(status: PoolStatus | None) -> Iterator[Metric]:
+def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
     """Yield the metrics of a pool as its manager last saw it; none before the first time."""
+    yield from tally.metrics()
     if status is None:
         return
     gauges = {
@@ -44,6 +46,13 @@ def of_pool(status: PoolStatus | None) -> Iterator[Metric]:
     }
     for name, (help, value) in gauges.items():
         yield gauge(name, help, [(value, {})])
+    ends_at = status.credentials_end_at
+    yield gauge(
+        "fogft_credentials_left_seconds",
+        "Until the cloud's credentials end, where that is known.",
+        [] if ends_at is None else [(ends_at - status.observed_at, {})],
+    )
+    yield counter("fogft_pool_usd_total", "What the pool has cost.", [(status.usd_to_date, {})])
     phases = Counter(replica.phase for replica in status.replicas)
     yield gauge(
         "fogft_pool_replicas",

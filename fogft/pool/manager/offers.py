@@ -14,6 +14,7 @@ from fogft.errors import SpecError
 from fogft.model.groups import sales
 from fogft.model.replica import Offer
 from fogft.model.spec import PoolSpec
+from fogft.planning.cost import GB, egress_bytes_per_s, egress_price
 
 
 class Seller(Protocol):
@@ -34,8 +35,22 @@ def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
     places = {group.name: f"fogft.groups[{n}]." for n, group in enumerate(spec.groups)}
     for name, resources in sales(spec):
         try:
-            sold = cloud.offers(resources)
+            sold = cloud.offers({**resources, "ports": []} if spec.dial_in else resources)
         except SpecError as error:
             raise SpecError(places.get(name, "") + error.message, error.hint) from error
-        found += [offer if offer.group == name else replace(offer, group=name) for offer in sold]
+        found += [
+            _priced(offer if offer.group == name else replace(offer, group=name), spec)
+            for offer in sold
+        ]
     return tuple(found)
+
+
+def _priced(offer: Offer, spec: PoolSpec) -> Offer:
+    """Return an offer with what leaves one replica, where the file says what is asked of it."""
+    price = egress_price(offer.placement.cloud)
+    if not price or not any(one.traffic.response_bytes for one in spec.services):
+        return offer
+    carriers = {service.name: spec.replicas for service in spec.services}
+    egress = egress_bytes_per_s(spec.services, carriers) * 3600 / GB * price
+    total = offer.usd_per_hour + egress
+    return replace(offer, usd_per_hour=total, egress_usd_per_hour=egress)

@@ -10,8 +10,9 @@ import contextlib
 import os
 import select
 import signal
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from fogft import disk
@@ -20,7 +21,11 @@ POLL_S = 0.05
 
 
 def lock_holder(lock: Path) -> int | None:
-    """Return the process that holds an flock, by the kernel's own list; None for nobody."""
+    """Return the process that holds a lock; None for nobody.
+
+    By the kernel's own list; in a container, whose overlays that list may know by another device,
+    by what the holder wrote.
+    """
     try:
         stat = lock.stat()
         lines = Path("/proc/locks").read_text().splitlines()
@@ -32,7 +37,11 @@ def lock_holder(lock: Path) -> int | None:
         if len(fields) >= 6 and fields[1] == "FLOCK" and fields[5] == wanted:
             pid = int(fields[4])
             return pid if pid > 0 else None
-    return None
+    try:
+        said = int(lock.read_text())
+    except (OSError, ValueError):
+        return None
+    return said if disk.is_locked(lock) else None
 
 
 def end_holder(lock: Path, *, suspected_pid: int | None, patience_s: float = 10.0) -> int | None:
@@ -66,6 +75,20 @@ def end_holder(lock: Path, *, suspected_pid: int | None, patience_s: float = 10.
     return pid
 
 
+def call_at_end(pid: int, call: Callable[[], None]) -> None:
+    """Call a function, on a thread of its own, when a process has ended; its parent need not be us.
+
+    At once where it has gone; never where the kernel cannot tell (older than 5.3).
+    """
+
+    def wait() -> None:
+        with _opened(pid) as process:
+            if process.wait():
+                call()
+
+    threading.Thread(target=wait, name=f"end-of-{pid}", daemon=True).start()
+
+
 class _Process:
     """A process that stays this one, even if its number is given to another."""
 
@@ -77,6 +100,14 @@ class _Process:
     def alive(self) -> bool:
         """Whether it has not ended; a zombie has. False where the kernel cannot tell."""
         return self._descriptor is not None and not select.select([self._descriptor], [], [], 0)[0]
+
+    def wait(self) -> bool:
+        """Wait until it has ended; return whether it has, which an old kernel cannot tell."""
+        if self._descriptor is not None:
+            ended = select.poll()
+            ended.register(self._descriptor, select.POLLIN)
+            ended.poll()
+        return self._descriptor is not None or not Path("/proc", str(self._pid)).exists()
 
     def send(self, number: signal.Signals) -> None:
         """Send it a signal."""

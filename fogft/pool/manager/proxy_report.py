@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from fogft import disk
 from fogft.errors import StateError
-from fogft.model.plain import Seconds, from_plain
+from fogft.model.plain import Count, Line, Moment, Seconds, from_plain
 from fogft.model.replica import LinkReport, LinkState
 
 STALE_S = 5.0
@@ -32,6 +33,54 @@ class GatewayLink:
 
 
 @dataclass(frozen=True)
+class _Order:
+    trouble: str = ""
+
+
+@dataclass(frozen=True)
+class Counted:
+    """The counters of a service that people are shown; a report has further ones."""
+
+    received: Count = 0
+    answered: Count = 0
+    fallback: Count = 0
+    silent: Count = 0
+    empty: Count = 0
+    turned_away: Count = 0
+    poison: Count = 0
+    late: Count = 0
+    pending: Count = 0
+    needed_replicas: Count = 0
+    poisoned_at: Moment | None = None
+    p50_s: Seconds | None = None
+    p99_s: Seconds | None = None
+    order: _Order | None = None
+    trouble: str = ""
+
+
+Counters = Annotated[Mapping[str, Any], partial(from_plain, Counted)]
+
+
+@dataclass(frozen=True)
+class TopicCounted:
+    """What became of a topic's messages.
+
+    Attributes:
+        messages: Published by the robot's nodes; or by replicas', each replica's counted.
+        passed: Published on the other side: of the robot's, by one replica at least.
+        dropped: Too many for a replica, or another replica's copy.
+        trouble: Why none pass; empty while they may.
+    """
+
+    messages: Count = 0
+    passed: Count = 0
+    dropped: Count = 0
+    refused: Count = 0
+    rate_hz: Seconds = 0.0
+    trouble: str = ""
+
+
+@dataclass(frozen=True)
 class ProxyReport:
     """One report of the client proxy.
 
@@ -41,11 +90,13 @@ class ProxyReport:
     """
 
     pid: int
-    written_at: float
+    written_at: Moment
     robot: str = ""
+    version: Line = ""
     uptime_s: float = 0.0
     links: tuple[LinkReport, ...] = ()
-    services: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    services: Mapping[str, Counters] = field(default_factory=dict)
+    topics: Mapping[str, TopicCounted] = field(default_factory=dict)
     uplink_suspected: bool = False
     gateways: tuple[GatewayLink, ...] = ()
 

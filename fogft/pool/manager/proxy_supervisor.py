@@ -1,38 +1,53 @@
-"""Keep the client proxy running: adopt the one that runs, start one where there is none.
+"""Keep the client proxy running, and another one in line behind it.
 
-Its death is no reason to touch a replica, and its life needs no manager: it is started in
-a session of its own and lives on when the manager goes.
+The death of one is no reason to touch a replica, and its life needs no manager: each is started
+in a session of its own and lives on when the manager goes. The one in line takes over by itself,
+in the instant in which the first ends; here both are started, and adopted where they run already.
 
-Owns: starting it again, with backoff.
+Owns: starting them again, with backoff.
 Not here: its configuration (`configuration`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 from fogft import disk
 from fogft.child import detached
 from fogft.model.reason import Cause, Reason
 from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager import process_control
 
 log = logging.getLogger(__name__)
 
 BACKOFF_S = 1.0
 BACKOFF_LIMIT_S = 30.0
-STEADY_S = 30.0  # one that ran so long earns a quick restart
+STEADY_S = 30.0  # one that ran so long is no failure
+CALM_S = 3.0  # so long a proxy works before another one is put in line: its start takes a core
+START_LIMIT_S = 20.0  # one that has neither place by then will not get one
+
+
+class _Child(NamedTuple):
+    process: subprocess.Popen[bytes]
+    started_at: float
 
 
 class ProxySupervisor:
-    """Looks after one client proxy; `look` is called with each tick.
+    """Looks after a pool's client proxies; `look` is called with each tick.
 
     Args:
         paths: The pool's folder.
         clock: Monotonic seconds.
-        command: What to start; ``python -m fogft proxy --config ...`` unless told.
+        command: What to start, alone; ``python -m fogft proxy --config ...`` unless told.
+        ended: Called, from any thread, when a proxy has ended: then `look` is due at once.
     """
 
     def __init__(
@@ -40,46 +55,95 @@ class ProxySupervisor:
         paths: PoolPaths,
         clock: Callable[[], float],
         command: Sequence[str] | None = None,
+        ended: Callable[[], None] = lambda: None,
     ) -> None:
         self._paths = paths
         self._clock = clock
+        self._alone = command is not None
         self._command = command or (
             *(sys.executable, "-m", "fogft"),
-            *("proxy", "--config", str(paths.proxy_config)),
+            *("proxy", "--standby", "--config", str(paths.proxy_config)),
         )
-        self.child: subprocess.Popen[bytes] | None = None
-        self._started_at = 0.0
+        self._tell_ended = ended
+        self._children: list[_Child] = []
+        self._watched: set[int] = set()
+        self._ending: set[int] = set()
+        self._works_since: tuple[int | None, float] = (None, 0.0)
         self._next_at = 0.0
         self._failures = 0
 
-    def look(self) -> bool:
-        """Start the proxy where it is missing; return whether one runs."""
-        if self.child is not None:
-            if self.child.poll() is None:
+    def look(self, *, outdated: bool = False) -> bool:
+        """Start what is missing; return whether a proxy works, or starts.
+
+        Args:
+            outdated: The one that works is of another version of fogft: one of ours takes over.
+        """
+        now = self._clock()
+        for child in [one for one in self._children if one.process.poll() is not None]:
+            self._children.remove(child)
+            self._ended(child.process.returncode, now - child.started_at)
+        working = self._holder(self._paths.proxy_lock)
+        waiting = self._holder(self._paths.standby_lock)
+        if working is None and waiting is not None:
+            return True  # it is about to take over
+        if working is not None and self._works_since[0] != working:
+            self._works_since = working, now
+        if outdated:
+            self._hand_over(working, waiting)
+        placed = {working, waiting}
+        for child in self._children:
+            if child.process.pid not in placed and now - child.started_at < START_LIMIT_S:
                 return True
-            self._ended(self.child.returncode)
-            self.child = None
-        # Only asked when none of ours runs: asking takes the lock for a moment.
-        if disk.is_locked(self._paths.proxy_lock):
-            return True
-        if self._clock() < self._next_at:
-            return False
-        self._started_at = self._clock()
-        self.child = detached(self._command, self._paths.proxy_log)
-        log.info("proxy_started pid=%d", self.child.pid)
+        calm = now - self._works_since[1] >= CALM_S
+        complete = waiting is not None or self._alone or not calm
+        if (working is not None and complete) or now < self._next_at:
+            return working is not None
+        process = detached(self._command, self._paths.proxy_log)
+        self._children.append(_Child(process, now))
+        self._watch(process.pid)
+        log.info("proxy_started pid=%d standby=%s", process.pid, working is not None)
         return True
 
-    def _ended(self, status: int) -> None:
-        ran_s = self._clock() - self._started_at
-        self._failures = 1 if ran_s > STEADY_S else self._failures + 1
-        wait_s = min(BACKOFF_S * 2.0 ** min(self._failures - 1, 16), BACKOFF_LIMIT_S)
-        self._next_at = self._clock() + (0.0 if ran_s > STEADY_S else wait_s)
+    def _hand_over(self, working: int | None, waiting: int | None) -> None:
+        """End what is not ours, the one that works only once one of ours can take its place."""
+        ours = {child.process.pid for child in self._children}
+        in_line = waiting in ours
+        last = working if in_line or self._alone else waiting
+        if last and last not in ours and last not in self._ending:
+            self._ending.add(last)
+            log.info("proxy_outdated pid=%d", last)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(last, signal.SIGTERM)
+
+    def _holder(self, lock: Path) -> int | None:
+        """Return who holds a lock, 0 for somebody unknown, None for nobody; hear of its end."""
+        pid = process_control.lock_holder(lock)
+        if pid is None:
+            return 0 if disk.is_locked(lock) else None
+        self._watch(pid)
+        return pid
+
+    def _watch(self, pid: int) -> None:
+        def gone() -> None:
+            self._watched.discard(pid)
+            self._ending.discard(pid)
+            self._tell_ended()
+
+        if pid not in self._watched:
+            self._watched.add(pid)
+            process_control.call_at_end(pid, gone)
+
+    def _ended(self, status: int, ran_s: float) -> None:
+        self._failures = 0 if ran_s > STEADY_S else self._failures + 1
         log.warning("proxy_ended status=%d ran_s=%.1f", status, ran_s)
+        if self._failures > 1:
+            wait_s = min(BACKOFF_S * 2.0 ** min(self._failures - 2, 16), BACKOFF_LIMIT_S)
+            self._next_at = self._clock() + wait_s
 
     @property
     def trouble(self) -> Reason | None:
         """Return what is wrong with it; None when nothing is."""
-        if self._failures < 2 or self.child is not None:
+        if self._failures < 2 or self._children:
             return None
         log_name = str(self._paths.proxy_log)
         return Reason(Cause.PROXY_KEEPS_ENDING, count=self._failures, name=log_name)

@@ -35,6 +35,7 @@ from fogft.model.replica import (
     ReplicaId,
     by_id,
 )
+from fogft.model.schedule import Wish, wish
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import certified
 from fogft.planning import lifetime
@@ -285,8 +286,9 @@ class Reconciler:
     ) -> None:
         self._mark_draining(plan, observed, history)
         self._publish(identity, spec, observed, plan)
+        slack = _slack(spec, observed, plan)
         for planned in plan.launches:
-            self._launch(identity, spec, planned)
+            self._launch(identity, spec, planned, slack)
         for end in plan.terminations:
             self._terminate(end.id, end.reason, history)
 
@@ -337,8 +339,12 @@ class Reconciler:
             self._membership = membership
         self._published_for = cause
 
-    def _launch(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> None:
+    def _launch(
+        self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch, slack: float | None
+    ) -> None:
         order = self._build_order(identity, spec, planned)
+        if slack is not None:
+            order = replace(order, limit_usd_per_hour=order.usd_per_hour + slack)
         location = order.placement.location
         self._remember.add(
             EventKind.LAUNCH,
@@ -384,6 +390,17 @@ class Reconciler:
         if not hopeless or fault_of(note.because[0]) is not Cause.NOT_READY:
             return note
         return replace(note, words=f"\n{self._log_tail}")
+
+
+def _slack(spec: PoolSpec, observed: Observed, plan: Plan) -> float | None:
+    """Return by how much each launch may cost more than planned; None where there is no cap."""
+    usual = Wish(spec.replicas, spec.max_usd_per_hour)
+    now = wish(spec.schedule, observed.now, usual) if spec.schedule is not None else usual
+    if now.max_usd_per_hour is None or not plan.launches:
+        return None
+    spent = sum(machine.usd_per_hour for machine in observed.machines or ())
+    spent += sum(planned.offer.usd_per_hour for planned in plan.launches)
+    return max(0.0, now.max_usd_per_hour - spent) / len(plan.launches)
 
 
 def _refusal(error: Exception) -> Cause | None:

@@ -66,6 +66,8 @@ def end(
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             store.write_intent(replace(_intent(store), stopping=True))
         end_client_proxy(paths, identity.uid, done)
+        # The client proxy may have started one since.
+        _end_process(done, "manager", paths.manager_lock, lease.read_pid(paths))
         teardown.end_machines(
             cloud_of(identity),
             identity.uid,
@@ -81,11 +83,12 @@ def end(
 
 
 def end_client_proxy(paths: PoolPaths, uid: str, done: Callable[[str], None]) -> None:
-    """End a pool's client proxy; tell it if there was one. Repeatable.
+    """End a pool's client proxy, and the one in line behind it, which would take over. Repeatable.
 
     Raises:
         FogftError: It does not end.
     """
+    _end_process(lambda _: None, "standby client proxy", paths.standby_lock, None)
     report = proxy_report.read(paths.proxy_status, uid)
     pid = report.pid if report is not None else None
     _end_process(done, "client proxy", paths.proxy_lock, pid)
@@ -105,7 +108,8 @@ def _end_process(
     if disk.is_locked(lock):
         raise FogftError(
             f"the {what} of `{lock.parent.name}` does not end",
-            "it belongs to another user, or hangs in the kernel; end it and run `fogft down` again",
+            "it belongs to another user, or hangs in the kernel; end "
+            "it, then run `fogft down` again",
         )
     if pid is not None:
         done(f"{what} (pid {pid})")

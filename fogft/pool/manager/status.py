@@ -6,21 +6,25 @@ Not here: how it is shown (`fogft.cli`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from fogft.errors import StateError
-from fogft.model.plain import from_plain, to_plain
+from fogft import __version__
+from fogft.model.plain import Moment, Seconds, from_plain, stored, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
+from fogft.model.topic import PREFIX, Origin
+from fogft.model.topology import Gateway, RobotRoute, Topology, trouble
 from fogft.planning.observed.history import MOVING, Event, EventKind, History
+from fogft.pool.manager.proxy_report import Counters, ProxyReport, TopicCounted
 from fogft.reason_words import words
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
+    from fogft.model.replica import Machine
     from fogft.model.spec import PoolSpec
     from fogft.planning.observed.health import Assessment
-    from fogft.pool.manager.proxy_report import ProxyReport
+    from fogft.planning.observed.history import Record
     from fogft.pool.manager.reconciler import Tick
 
 T = TypeVar("T")
@@ -53,10 +57,16 @@ class ReplicaStatus:
             ``at risk``.
         age_s: Since its launch; None where that was somebody else's.
         differs: The type of a service is not the same there as here; `detail` says how.
+        differing: The services of such types.
         reason: Why the verdict is not ``good``, as ``{cause, ...}``; None when it is.
         known: Whether `phase` and `link` are known now; else `phase` is what was last seen.
         has_served: Whether it was ready before: one that is ``starting`` then has lost its
             service, or cannot be reached.
+        lease_left_s: Until it shuts down unless it hears of the manager again.
+        version: Of fogft on the replica; empty where it is not known.
+        provisioning_s: From its order until the machine ran; then `setup_s` until `setup` was done
+            and `starting_s` until it was ready. None where it is not known, or not over.
+        ready_after_s: From its order until it was ready for the first time.
     """
 
     slot: int
@@ -77,9 +87,17 @@ class ReplicaStatus:
     age_s: float | None
     detail: str
     differs: bool = False
+    differing: Sequence[str] = ()
     reason: Reason | None = None
     known: bool = True
     has_served: bool = False
+    lease_left_s: float | None = None
+    strangers: int = 0
+    version: str = ""
+    provisioning_s: float | None = None
+    setup_s: float | None = None
+    starting_s: float | None = None
+    ready_after_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +107,35 @@ class ServiceStatus:
     name: str
     type: str
     ready_replicas: int
-    counters: Mapping[str, Any] = field(default_factory=dict)
+    counters: Counters = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TopicStatus:
+    """One topic, of an action or by itself.
+
+    Attributes:
+        origin: Who publishes, ``robot`` or ``replicas``.
+        heard_by: The replicas, as ``slot.generation``, that pass it on now: of a topic of the
+            robot's those where a node subscribes.
+        counters: What the client proxy counted.
+    """
+
+    name: str
+    type: str
+    origin: str = field(metadata={"words": tuple(origin.value for origin in Origin)})
+    heard_by: Sequence[str] = ()
+    counters: TopicCounted = field(default_factory=TopicCounted)
+
+    def seen(self, links: Iterable[LinkReport], counted: Mapping[str, TopicCounted]) -> TopicStatus:
+        """Return it as links and counters say it is now."""
+        key = PREFIX + self.name
+        ups = (one for one in links if one.state is LinkState.UP and key in one.ready)
+        return replace(
+            self,
+            heard_by=sorted(one.id.short for one in ups),
+            counters=counted.get(self.name, self.counters),
+        )
 
 
 @dataclass(frozen=True)
@@ -122,12 +168,46 @@ class EventStatus:
         detail: Why, in words; `reason` is the same as ``{cause, ...}``.
     """
 
-    at: float
+    at: Moment
     event: str = field(metadata={"words": tuple(WORDS.values())})
     replica: str
     location: str
     detail: str
     reason: Reason | None = None
+
+
+@dataclass(frozen=True)
+class _DrawnGateway:
+    name: str
+    endpoint: str
+    through: tuple[str, ...]
+    generations: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _DrawnLink:
+    name: str
+    state: str
+    rtt_s: Seconds | None
+    detail: str
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    robot: str
+    gateways: tuple[_DrawnGateway, ...]
+    robots: Mapping[str, tuple[str, ...]]
+    through: tuple[str, ...]
+    links: tuple[_DrawnLink, ...]
+
+
+def _check_drawn(raw: Mapping[str, Any]) -> None:
+    if raw:
+        drawn = from_plain(_Drawn, raw)
+        gateways = tuple(Gateway(one.name, one.endpoint, one.through) for one in drawn.gateways)
+        routes = tuple(RobotRoute(name, through) for name, through in drawn.robots.items())
+        if wrong := trouble(Topology(gateways, routes, drawn.through)):
+            raise ValueError(wrong)
 
 
 @dataclass(frozen=True)
@@ -141,6 +221,9 @@ class PoolStatus:
         by_hand: Replicas that people started themselves, beside those of `replicas`.
         target: Replicas wanted now.
         ready: Replicas whose services answer and that are to stay.
+        credentials_end_at: When the cloud's credentials end, in seconds since the epoch; None where
+            no end is known.
+        usd_to_date: What the pool has cost since its first `up`, as the manager saw it.
         ended: Why the manager has ended the pool by itself; empty while it runs.
         notes: Why the pool is not yet as wanted, in sentences.
         reasons: The same, one for each note, as ``{cause, ...}``.
@@ -149,6 +232,8 @@ class PoolStatus:
             how this machine's robot finds its gateways; empty where there are none.
         events: The last things that happened.
         applied: Digest of the pool file that was applied last.
+        manager_version: Of fogft, by which the manager runs; empty before 0.2.0.
+        proxy_version: The same of the client proxy.
     """
 
     pool: str
@@ -157,7 +242,7 @@ class PoolStatus:
     file: str
     epoch: int
     manager_pid: int
-    observed_at: float
+    observed_at: Moment
     cloud_reachable: bool
     stopping: bool
     target: int
@@ -166,6 +251,8 @@ class PoolStatus:
     usd_per_hour: float
     proxy_pid: int | None
     proxy_alive: bool
+    usd_to_date: float = 0.0
+    credentials_end_at: float | None = None
     ended: str = ""
     excluded: Sequence[str] = ()
     notes: Sequence[str] = ()
@@ -173,10 +260,13 @@ class PoolStatus:
     replicas: Sequence[ReplicaStatus] = ()
     by_hand: Sequence[ReplicaStatus] = ()
     services: Sequence[ServiceStatus] = ()
+    topics: Sequence[TopicStatus] = ()
     events: Sequence[EventStatus] = ()
     applied: str = ""
     update: UpdateStatus | None = None
-    topology: Mapping[str, Any] = field(default_factory=dict)
+    topology: Annotated[Mapping[str, Any], _check_drawn] = field(default_factory=dict)
+    manager_version: str = ""
+    proxy_version: str = ""
     version: int = VERSION
 
     def to_json(self) -> dict[str, Any]:
@@ -190,10 +280,7 @@ def from_json(raw: Any) -> PoolStatus:
     Raises:
         StateError: It is none, or of another version of fogft.
     """
-    try:
-        return from_plain(PoolStatus, raw)
-    except ValueError as error:
-        raise StateError(f"not a status: {error}", "is the manager of another version?") from error
+    return stored(PoolStatus, raw, "not a status", "is the manager of another version?")
 
 
 def of_tick(
@@ -206,6 +293,8 @@ def of_tick(
     manager_pid: int,
     proxy_alive: bool,
     notes: Sequence[Reason] = (),
+    usd_to_date: float = 0.0,
+    credentials_end_at: float | None = None,
 ) -> PoolStatus:
     """Return the status after a tick."""
     from fogft.model.groups import FIRST_BY_HAND
@@ -234,6 +323,8 @@ def of_tick(
         ready=sum(replica.phase == Phase.READY.value for replica in replicas),
         uplink_suspected=bool(health and health.uplink_suspected),
         usd_per_hour=sum(one.machine.usd_per_hour for one in judged),
+        usd_to_date=usd_to_date,
+        credentials_end_at=credentials_end_at,
         proxy_pid=report.pid if report is not None and proxy_alive else None,
         proxy_alive=proxy_alive,
         excluded=sorted(tick.intent.excluded),
@@ -242,9 +333,17 @@ def of_tick(
         replicas=replicas,
         by_hand=[_started_by_hand(id, links.get(id), tick.spec) for id in by_hand],
         services=_services(tick.spec, heard, report),
+        topics=[
+            TopicStatus(one.name, one.type, one.origin.value).seen(
+                heard, report.topics if report is not None else {}
+            )
+            for one in tick.spec.topics
+        ],
         events=[event_status(event) for event in recent],
         topology=_topology(tick, report if proxy_alive else None),
         applied=tick.file,
+        manager_version=__version__,
+        proxy_version=report.version if report is not None else "",
         update=_update(tick),
     )
 
@@ -301,7 +400,23 @@ def _replica(
         detail=_detail(one),
         reason=one.why,
         has_served=record is not None and record.first_ready_at is not None,
+        **_phases(launched_at, machine, record),
     )
+
+
+def _phases(launched_at: float, machine: Machine, record: Record | None) -> dict[str, Any]:
+    """Return how long each phase of a launch took, as far as it is known."""
+    ready_at = record.first_ready_at if record is not None else None
+
+    def between(begin: float, end: float | None) -> float | None:
+        return max(0.0, end - begin) if begin and end else None
+
+    return {
+        "provisioning_s": between(launched_at, machine.running_at),
+        "setup_s": between(machine.running_at, machine.set_up_at),
+        "starting_s": between(machine.set_up_at, ready_at),
+        "ready_after_s": between(launched_at, ready_at),
+    }
 
 
 def _started_by_hand(id: ReplicaId, link: LinkReport | None, spec: PoolSpec) -> ReplicaStatus:
@@ -331,9 +446,13 @@ def _linked(id: ReplicaId, phase: Phase, link: LinkReport | None) -> ReplicaStat
         won=known.won,
         in_flight=known.in_flight,
         restarts=known.restarts,
+        strangers=known.strangers,
         age_s=None,
         detail=known.detail,
         differs=known.differs,
+        differing=list(known.differing),
+        lease_left_s=known.lease_left_s,
+        version=known.version,
     )
 
 

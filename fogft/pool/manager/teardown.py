@@ -28,13 +28,13 @@ class Known:
         pool: Its name.
         running: Replicas that were launched and have not ended as far as was seen, in words.
         clouds: Where any were ever launched.
-        orphan_after_s: When replicas without a manager end by themselves; None if not known.
+        unmanaged_max_hours: When replicas without a manager end by themselves; None if not known.
     """
 
     pool: str
     running: tuple[str, ...] = ()
     clouds: frozenset[str] = frozenset()
-    orphan_after_s: float | None = None
+    unmanaged_max_hours: float | None = None
 
 
 def known(store: PoolStore) -> Known:
@@ -47,7 +47,7 @@ def known(store: PoolStore) -> Known:
             for r in sorted(history.open(), key=lambda r: (r.slot, r.generation))
         )
         clouds = frozenset(place.split("/")[0] for place in history.locations if place)
-        return Known(pool, running, clouds, store.spec().orphan_after_s)
+        return Known(pool, running, clouds, store.spec().unmanaged_max_hours)
     except FogftError:
         return Known(pool)
 
@@ -141,6 +141,7 @@ def _unknown(error: CloudUnreachable, known: Known) -> CloudUnreachable:
     lines = [f"it cannot be told what of `{known.pool}` still runs: {error.message}"]
     lines += [f"  may still run: {replica}" for replica in known.running]
     hints = [f"run `fogft down {known.pool}` again", *([error.hint] if error.hint else [])]
-    if known.orphan_after_s is not None:
-        hints.append(f"what hears of no manager ends by itself after {known.orphan_after_s:.0f} s")
+    if known.unmanaged_max_hours is not None:
+        hours = f"{known.unmanaged_max_hours:g} hours"
+        hints.append(f"replicas that hear of no manager end by themselves after {hours}")
     return CloudUnreachable("\n".join(lines), "; ".join(hints))

@@ -286,6 +286,10 @@ class NoRos:
     def respond(self, handle: Any, payload: bytes) -> None:
         """Never called: a gateway's dispatchers respond to the forwarder."""
 
+    def mismatch(self) -> str:
+        """Return nothing: nobody calls it through ROS."""
+        return ""
+
     def client(self, name: str, type_name: str) -> RosClient:
         """Make none.
 

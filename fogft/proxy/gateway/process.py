@@ -6,6 +6,7 @@ again with a new certificate it is the same gateway, under its next generation.
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import secrets
@@ -26,16 +27,16 @@ from fogft.model import names
 from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
-from fogft.process import start_log, stop_on_signal
+from fogft.model.type_definition import RESPONSE
+from fogft.process import Watchdog, notify, start_log, stop_on_signal
 from fogft.proxy.config import GatewayConfig, read_gateway
 from fogft.proxy.gateway.gateway import Forwarder, NoRos, numbers
-from fogft.proxy.middleware import response_fault
+from fogft.proxy.middleware import fault_of
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
-from fogft.proxy.robot.process import make_dialer
+from fogft.proxy.robot.process import make_dialer, try_step
 from fogft.records.signing import Signer, common_name
-from fogft.requests.load import NEVER
 
 log = logging.getLogger(__name__)
 
@@ -80,10 +81,9 @@ class _Gateway:
         self._config = config
         client = config.client
         self._incarnation = secrets.token_hex(8)
-        self._manager_seen = -NEVER
         self._draining = False
         self._forwarder = Forwarder()
-        dialer = make_dialer(client, self._manager_age_s)
+        dialer = make_dialer(client)
         self._proxy = ClientProxy(client.pool_uid, NoRos(), dialer, self._make_dispatcher)
         self._services = tuple(_passed_on(service) for service in client.services)
         self._proxy.serve(self._services)
@@ -113,7 +113,7 @@ class _Gateway:
         dispatcher = Dispatcher(
             spec,
             self._forwarder.respond,
-            fault_of=response_fault(spec.type),
+            fault_of=fault_of(spec.type, RESPONSE),
             ok_of=_ok_of(spec.type),
             wake=wake,
         )
@@ -140,9 +140,6 @@ class _Gateway:
         log.info("gateway_listening gateway=%s endpoint=%s", self._holder.short, listener.endpoint)
 
     def _probed(self, probe: Probe) -> ProbeAnswer:
-        if probe.manager_age_s is not None:
-            seen = time.monotonic() - probe.manager_age_s
-            self._manager_seen = max(self._manager_seen, seen)
         behind = self._proxy.behind()
         ready = self._proxy.ready
         return ProbeAnswer(
@@ -158,10 +155,6 @@ class _Gateway:
             types=self._proxy.types_behind() if probe.describe else {},
         )
 
-    def _manager_age_s(self) -> float | None:
-        age_s = time.monotonic() - self._manager_seen
-        return age_s if age_s < NEVER else None
-
     # -- the loop -------------------------------------------------------------------------
 
     def run(self, stop: threading.Event) -> None:
@@ -169,11 +162,13 @@ class _Gateway:
         self._forwarder.start()
         self._listen()
         self._scrape.at(self._config.client.metrics)
-        reported = time.monotonic()
+        reported, watchdog = time.monotonic(), Watchdog()
+        notify("READY=1")
         while not stop.is_set():
+            watchdog.work()
             self._proxy.run_once()
             self._forwarder.tick(self._proxy.ready)
-            self._follow()
+            try_step(self._follow, self._config.client.membership)
             if self._certificate.changed():
                 self._renew()
             if time.monotonic() - reported > _REPORT_EVERY_S:
@@ -181,13 +176,7 @@ class _Gateway:
                 self._report()
 
     def _follow(self) -> None:
-        try:
-            membership = self._following.look()
-        except FogftError as error:
-            log.error(
-                "file_failed path=%s reason=%r", self._config.client.membership, error.message
-            )
-            return
+        membership = self._following.look()
         if membership is not None:
             self._proxy.follow(membership)
             self._revoke(membership.revoked)
@@ -226,10 +215,8 @@ class _Gateway:
             **self._told(),
             **self._following.report(),
         }
-        try:
-            disk.write_json(self._config.client.status, report, durable=False)
-        except FogftError as error:
-            log.error("file_failed path=%s reason=%r", self._config.client.status, error.message)
+        status = self._config.client.status
+        try_step(functools.partial(disk.write_json, status, report, durable=False), status)
 
     def close(self) -> None:
         """Refuse what is under way, and leave."""
@@ -251,9 +238,9 @@ def _ok_of(type_name: str) -> Callable[[str], Callable[[bytes], bool]]:
 
     def ok_of(field: str) -> Callable[[bytes], bool]:
         try:
-            from fogft.ros import types
+            from fogft.ros import messages
 
-            return types.bool_field(type_name, field)
+            return messages.bool_field(type_name, field)
         except (FogftError, ImportError) as error:
             log.warning(
                 "ok_field_not_judged type=%s reason=%r effect='the first response is returned'",

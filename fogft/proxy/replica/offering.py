@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from fogft.model.names import NAMES_BYTES_LIMIT
 from fogft.model.spec import ServiceSpec
 from fogft.model.type_definition import Definition
 from fogft.ros.port import RosNode
@@ -42,6 +43,7 @@ class Offering:
         self._clock = clock
         self._definitions: dict[str, Definition] = {}
         self._seen: Mapping[str, str] = {}
+        self._left_out = 0
         self._seen_since = self._looked_at = float("-inf")
 
     def look(self, node: RosNode, *, complete: bool) -> tuple[ServiceSpec, ...]:
@@ -55,7 +57,9 @@ class Offering:
         if now < self._looked_at + LOOK_EVERY_S or (complete and not self._finds_out):
             return ()
         self._looked_at = now
-        seen = node.offered()
+        offered = node.offered()
+        seen = _that_fit(offered)
+        self._left_out = len(offered) - len(seen)
         if seen != self._seen:
             self._seen, self._seen_since = seen, now
         if not self._finds_out:
@@ -92,10 +96,23 @@ class Offering:
             return "`run` offers no service yet"
         missing = sorted({service.name for service in self.services} - ready)
         if not missing:
-            return ""
+            what = f"{self._left_out} services of `run` are left out: the names and types of all"
+            limit = f"may have {NAMES_BYTES_LIMIT} bytes together"
+            return f"{what} {limit}" if self._left_out and self._finds_out else ""
         listed = {service.name: service.type for service in self.services}
         others = [f"{n} ({t})" for n, t in sorted(self._seen.items()) if listed.get(n) != t]
         more = "; it offers " + ", ".join(others[:_TOLD]) if others else ""
         if len(others) > _TOLD:
             more += f" and {len(others) - _TOLD} more"
         return f"`run` does not offer {', '.join(missing)} yet{more}"
+
+
+def _that_fit(offered: Mapping[str, str]) -> dict[str, str]:
+    """Return as many services, by name, as a probe's answer has room for."""
+    room, found = NAMES_BYTES_LIMIT, dict[str, str]()
+    for name, kind in sorted(offered.items()):
+        room -= len(name) + len(kind)
+        if room < 0:
+            break
+        found[name] = kind
+    return found

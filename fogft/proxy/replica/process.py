@@ -1,18 +1,22 @@
 """``fogft serve --config FILE``: the server proxy as a process, one a replica.
 
-It ends with status 0 when it was told to or when it is orphaned; whoever started it (a VM's
+It ends with status 0 when it was told to or when its lease is over; whoever started it (a VM's
 job, the local cloud's machine) then ends the machine.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import os
+import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 from fogft.cloud import notice
+from fogft.cloud.notice import Notice, NoticeKind
 from fogft.link.zenoh import runtime
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
@@ -25,12 +29,16 @@ from fogft.proxy.config import read_server
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.records import cache
+from fogft.records.record import RecordKind
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
 
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.05
+_IDLE_TICK_S = 0.15  # while all is ready, and nobody waits
+_LEAVE_S = 4.0
+"""From a SIGTERM to the end: robots probe each second, and some clouds kill after five."""
 
 
 def run(
@@ -43,7 +51,7 @@ def run(
     advertise: str | None = None,
     metrics: str | None = None,
 ) -> None:
-    """Run until a signal ends it, or until no manager was heard of for `orphan_after_s`.
+    """Run until a signal ends it, or until the manager's lease is over.
 
     Args:
         config_path: A `replica.yaml`.
@@ -69,6 +77,13 @@ def run(
     )
     start_log(config.log_level)
     stop = stop_on_signal()
+    machine_ends = threading.Event()
+
+    def end(*_: object) -> None:
+        machine_ends.set()
+        stop.set()
+
+    signal.signal(signal.SIGTERM, end)
     middleware.prepare(config.rmw)
     proxy = _make(config)
     watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
@@ -82,6 +97,12 @@ def run(
         presence = Presence(config, proxy.endpoint)
         start.settle()
         _loop(config, proxy, presence, stop)
+        if machine_ends.is_set() and watching is not None and watching.silent:
+            # No other notice exists on RunPod, Vast and others: this is theirs, and it is short.
+            proxy.noticed(Notice(NoticeKind.PREEMPTION, None, "signal", "SIGTERM"))
+            log.warning("notice_received kind=preemption source=signal ends_in_s=%.0f", _LEAVE_S)
+            stop.clear()
+            _loop(config, proxy, presence, stop, time.monotonic() + _LEAVE_S)
     finally:
         scrape.close()
         if presence is not None:
@@ -110,7 +131,7 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
 
     handshakes = HandshakeLog()
     listener = ZenohListener(config.listen, config.credentials, config.id, handshakes=handshakes)
-    listener.take_records(cache.read(config.revocations) if config.revocations else ())
+    listener.take_records(cache.read(config.announcements) if config.announcements else ())
     return ServerProxy(
         config.id,
         config.services,
@@ -121,7 +142,6 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
         define=define,
         topics=config.topics,
         max_in_flight=config.max_in_flight,
-        orphan_after_s=config.orphan_after_s,
     )
 
 
@@ -143,17 +163,21 @@ def run_environment(config: ServerProxyConfig) -> dict[str, str]:
 
 
 def _loop(
-    config: ServerProxyConfig, proxy: ServerProxy, presence: Presence, stop: threading.Event
+    config: ServerProxyConfig,
+    proxy: ServerProxy,
+    presence: Presence,
+    stop: threading.Event,
+    until: float = math.inf,
 ) -> None:
     memory = memory_tuning.Trimmer()
-    while not stop.wait(_TICK_S):
+    while time.monotonic() < until and not stop.wait(_IDLE_TICK_S if proxy.idle else _TICK_S):
         proxy.run_once()
         memory.look()
-        proxy.revoke(
-            presence.look(proxy.ready, draining=proxy.draining, in_flight=proxy.responder.in_flight)
+        known = presence.look(
+            proxy.ready, draining=proxy.draining, in_flight=proxy.responder.in_flight
         )
-        if proxy.orphaned:
-            log.error(
-                "replica_orphaned replica=%s orphan_after_s=%.0f", config.id, config.orphan_after_s
-            )
+        proxy.revoke(known.revoked)
+        proxy.renew(known.of(RecordKind.LEASE))
+        if proxy.lease_is_over:
+            log.error("lease_over replica=%s reason='no manager was heard of'", config.id)
             return

@@ -111,6 +111,23 @@ class Responder:
             "overloaded": self.refused.get(Refusal.OVERLOADED, 0),
         }
 
+    def hanging(self, *, stuck: bool = False) -> dict[str, float]:
+        """Return the services that have ended none of their work for unusually long.
+
+        Args:
+            stuck: Only those that are to be started anew for it.
+
+        Returns:
+            For how many seconds, by service.
+        """
+        now = self._clock()
+        with self._lock:
+            return {
+                name: queue.quiet_s(now)
+                for name, queue in self._queues.items()
+                if (queue.stuck(now) if stuck else queue.hangs(now))
+            }
+
     @property
     def limits(self) -> dict[str, int]:
         """How many requests each service may have at once."""
@@ -334,6 +351,7 @@ class Responder:
             for name, queue in self._queues.items():
                 if service in (None, name):
                     lost += queue.abandoned(float("inf"))
+                    queue.died()
                     self._interruptions.ended(name)
         for job in (*blamed, *lost):
             self._forget_ticket(job)

@@ -16,9 +16,10 @@ from __future__ import annotations
 import logging
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, cast
 
+from fogft import __version__
 from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.errors import RosError
 from fogft.link.port import Incoming, Listener, Probe, ProbeAnswer
@@ -35,11 +36,15 @@ from fogft.proxy.replica.offering import Offering
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder, StateBytes
 from fogft.proxy.replica.responder import Responder
 from fogft.proxy.replica.service_queue import limits_of
+from fogft.proxy.replica.serving_lease import HeldLease
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
+from fogft.records.record import Record
 from fogft.ros.port import RosClient, RosNode, RosTopics
 
 log = logging.getLogger(__name__)
+
+_STRANGERS = ("handshakes_refused", "unauthenticated", "kept_out")
 
 
 class ServerProxy:
@@ -55,7 +60,6 @@ class ServerProxy:
         define: Returns the definition of a service type here, for the robot to compare.
         topics: What passes besides services; then nodes publish and subscribe, too.
         max_in_flight: Requests held at once.
-        orphan_after_s: With no sign of the pool's manager for so long, `orphaned` is true.
         clock: Monotonic seconds.
     """
 
@@ -71,18 +75,17 @@ class ServerProxy:
         define: Callable[[str], Definition] | None = None,
         topics: tuple[TopicSpec, ...] = (),
         max_in_flight: int = 512,
-        orphan_after_s: float = 3600.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._id = id
         self._offering = Offering(services, define, clock)
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
         self._listener, self._make_node, self._supervisor = listener, make_node, supervisor
-        self._orphan_after_s, self._clock = orphan_after_s, clock
+        self._clock = clock
+        self._lease = HeldLease(clock)
         self._topics = TopicsOnReplica(topics, clock)
         self._incarnation = secrets.token_hex(8)
         self._ready: frozenset[str] = frozenset()
-        self._manager_seen = clock()
         self._node: RosNode | None = None
         self._clients: dict[str, RosClient] = {}
         self._revoked: frozenset[str] = frozenset()
@@ -129,6 +132,8 @@ class ServerProxy:
 
     def run_once(self) -> None:
         """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
+        lease = self._listener.lease()
+        self.renew(() if lease is None else (lease,))
         died = self._supervisor.poll(at_work=self.responder.at_work > 0)
         if died or self._node is None or not self._node.alive:
             self._ready = frozenset()
@@ -139,6 +144,7 @@ class ServerProxy:
             self._join_ros()
         self._take_up_new()
         self._look_for_services()
+        self._end_stuck()
         self.responder.tick()
         self._goals.tick()
         self._topics.tick()
@@ -162,7 +168,7 @@ class ServerProxy:
             ordered.crashed()
 
     def _look_for_services(self) -> None:
-        there = {name for name, client in self._clients.items() if client.available()}
+        there = {name for name, client in self._clients.items() if self._can_call(name, client)}
         ready = frozenset(there if self._supervisor.alive else ())
         gone = self._ready - ready
         if ready != self._ready:
@@ -175,6 +181,36 @@ class ServerProxy:
             else:
                 self._goals.crashed(name)
                 self.responder.crashed(name)
+
+    def _can_call(self, name: str, client: RosClient) -> bool:
+        if not client.available():
+            return False
+        self._note(name, client.mismatch())
+        return name not in self._not_usable
+
+    def _note(self, name: str, trouble: str) -> None:
+        """Keep, and log once, why a service cannot be called here; empty for nothing."""
+        if trouble and self._not_usable.get(name) != trouble:
+            log.error("service_not_usable replica=%s service=%s reason=%r", self._id, name, trouble)
+        if trouble:
+            self._not_usable[name] = trouble
+        else:
+            self._not_usable.pop(name, None)
+
+    def _end_stuck(self) -> None:
+        """Start the command anew where a service of it answers nothing any more."""
+        for name, seconds in self._hanging(stuck=True).items():
+            log.error("service_stuck replica=%s service=%s quiet_s=%.0f", self._id, name, seconds)
+            self._supervisor.restart()
+            return
+
+    def _hanging(self, *, stuck: bool = False) -> dict[str, float]:
+        """Return the services that hang. Parts of actions take what their goals take."""
+        hanging = self.responder.hanging(stuck=stuck)
+        if not hanging:
+            return hanging
+        plain = {s.name for s in self._offering.services if s.part is Part.NONE}
+        return {name: seconds for name, seconds in hanging.items() if name in plain}
 
     def _replaced(self) -> set[str]:
         """Return the services that have one more server than before.
@@ -190,14 +226,28 @@ class ServerProxy:
         return self._ready
 
     @property
+    def idle(self) -> bool:
+        """Whether all can answer, and nobody waits for it."""
+        return (
+            len(self._ready) == len(self._offering.services) > 0
+            and not self.responder.in_flight
+            and not (self._topics or self._goals or self._ordered)
+        )
+
+    @property
     def draining(self) -> bool:
-        """Whether it asked to be left alone."""
+        """Whether the replica is draining."""
         return self._draining
 
     @property
     def endpoint(self) -> str:
         """``host:port`` at which it listens."""
         return self._listener.endpoint
+
+    def renew(self, records: Iterable[Record]) -> None:
+        """Take leases that the manager signed; only a newer one changes anything."""
+        for record in records:
+            self._lease.renew(record)
 
     def revoke(self, names: frozenset[str]) -> None:
         """Let these holders of certificates in no more."""
@@ -206,9 +256,10 @@ class ServerProxy:
             self._listener.revoke(self._revoked)
 
     @property
-    def orphaned(self) -> bool:
-        """Whether nothing was heard of a manager for `orphan_after_s`."""
-        return self._clock() - self._manager_seen > self._orphan_after_s
+    def lease_is_over(self) -> bool:
+        """Whether the manager was not heard of for as long as it said in advance."""
+        left_s = self._lease.left_s
+        return left_s is not None and left_s <= 0
 
     def noticed(self, notice: Notice) -> None:
         """Pass on what the machine was told by its cloud. From any thread; never taken back.
@@ -230,6 +281,7 @@ class ServerProxy:
             "refused": {r.value: n for r, n in self.responder.refused.items()},
             "services": {s.name: s.name in answering for s in self._offering.services},
             "draining": self._draining,
+            "lease_left_s": self._lease.left_s,
             "restarts": max(self._supervisor.restarts, 0),
             "wire": dict(self._listener.counters()),
         }
@@ -261,12 +313,9 @@ class ServerProxy:
         try:
             self._clients[service.name] = self._node.client(service.name, service.type)
         except RosError as error:
-            if self._not_usable.get(service.name) != error.message:
-                log.error("service_not_usable replica=%s service=%s reason=%r",
-                          self._id, service.name, error.message)  # fmt: skip
-            self._not_usable[service.name] = error.message
+            self._note(service.name, error.message)
         else:
-            self._not_usable.pop(service.name, None)
+            self._note(service.name, "")
 
     def _leave_ros(self) -> None:
         node, self._node, self._clients = self._node, None, {}
@@ -299,8 +348,7 @@ class ServerProxy:
         return self._topics.ready() if self._topics and self._supervisor.alive else frozenset()
 
     def _probe(self, probe: Probe) -> ProbeAnswer:
-        if probe.manager_age_s is not None:
-            self._manager_seen = max(self._manager_seen, self._clock() - probe.manager_age_s)
+        counts = self._listener.counters()
         return ProbeAnswer(
             slot=self._id.slot,
             generation=self._id.generation,
@@ -316,12 +364,17 @@ class ServerProxy:
             work=self.responder.report(),
             offered=self._offering.told,
             types=self._offering.types() if probe.describe else {},
+            hanging=frozenset(self._hanging()),
+            version=__version__,
+            lease_age_s=self._lease.age_s,
+            lease_left_s=self._lease.left_s,
+            strangers=sum(counts.get(event, 0) for event in _STRANGERS),
         )
 
     def _detail(self) -> str:
         services = self._offering.services
         if services and len(self._ready) == len(services):
-            return self._state_detail() or self._topics.trouble
+            return self._state_detail() or self._topics.trouble or self._hanging_detail()
         for why in self._not_usable.values():
             return why
         if self._topics.trouble:
@@ -336,6 +389,11 @@ class ServerProxy:
         for name, ordered in self._ordered.items():
             if not ordered.ready:
                 return ordered.detail or f"`{name}` does not have the present state yet"
+        return ""
+
+    def _hanging_detail(self) -> str:
+        for name, seconds in self._hanging().items():
+            return f"`{name}` has work and has answered nothing for {seconds:.0f} s"
         return ""
 
     def close(self) -> None:

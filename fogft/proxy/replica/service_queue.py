@@ -21,6 +21,15 @@ from fogft.requests.load import NEARLY, Handling, Load
 # Job whose deadline has passed is still in the service's hands and takes its room. After so
 # long its response is taken for lost.
 _ABANDONED_AFTER_S = 60.0
+# A service with work that has ended none for so long, and for so many times the longest that it
+# lately took, hangs. One that has never ended any may still be loading what it needs.
+_HANGS_AFTER_S = 1.0
+_HANGS_AFTER_TIMES = 5.0
+# After so much it is started anew, if all that it has is past its deadline. One alone may be lost.
+_STUCK_AFTER_S = 60.0
+_STUCK_AFTER_TIMES = 20.0
+_STUCK_ON = 2
+_LONGEST_FADES = 0.999  # with each answer
 
 
 class Job:
@@ -65,6 +74,10 @@ class ServiceQueue:
         self.at_work = 0
         self._begun_last = 0.0
         self._alone = False  # the job at work is to have no other beside it
+        self._longest_s = 0.0  # that it lately took; 0 before its first answer
+        self._quiet_since: float | None = None  # it has work, and has ended none since
+        self._unanswered = 0  # of what was passed on, whether room is kept for it or not
+        self._last_deadline = 0.0
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
     def __len__(self) -> int:
@@ -140,6 +153,10 @@ class ServiceQueue:
         """Job is passed on. Job that comes while the line is `open` need not wait before."""
         self.at_work += 1
         self._alone = job.alone
+        self._unanswered += 1
+        self._last_deadline = max(self._last_deadline, job.deadline)
+        if self._quiet_since is None:
+            self._quiet_since = now
         self._begun_last = now
         job.passed_on, job.begun, job.level = True, now, self.at_work
 
@@ -150,8 +167,12 @@ class ServiceQueue:
     def finished(self, job: Job, now: float) -> None:
         """The service has answered."""
         if job.passed_on:
-            self.limit.finished(job.level, now - job.begun, now)
+            took_s = now - job.begun
+            self.limit.finished(job.level, took_s, now)
+            self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
         self.free(job)
+        self._unanswered = self.at_work
+        self._quiet_since = now if self.at_work else None
 
     def free(self, job: Job) -> None:
         """The service has no more to do with this job."""
@@ -159,6 +180,30 @@ class ServiceQueue:
             job.passed_on = False
             self.at_work -= 1
             self._alone = False
+            self._unanswered -= 1
+            if not self._unanswered:
+                self._quiet_since = None
+
+    def hangs(self, now: float) -> bool:
+        """Whether the service has work, and has ended none for far longer than it takes."""
+        return self.quiet_s(now) > max(_HANGS_AFTER_S, _HANGS_AFTER_TIMES * self._longest_s)
+
+    def stuck(self, now: float) -> bool:
+        """Whether it hangs, and nobody waits for anything that it has."""
+        if self._unanswered < _STUCK_ON or now < self._last_deadline:
+            return False
+        return self.quiet_s(now) > max(_STUCK_AFTER_S, _STUCK_AFTER_TIMES * self._longest_s)
+
+    def quiet_s(self, now: float) -> float:
+        """Return how long the service, which has answered before, has ended none of its work."""
+        if self._quiet_since is None or not self._longest_s:
+            return 0.0
+        return now - self._quiet_since
+
+    def died(self) -> None:
+        """The service is another process from now on, of which nothing is known."""
+        self._quiet_since, self._unanswered = None, 0
+        self._longest_s = self._last_deadline = 0.0
 
     def overdue(self, job: Job, now: float) -> None:
         """Job that was passed on is past its deadline: it keeps its room for a while."""
@@ -171,6 +216,7 @@ class ServiceQueue:
             job = self._overdue.popleft()[1]
             if job.passed_on:
                 found.append(job)
+                self._unanswered += 1  # as it still is
                 self.free(job)
         return found
 

@@ -35,8 +35,8 @@ from fogft.ros.port import RosNode, RosTopics
 
 log = logging.getLogger(__name__)
 
-_TICK_S = 0.02
-
+_TICK_S = 0.02  # where topics pass
+_IDLE_TICK_S = 0.1
 
 # Makes the dispatcher of a service, given how to respond and how to have `tick` called soon.
 MakeDispatcher = Callable[
@@ -238,7 +238,7 @@ class ClientProxy:
 
     # -- the proxy's own thread -----------------------------------------------------------
 
-    def run_once(self, timeout_s: float = _TICK_S) -> bool:
+    def run_once(self, timeout_s: float = _IDLE_TICK_S) -> bool:
         """Wait for a change or a moment, then route, advertise and tick.
 
         The moment is at most `timeout_s`, and less where a dispatcher wants its tick earlier.
@@ -265,6 +265,8 @@ class ClientProxy:
             for service in self._services.values():
                 service.advertise(self._node, now)
         self._next_look = min(looks, default=NEVER)
+        if len(self._topics):
+            self._next_look = min(self._next_look, now + _TICK_S)
         return changed
 
     def _differences(self, link: Link) -> Mapping[str, str]:
@@ -276,11 +278,19 @@ class ClientProxy:
         differ = {link.peer.id: self._differences(link) for link in links}
         versions = self._links.versions()
         leaving = frozenset(link.peer.id for link in links if self._links.draining(link))
+        hanging = self._links.hanging()
         for service in self._services.values():
-            fit = [link for link in links if service.spec.name not in differ[link.peer.id]]
-            service.dispatcher.route(service.may_ask(fit, leaving), versions, leaving)
+            name = service.spec.name
+            fit = [link for link in links if name not in differ[link.peer.id]]
+            hang = {id for id, names in hanging.items() if name in names}
+            service.dispatcher.route(service.may_ask(fit, leaving), versions, leaving, hang)
 
     # -- what people see ------------------------------------------------------------------
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing has to be seen to, for all that is known."""
+        return self._next_look == NEVER
 
     @property
     def uplink_suspected(self) -> bool:
@@ -292,7 +302,8 @@ class ClientProxy:
         with self._lock:
             links, gateways = self._link_reports()
             services: Mapping[str, Any] = {
-                name: service.dispatcher.report() for name, service in self._services.items()
+                name: {**service.dispatcher.report(), "trouble": service.trouble}
+                for name, service in self._services.items()
             }
         return {
             "links": links,
@@ -322,6 +333,26 @@ class ClientProxy:
     def ready(self) -> frozenset[str]:
         """Services that at least one link calls ready."""
         return self._links.ready
+
+    @property
+    def offered(self) -> list[str]:
+        """Services that are offered in ROS now."""
+        return [name for name, service in self._services.items() if service.server is not None]
+
+    def take_no_more(self, *, shared: bool) -> None:
+        """Leave callers' requests to another proxy; only those of services that two can share."""
+        with self._lock:
+            for service in self._services.values():
+                if service.shared is shared:
+                    service.dispatcher.leaving = True
+            if not shared:
+                self._topics.close()
+
+    def waiting(self, *, shared: bool) -> int:
+        """Count the requests without an answer of services that two proxies can share, or not."""
+        with self._lock:
+            services = [s for s in self._services.values() if s.shared is shared]
+            return sum(service.dispatcher.waiting for service in services)
 
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, of the services that are traced."""

@@ -16,6 +16,8 @@ from fogft.model.topic import PREFIX
 from fogft.ros.port import Level, Status
 
 WINDOW_S = 30.0
+CREDENTIALS_SOON_S = 3600.0
+UNMANAGED_AFTER_S = 90.0  # a manager signs a lease for its replicas every minute
 # Ends of requests that somebody should hear of, and how they are called.
 _TROUBLES = {
     "silent": "got no answer",
@@ -76,6 +78,7 @@ class Diagnosis:
         links = report["links"]
         up = sum(link["state"] == "up" for link in links)
         worst = max((status.level for status in services), default=Level.WARN)
+        left_s = _unmanaged(links)
         if report["uplink_suspected"]:
             message = "all replicas fell silent together: the robot's uplink is suspected"
             worst = Level.ERROR
@@ -84,11 +87,23 @@ class Diagnosis:
         else:
             message = f"{up} of {len(links)} replicas are reached"
             worst = max(worst, Level.OK if up == len(links) else Level.WARN)
+        if left_s is not None:
+            message += f"; no manager runs, replicas end in {left_s / 3600:.1f} h"
+            worst = max(worst, Level.WARN)
+        credentials_s = report.get("credentials_left_s")
+        if credentials_s is not None and credentials_s < CREDENTIALS_SOON_S:
+            if credentials_s > 0:
+                message += f"; the cloud's credentials end in {credentials_s / 60:.0f} min"
+            else:
+                message += "; the cloud's credentials have ended: nothing is launched or ended"
+            worst = max(worst, Level.WARN)
         values = {
             "replicas": len(links),
             "replicas reached": up,
             "services": len(services),
             "uplink suspected": report["uplink_suspected"],
+            "replicas end without a manager in_s": left_s,
+            "credentials end in_s": credentials_s,
         }
         return self._status(worst, "pool", message, values, self._robot)
 
@@ -103,6 +118,8 @@ class Diagnosis:
         troubles = [f"{n} {_TROUBLES[key]}" for key, n in lately.items() if n]
         if not ready:
             level, message = Level.ERROR, "no replica can answer"
+        elif report.get("trouble"):
+            level, message = Level.ERROR, str(report["trouble"])
         elif troubles:
             level, message = Level.WARN, f"in the last {WINDOW_S:.0f} s {', '.join(troubles)}"
         else:
@@ -135,6 +152,8 @@ class Diagnosis:
             level, message = Level.WARN, detail or "not all services can answer"
         elif link.get("draining"):
             level, message = Level.WARN, "its machine will be taken"
+        elif link.get("hanging"):
+            level, message = Level.WARN, detail
         elif link.get("disagrees"):
             level, message = Level.WARN, "its answers differ from the others'"
         else:
@@ -156,6 +175,18 @@ class Diagnosis:
     ) -> Status:
         told = {key: _told(value) for key, value in values.items() if value is not None}
         return Status(level, f"fogft {self._pool}: {what}", message, hardware, told)
+
+
+def _unmanaged(links: list[Mapping[str, Any]]) -> float | None:
+    """Return when the first replica ends because no manager is heard of; None if it is."""
+    leases = [
+        (float(one["lease_age_s"]), float(one["lease_left_s"]))
+        for one in links
+        if one.get("lease_age_s") is not None
+    ]
+    if not leases or min(age_s for age_s, _ in leases) < UNMANAGED_AFTER_S:
+        return None
+    return min(left_s for _, left_s in leases)
 
 
 def _ms(seconds: float | None) -> float | None:

@@ -40,12 +40,16 @@ from fogft.proxy.robot.sending import Sender, key_of
 from fogft.requests.auto import policy
 from fogft.requests.decide import Accepts, Decide, FirstSuccess, Means
 from fogft.requests.first_response import Verdict
+from fogft.requests.load import NEVER
 from fogft.requests.pending import PendingRequests
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
 
 MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
+_SHORTEST_S = 0.002
+_TICK_S = 0.02  # while requests wait, and for a moment after: then it needs none
+_LINGERS_S = 0.1
 
 
 class Dispatcher:
@@ -64,8 +68,10 @@ class Dispatcher:
         wake: Has `tick` called soon. Any thread.
         clock: Monotonic seconds.
         max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
+        id_of: Gives a caller's request its id, by service and handle.
 
     Attributes:
+        leaving: Whether callers' requests are left to another proxy, which gets them too.
         outcomes: What became of its requests.
     """
 
@@ -83,7 +89,10 @@ class Dispatcher:
         clock: Callable[[], float] = time.monotonic,
         max_pending_bytes: int = 256 << 20,
         max_pending: int = 1 << 16,
+        id_of: Callable[[str, Any], bytes] = lambda service, handle: os.urandom(REQUEST_ID_BYTES),
     ) -> None:
+        self._id_of = id_of
+        self.leaving = False
         self._fault_of = fault_of
         self._malformed: Counter[int] = Counter()
         self._ok_of = ok_of
@@ -95,6 +104,7 @@ class Dispatcher:
         self._replication = replication
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
+        self._busy_until = NEVER if replication is not None else -NEVER
         self._requests: PendingRequests[Request] = PendingRequests(
             policy(spec),
             self._decide,
@@ -127,8 +137,9 @@ class Dispatcher:
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to whom the policy chooses."""
-        timeout_s = self._ledger.spec.timeout_s
-        self.forward(os.urandom(REQUEST_ID_BYTES), payload, handle, timeout_s)
+        if not self.leaving:
+            spec = self._ledger.spec
+            self.forward(self._id_of(spec.name, handle), payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Do the same for a request that has its id, and so much time left; whether it was taken.
@@ -148,7 +159,7 @@ class Dispatcher:
             chosen = requests.begin(request, item, able, deadline=now + timeout_s, now=now)
             if item.trace is not None:
                 item.trace.asked.update(dict.fromkeys(chosen, now))
-            soon = requests.choose.look_at
+            soon = min(requests.choose.look_at, now + _TICK_S)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
         self._sender.first(request, payload, links, chosen, timeout_s)
@@ -340,6 +351,7 @@ class Dispatcher:
         links: Sequence[Link],
         versions: Mapping[ReplicaId, str] = MappingProxyType({}),
         leaving: Collection[ReplicaId] = (),
+        hanging: Collection[ReplicaId] = (),
     ) -> None:
         """Set the links that may be asked now, and offer them what they lack.
 
@@ -347,8 +359,9 @@ class Dispatcher:
             links: Those whose replica is ready; where replicas are brought to readiness, all.
             versions: What each replica of the pool runs.
             leaving: The replicas that are to go soon.
+            hanging: Those that say that the service answers nothing of what it has.
         """
-        self._sender.route(links, versions, leaving)
+        self._sender.route(links, versions, leaving, hanging)
 
     def began_anew(self, replica: int, about: Callable[[bytes], bool]) -> None:
         """Have a replica asked again: it has begun anew what some requests are about.
@@ -362,7 +375,7 @@ class Dispatcher:
         self._wake()
 
     def tick(self) -> float:
-        """Let requests expire, and offer them to whom the policy chooses. Call at 50 Hz.
+        """Let requests expire, and offer them to whom the policy chooses.
 
         Returns:
             When to call again at the latest, on the clock; infinite for no matter when.
@@ -380,7 +393,12 @@ class Dispatcher:
         for request in idle:
             self._settle(request)
         look_at = min(self._sender.next_look, self._delivery.tick(now, able=self.able))
+        look_at = max(look_at, now + _SHORTEST_S)
         self._sender.next_look = look_at
+        if len(self._requests):  # after that was set: who comes later sees it, and wakes
+            self._busy_until = max(self._busy_until, now + _LINGERS_S)
+        if now < self._busy_until:
+            self._sender.next_look = look_at = min(look_at, now + _TICK_S)
         return look_at
 
     def close(self) -> None:
@@ -391,7 +409,11 @@ class Dispatcher:
 
     def disagrees(self, replica: int) -> bool:
         """Whether a replica's answers have differed, or were malformed, repeatedly."""
-        return replica in self._decide.flagged or self._malformed[replica] >= MALFORMED_LIMIT
+        return replica in self._decide.flagged or self.misreads(replica)
+
+    def misreads(self, replica: int) -> bool:
+        """Whether a replica's answers were malformed, repeatedly."""
+        return self._malformed[replica] >= MALFORMED_LIMIT
 
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, where that is traced."""
@@ -407,5 +429,6 @@ class Dispatcher:
                 "pending": len(requests) + len(requests.fallback or ()),
                 "pending_bytes": requests.held_bytes,
                 "hedging": requests.choose.report(),
+                "needed_replicas": requests.choose.needed(len(self._sender.able), self._clock()),
                 **self._decide.report(),
             }

@@ -95,10 +95,19 @@ class Links:
         """Services that at least one link calls ready."""
         return frozenset(name for link in self for name in link.ready)
 
+    def hanging(self) -> dict[ReplicaId, frozenset[str]]:
+        """Return the services that a replica says answer nothing of what they have."""
+        answers = {link.peer.id: link.status().probe_answer for link in self}
+        return {id: answer.hanging for id, answer in answers.items() if answer is not None}
+
     def types(self) -> dict[str, Definition]:
-        """Return the definitions of types as replicas told them."""
-        answers = [link.status().probe_answer for link in self]
-        return {name: told for a in answers if a is not None for name, told in a.types.items()}
+        """Return the definitions of types as most replicas told them."""
+        told: dict[str, list[Definition]] = {}
+        for link in self:
+            answer = link.status().probe_answer
+            for name, definition in (answer.types if answer is not None else {}).items():
+                told.setdefault(name, []).append(definition)
+        return {name: max(all_of, key=all_of.count) for name, all_of in told.items()}
 
     def reports(
         self,

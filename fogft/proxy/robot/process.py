@@ -6,6 +6,7 @@ needs no manager: started alone it goes on with the last membership on disk.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import logging
@@ -16,7 +17,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from fogft import disk
+from fogft import __version__, disk
 from fogft.disk import Watched
 from fogft.errors import FogftError, PoolBusy, StateError
 from fogft.link.uplinks import UplinkDialer
@@ -26,20 +27,23 @@ from fogft.model import names
 from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.spec import Part, ServiceSpec
-from fogft.process import start_log, stop_on_signal
+from fogft.model.type_definition import RESPONSE
+from fogft.process import Watchdog, notify, start_log, stop_on_signal
 from fogft.proxy import middleware, start
 from fogft.proxy.config import read_client
 from fogft.proxy.order_mark import OrderMark
+from fogft.proxy.robot import handover
+from fogft.proxy.robot import standby as in_line
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.diagnostics_node import SeenFromRos
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
-from fogft.proxy.robot.manager_sign import ManagerSign
+from fogft.proxy.robot.manager_restart import ManagerRestart
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning
-from fogft.ros.port import RosNode, RosTopics
+from fogft.ros.port import RosTopics
 
 if TYPE_CHECKING:
     from fogft.ros.visible import VisibleNode
@@ -50,38 +54,49 @@ _STATEFUL_BYTES = 64 << 20  # of requests; each is in the log of its order, too
 TRACE_NAME = "trace.jsonl"
 _TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 0.5
+_REPORT_IDLE_EVERY_S = 1.0  # after so long without a request
 _REPORT_AFTER_CHANGE_S = 0.05
-_LOOK_EVERY_S = 0.05  # at files, and what else needs no haste
+_LOOK_EVERY_S = 0.1  # at files, and what else needs no haste
 
 
-def run(config_path: Path, *, metrics: str | None = None) -> None:
+def run(config_path: Path, *, metrics: str | None = None, standby: bool = False) -> None:
     """Run until a signal ends it.
 
     Args:
         config_path: A `proxy.yaml`.
         metrics: ``host:port`` to answer Prometheus at, instead of the file's.
+        standby: Where one runs already, wait until it ends, and take its place at once.
 
     Raises:
-        PoolBusy: This pool's client proxy runs already.
+        PoolBusy: This pool's client proxy runs already, with `standby` another standby too.
         FogftError: The configuration, the credentials or ROS cannot be used.
     """
     start.begin()
     start_log()
     stop = stop_on_signal()
     config = read_client(config_path, metrics)
+    managing = ManagerRestart(config.lock.parent, os.environ)
     lock = disk.Lock(config.lock)
-    if not lock.acquire(wait=False):
-        raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
     middleware.prepare(config.rmw)
+    early = None
+    if not lock.acquire(wait=False):
+        if not standby:
+            raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
+        early = in_line.wait(config, lock, stop, _node_name("fogft_proxy", config.pool))
+        if stop.is_set():
+            return
+        config = _same(config, read_client(config_path, metrics), config_path)
+    began = time.monotonic()
+    _bury(config)
     from fogft.ros import goal_status
-    from fogft.ros.types import check_ok_field
+    from fogft.ros.messages import check_ok_field
 
-    sign = ManagerSign(config.lease)
     made: list[ClientProxy] = []  # the node asks the proxy that is made with it
     joined = middleware.join(
         config.rmw,
         _node_name("fogft_proxy", config.pool),
         config.domain_id,
+        early=early,
         told=lambda: made[0].types_behind() if made else {},
         noticed=lambda: made[0].types_changed() if made else None,
     )
@@ -91,8 +106,9 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
         pool_uid=config.pool_uid,
         actions=Actions(),
         speaks=config.rmw,
+        id_of=handover.request_ids(config.credentials.key),
     )
-    dialer = make_dialer(config, sign.age_s)
+    dialer = make_dialer(config)
     proxy = ClientProxy(
         config.pool_uid, joined.node, dialer, make, define=joined.define, merge=goal_status.merged
     )
@@ -104,18 +120,36 @@ def run(config_path: Path, *, metrics: str | None = None) -> None:
     following = Following(config)
     scrape = Scrape(lambda: proxies.of_client(proxy.report()), {"pool": config.pool})
     scrape.at(config.metrics)
-    log.info("proxy_started pool=%s robot=%s pid=%d", config.pool, config.robot, os.getpid())
+    log.info("proxy_started pool=%s robot=%s pid=%d standby=%s start_s=%.2f", config.pool,
+             config.robot, os.getpid(), early is not None, time.monotonic() - began)  # fmt: skip
     try:
-        parts = _Parts(proxy, following, sign, dialer, seen, scrape, metrics, joined.node)
+        parts = _Parts(proxy, following, dialer, seen, scrape, metrics, joined, managing)
         start.settle()
+        notify("READY=1")
         _loop(config_path, config, parts, stop)
+        if stop.is_set():
+            release = functools.partial(_release, parts, config, lock)
+            handover.hand_over(config, proxy, parts.callers, release)
     finally:
+        managing.close()
         scrape.close()
         following.close()
         proxy.close()
         joined.node.close()
         lock.release()
         log.info("proxy_stopped pool=%s", config.pool)
+
+
+def _release(parts: _Parts, config: ClientProxyConfig, lock: disk.Lock) -> None:
+    """Let another proxy work: it must not take us for dead, and needs our ports."""
+    parts.scrape.close()
+    parts.following.close()
+    try_step(functools.partial(_forget_participant, config.status), config.status)
+    lock.release()
+
+
+def _forget_participant(status: Path) -> None:
+    disk.write_json(status, {**(disk.read_json(status) or {}), "participant": ""}, durable=False)
 
 
 def _make_visible(
@@ -129,7 +163,7 @@ def _make_visible(
         return None
 
 
-def make_dialer(config: ClientProxyConfig, manager_age: Callable[[], float | None]) -> UplinkDialer:
+def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
     """Make the dialer of a proxy, or of a gateway.
 
     With several uplinks one is suspected in half the time: a false alarm costs a copy, no more.
@@ -143,7 +177,6 @@ def make_dialer(config: ClientProxyConfig, manager_age: Callable[[], float | Non
             robot=config.robot,
             pool_uid=config.pool_uid,
             suspect_after_s=config.suspect_after_s / 2 if several else config.suspect_after_s,
-            manager_age=manager_age,
             tell_losers=config.tell_losers,
         )
     )
@@ -160,6 +193,7 @@ def make_dispatcher(
     pool_uid: str,
     actions: Actions,
     speaks: Speaks = Speaks.RCLPY,
+    id_of: Callable[[str, Any], bytes] | None = None,
 ) -> Dispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
 
@@ -171,14 +205,15 @@ def make_dispatcher(
         pool_uid: Whose marks they are.
         actions: Makes those of actions.
         speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
+        id_of: Gives a request its id, by service and handle; a random one unless given.
 
     Raises:
         RosError: The type is needed and cannot be loaded.
     """
-    fault_of = middleware.response_fault(spec.type)
+    fault_of = middleware.fault_of(spec.type, RESPONSE)
     if spec.part is not Part.NONE:
         return actions.make(spec, respond, wake, fault_of)
-    from fogft.ros import types
+    from fogft.ros import messages
     from fogft.ros.comparison import Comparison
 
     # The policy may become `empty` later.
@@ -190,7 +225,9 @@ def make_dispatcher(
         mark = marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}"
         order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake)
         return make(decide=order, replication=order, max_pending_bytes=_STATEFUL_BYTES)
-    ok_of = functools.partial(types.bool_field, spec.type)
+    if id_of is not None:
+        make = functools.partial(make, id_of=id_of)
+    ok_of = functools.partial(messages.bool_field, spec.type)
     if spec.quorum > 1:
         comparison = Comparison(spec.type, dict(spec.tolerance))
         flagged = functools.partial(_replica_disagrees, spec.name)
@@ -206,12 +243,30 @@ def _replica_disagrees(service: str, replica: int, count: int) -> None:
 class _Parts(NamedTuple):
     proxy: ClientProxy
     following: Following
-    sign: ManagerSign
     dialer: UplinkDialer
     seen: SeenFromRos
     scrape: Scrape
     metrics: str | None
-    node: RosNode
+    joined: middleware.Joined
+    managing: ManagerRestart
+
+    def callers(self) -> dict[str, int]:
+        """Count who may call each service that is offered, as far as discovery knows."""
+        return {name: self.joined.callers(name) for name in self.proxy.offered}
+
+    def participant(self) -> bytes:
+        """Return the id of this process in DDS, once it offers a service."""
+        return next(filter(None, map(self.joined.participant, self.proxy.offered)), b"")
+
+
+def _diagnosed(proxy: ClientProxy, config: ClientProxyConfig) -> dict[str, Any]:
+    """Return the report with what the manager beside it, if there is one, says of credentials."""
+    told: Any = None
+    with contextlib.suppress(FogftError):
+        told = disk.read_json(config.lock.parent / "status.json")
+    ends_at = told.get("credentials_end_at") if isinstance(told, dict) else None
+    left_s = ends_at - time.time() if isinstance(ends_at, (int, float)) else None
+    return {**proxy.report(), "credentials_left_s": left_s}
 
 
 def _loop(
@@ -220,23 +275,28 @@ def _loop(
     parts: _Parts,
     stop: threading.Event,
 ) -> None:
-    proxy, following, sign, seen = parts.proxy, parts.following, parts.sign, parts.seen
-    memory = memory_tuning.Trimmer()
+    proxy, following, seen = parts.proxy, parts.following, parts.seen
+    memory, watchdog = memory_tuning.Trimmer(), Watchdog()
     watched_config = Watched(config_path)
     watched_config.changed()
     watched_certificate = Watched(config.credentials.certificate)  # written after its key
     watched_certificate.changed()
-    revocations = Watched(config.revocations) if config.revocations else None
-    started = reported = looked = time.monotonic()
+    announcements = Watched(config.announcements) if config.announcements else None
+    started = reported = busy = time.monotonic()
+    looked = 0.0
     changed = False  # since the last report
+    participant = b""
     while not stop.is_set():
         changed = proxy.run_once() or changed
         now = time.monotonic()
+        if not proxy.idle:
+            busy = now
         if now - looked < _LOOK_EVERY_S:  # requests' own deadlines are seen to by `run_once`
             continue
         looked = now
         memory.look()
-        sign.look()
+        watchdog.work()
+        try_step(parts.managing.look, config.lock)
         if watched_config.changed():
             try_step(functools.partial(_reconfigure, config_path, config, parts), config_path)
         try_step(functools.partial(_follow_parameters, parts), config_path)
@@ -244,15 +304,19 @@ def _loop(
         if watched_certificate.changed():
             proxy.renew()
             following.renew()
-        if revocations is not None and revocations.changed():
-            try_step(functools.partial(_tell, revocations.path, proxy), revocations.path)
-        seen.diagnose(proxy.report, now)
-        if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
+        if announcements is not None and announcements.changed():
+            try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
+        seen.diagnose(functools.partial(_diagnosed, proxy, config), now)
+        idle = now - busy > _REPORT_IDLE_EVERY_S
+        every_s = _REPORT_IDLE_EVERY_S if idle else _REPORT_EVERY_S
+        if now - reported > (_REPORT_AFTER_CHANGE_S if changed else every_s):
             reported, changed = now, False
             if not config_path.parent.exists():  # the pool's folder: its end is the pool's
                 log.warning("folder_gone path=%s", config_path.parent)
                 return
-            report = {**proxy.report(), **following.report()}
+            participant = participant or parts.participant()
+            report = {**proxy.report(), **following.report(), "participant": participant.hex()}
+            report["callers"] = parts.callers()
             try_step(functools.partial(_report, config, report, now - started), config.status)
             trace = config.status.with_name(TRACE_NAME)
             try_step(functools.partial(_write_trace, trace, proxy), trace)
@@ -262,31 +326,44 @@ _troubles: dict[Path, str] = {}
 
 
 def try_step(step: Callable[[], None], path: Path) -> None:
-    """Do one step; a bad file, or a full disk, is logged once and changes nothing."""
+    """Do one step; a bad file, a full disk or the like is logged once and changes nothing."""
     try:
         step()
-    except FogftError as error:
-        if _troubles.get(path) != error.message:
-            _troubles[path] = error.message
-            log.error("file_failed path=%s reason=%r", path, error.message)
+    except (FogftError, OSError) as error:  # of the system: no descriptor, no folder
+        reason = error.message if isinstance(error, FogftError) else str(error)
+        if _troubles.get(path) != reason:
+            _troubles[path] = reason
+            log.error("file_failed path=%s reason=%r", path, reason)
     else:
         _troubles.pop(path, None)
 
 
 def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
-    new = read_client(path, parts.metrics)
-    fixed = (new.pool_uid, new.domain_id, new.rmw)
-    if fixed != (old.pool_uid, old.domain_id, old.rmw):
-        raise StateError(
-            f"`{path}`: pool_uid, domain_id and rmw cannot change while the proxy runs"
-        )
+    new = _same(old, read_client(path, parts.metrics), path)
     if parts.dialer.use(new.uplinks, new.services):
         parts.proxy.redial()
     parts.proxy.serve(parts.seen.follow(new.services))
-    parts.proxy.pass_topics(new.topics, cast(RosTopics, parts.node))
+    parts.proxy.pass_topics(new.topics, cast(RosTopics, parts.joined.node))
     parts.following.apply(new)
     parts.scrape.at(new.metrics)
     log.info("config_applied services=%d", len(new.services))
+
+
+def _same(old: ClientProxyConfig, new: ClientProxyConfig, path: Path) -> ClientProxyConfig:
+    """Return the new configuration. Raises StateError where this process cannot take it."""
+    if (new.pool_uid, new.domain_id, new.rmw) != (old.pool_uid, old.domain_id, old.rmw):
+        raise StateError(
+            f"`{path}`: pool_uid, domain_id and rmw cannot change while the proxy runs"
+        )
+    return new
+
+
+def _bury(config: ClientProxyConfig) -> None:
+    """Tell ROS that the process which had the lock before us is gone: if killed, it could not."""
+    with contextlib.suppress(StateError):
+        left = disk.read_json(config.status)
+        if isinstance(left, dict) and isinstance(said := left.get("participant"), str):
+            middleware.declare_gone(said, config.domain_id)
 
 
 def _follow_parameters(parts: _Parts) -> None:
@@ -313,6 +390,7 @@ def _report(config: ClientProxyConfig, report: Mapping[str, Any], uptime_s: floa
         "written_at": time.time(),
         "uptime_s": uptime_s,
         "robot": config.robot,
+        "version": __version__,
     }
     disk.write_json(config.status, {**header, **report}, durable=False)
 

@@ -18,12 +18,14 @@ from fogft.ros.port import RosClient, RosNode, RosServer
 
 log = logging.getLogger(__name__)
 
+_LOOK_EVERY_S = 2.0  # whether clients are on a middleware that understands ours
+
 
 class ProxiedService:
     """A service of the robot's.
 
     Attributes:
-        trouble: Why it cannot be offered; empty when it can.
+        trouble: Why it cannot be offered, or a client of it gets no answers; empty for nothing.
     """
 
     def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher) -> None:
@@ -34,6 +36,12 @@ class ProxiedService:
         self._fallback_name = ""
         self.trouble = ""
         self._advertising = Advertising()
+        self._looked_at = 0.0
+
+    @property
+    def shared(self) -> bool:
+        """Whether two proxies can serve it at once: it has no order, and no goals."""
+        return self.spec.state is None and self.spec.part is Part.NONE
 
     def adopt(self, spec: ServiceSpec, node: RosNode) -> None:
         """Have the dispatcher follow a policy, with a client of its fallback service."""
@@ -71,6 +79,9 @@ class ProxiedService:
             self._offer(node)
         elif not wanted and self.server is not None:
             self._withdraw()
+        elif self.server is not None and now > self._looked_at + _LOOK_EVERY_S:
+            self._looked_at = now
+            self._note("client_not_answered", self.server.mismatch())
 
     def _offer(self, node: RosNode) -> None:
         spec = self.spec
@@ -78,12 +89,15 @@ class ProxiedService:
             asked = self.dispatcher
             self.server = node.serve(spec.name, spec.type, asked.submit, asked.burst)
         except RosError as error:  # it shall not take the other services with it
-            if self.trouble != error.message:
-                self.trouble = error.message
-                log.error("service_not_advertised service=%s reason=%r", spec.name, error.message)
+            self._note("service_not_advertised", error.message)
         else:
-            self.trouble = ""
+            self._note("", "")
             log.info("service_advertised service=%s type=%s", spec.name, spec.type)
+
+    def _note(self, event: str, trouble: str) -> None:
+        if trouble not in ("", self.trouble):
+            log.error("%s service=%s reason=%r", event, self.spec.name, trouble)
+        self.trouble = trouble
 
     def _withdraw(self) -> None:
         server, self.server = self.server, None

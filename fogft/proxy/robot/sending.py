@@ -37,6 +37,7 @@ class Sender:
         self._replication = replication
         self._sending = threading.Lock()  # what replicas must have leaves in its order
         self._in_burst = False
+        self._hanging: set[int] = set()
         self.links: dict[int, Link] = {}
         self.able: tuple[int, ...] = ()
         self.next_look = NEVER
@@ -74,10 +75,12 @@ class Sender:
         links: Sequence[Link],
         versions: Mapping[ReplicaId, str],
         leaving: Collection[ReplicaId],
+        hanging: Collection[ReplicaId],
     ) -> None:
         """Set the links that may be asked now, and offer them what they lack."""
         routed = {key_of(link): link for link in links}
         replication, now = self._replication, self._ledger.clock()
+        hang = {key for key, link in routed.items() if link.peer.id in hanging}
         with self._ledger.lock:
             added = [key for key, link in routed.items() if self.links.get(key) is not link]
             self._ledger.requests.left(self.links.keys() - routed.keys())
@@ -89,7 +92,10 @@ class Sender:
                 known = {key: versions.get(x.peer.id, "") for key, x in routed.items()}
                 going = [key for key, link in routed.items() if link.peer.id in leaving]
                 replication.reach(added, now, known, going)
-        if added:
+            told, self._hanging = hang - self._hanging, hang
+            for key in told:
+                self._ledger.requests.choose.hangs(key)
+        if added or told:
             self.offer_more(now)
         self.replicate()
 

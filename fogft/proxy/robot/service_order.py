@@ -82,7 +82,7 @@ class ServiceOrder:
         if self._term.held_by:
             return (
                 f"robot `{self._term.held_by}` orders this service, and a service with `state` "
-                "is for one robot; for several see docs/state.md"
+                "is for one robot; for several see docs/how-to/state.md"
             )
         if self._term.stranded:
             return "no replica that can be reached holds the state; see docs/design/state.md"

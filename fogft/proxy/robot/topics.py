@@ -30,7 +30,8 @@ log = logging.getLogger(__name__)
 _MESSAGE_S = 10.0  # a message that is not confirmed in this time goes again
 _PULL_S = 10.0
 _AGAIN_S = 0.2  # after a refusal
-_LOOK_EVERY_S = 2.0  # whether publishers are heard
+_LOOK_EVERY_S = 2.0  # whether publishers are heard, and how often they publish
+_UNCONFIRMED_LIMIT = 4096
 
 
 class Merge(Protocol):
@@ -73,6 +74,8 @@ class RobotTopic:
         self._subscription: RosSubscription | None = None
         self._looked_at = clock()
         self.trouble = ""
+        self._unconfirmed: dict[int, None] = {}
+        self._rate_hz, self._counted = 0.0, (clock(), 0)
         self.count = dict.fromkeys(("messages", "passed", "dropped", "refused"), 0)
 
     def open(self, node: RosTopics) -> None:
@@ -89,6 +92,15 @@ class RobotTopic:
             if end is not None:
                 end.close()
 
+    def report(self) -> dict[str, Any]:
+        """Return its counters and rate, and why it does not pass."""
+        rate_hz = round(self._rate_hz, 2)
+        return {
+            **self.count,
+            "rate_hz": rate_hz,
+            **({"trouble": self.trouble} if self.trouble else {}),
+        }
+
     # -- the robot's own messages ---------------------------------------------------------
 
     def heard(self, message: bytes) -> None:
@@ -97,6 +109,10 @@ class RobotTopic:
             self._number += 1
             self.count["messages"] += 1
             self._kept.append((self._number, message))
+            self.count["dropped"] += not (self._ways or self.topic.latched)
+            self._unconfirmed[self._number] = None
+            if len(self._unconfirmed) > _UNCONFIRMED_LIMIT:
+                del self._unconfirmed[next(iter(self._unconfirmed))]
             for way in self._ways.values():
                 self.count["dropped"] += way.outbox.put(self._number, message)
             self._send()
@@ -122,8 +138,12 @@ class RobotTopic:
         with self._lock:
             self._send()
         now = self._clock()
-        if self._subscription is not None and now - self._looked_at > _LOOK_EVERY_S:
-            self._looked_at = now
+        if now - self._looked_at <= _LOOK_EVERY_S:
+            return
+        self._looked_at, (then, before_count) = now, self._counted
+        self._counted = (now, self.count["messages"])
+        self._rate_hz = (self.count["messages"] - before_count) / (now - then)
+        if self._subscription is not None:
             before, self.trouble = self.trouble, self._subscription.mismatch()
             if self.trouble not in ("", before):
                 log.error("topic_not_heard topic=%s reason=%r", self.topic.name, self.trouble)
@@ -168,6 +188,9 @@ class RobotTopic:
                 self._refused(way, number, answer.refusal or Refusal.LOST)
             elif number:
                 way.outbox.confirmed(number)
+                if number in self._unconfirmed:
+                    del self._unconfirmed[number]
+                    self.count["passed"] += 1
             else:
                 self._take(key, way, answer.payload)
             due = not number or way.outbox.waiting
@@ -283,6 +306,10 @@ class TopicsOnRobot:
         """Pass the end of an attempt to its topic."""
         self._topics[answer.service].answered(key, answer)
 
+    def __len__(self) -> int:
+        """Return how many pass."""
+        return len(self._topics)
+
     def tick(self) -> None:
         """Send what is due."""
         for one in self._topics.values():
@@ -290,10 +317,7 @@ class TopicsOnRobot:
 
     def report(self) -> dict[str, Any]:
         """Return counters by topic, and why some cannot pass."""
-        counts: dict[str, Any] = {
-            one.topic.name: {**one.count, **({"trouble": one.trouble} if one.trouble else {})}
-            for one in self._topics.values()
-        }
+        counts = {one.topic.name: one.report() for one in self._topics.values()}
         return {**counts, **{name: {"trouble": why} for name, why in self._trouble.items()}}
 
     def close(self) -> None:

@@ -93,10 +93,8 @@ def main() -> None:
     service = Service(given["delay_s"], given["reply_bytes"])
     service.start()
     state = {"ready": [SERVICE], "draining": False}
-    managers: list[float | None] = []
 
     def on_probe(probe: Probe) -> ProbeAnswer:
-        managers.append(probe.manager_age_s)
         slot, generation = given["claims"]
         return ProbeAnswer(
             slot, generation, "test", frozenset(state["ready"]), bool(state["draining"])
@@ -109,8 +107,9 @@ def main() -> None:
         service.delay_s = command.pop("delay_s", service.delay_s)
         listener.revoke(command.pop("revoke", ()))
         state.update(command)
-        last = {"manager_age_s": managers[-1]} if managers else {}
-        print(json.dumps({**listener.counters(), **last}), flush=True)
+        lease = listener.lease()
+        told = {"lease": 0 if lease is None else lease.sequence}
+        print(json.dumps({**listener.counters(), **told}), flush=True)
     listener.close()
 
 

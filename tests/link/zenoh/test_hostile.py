@@ -185,7 +185,7 @@ def test_who_did_not_greet_is_refused_and_counted(
     ada = authority.robot("ada").certificate.read_bytes()
     forged = frame.Greeting(bytes(8), ssl.PEM_cert_to_DER_cert(ada.decode()), b"s" * 70)
     bare = frame.encode_greeting(frame.Greeting(bytes(8)))
-    probe = b'{"v":%d,"robot":"ada","manager_age_s":null}' % frame.VERSION
+    probe = b'{"v":%d,"robot":"ada"}' % frame.VERSION
     tries = [
         (names.probe_key(POOL_UID, 0), probe, frame.encode_greeting(forged)),
         (names.probe_key(POOL_UID, 0), probe, bare),

@@ -132,7 +132,7 @@ def test_who_would_find_nobody_gets_no_bundle(
 ) -> None:
     """Where there is no rendezvous; no generation is used up, and the remedy is named."""
     store = store_of(spec, tmp_path)
-    with pytest.raises(CredentialError, match="would find") as caught:
+    with pytest.raises(CredentialError, match=r"(could|would) find") as caught:
         issued(store, role, name)
     assert "fogft.rendezvous" in caught.value.hint
     assert not Ledger(store.paths.credentials).entries()
@@ -152,7 +152,7 @@ def test_it_is_good_for_one_time(file: Path, tmp_path: Path) -> None:
     copy.write_bytes(file.read_bytes())
     joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
     assert not file.exists()
-    with pytest.raises(CredentialError, match="was used here before"):
+    with pytest.raises(CredentialError, match="was already used on this machine"):
         joining.join(copy, PASSPHRASE, tmp_path / "home", NOW)
     with pytest.raises(CredentialError, match="cannot be read"):
         joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
@@ -178,7 +178,7 @@ def test_a_wrong_passphrase_opens_nothing_and_spoils_nothing(file: Path, tmp_pat
 
 
 def test_its_time_ends_and_cannot_be_prolonged(file: Path, tmp_path: Path) -> None:
-    with pytest.raises(CredentialError, match="too old") as caught:
+    with pytest.raises(CredentialError, match="expired at") as caught:
         joining.join(file, PASSPHRASE, tmp_path / "home", NOW + 3600)
     assert "by this machine's clock" in caught.value.hint
     raw = json.loads(file.read_text())
@@ -192,7 +192,7 @@ def test_its_time_ends_and_cannot_be_prolonged(file: Path, tmp_path: Path) -> No
 def test_a_passphrase_that_is_too_short_uses_no_generation_up(
     store: PoolStore, passphrase: str
 ) -> None:
-    with pytest.raises(CredentialError, match="fewer than 12"):
+    with pytest.raises(CredentialError, match="shorter than 12"):
         joining.issue(store, Role.ROBOT, "ada", passphrase, NOW, open_for_s=60)
     issued = joining.issue(store, Role.ROBOT, "ada", PASSPHRASE, NOW, open_for_s=60)
     assert issued.holder.generation == 1
@@ -258,5 +258,5 @@ def test_any_damage_is_told(data: st.DataObject) -> None:
     | st.text().map(lambda t: json.dumps({"fogft_bundle": 1, "id": t}).encode())
 )
 def test_garbage_is_no_bundle(data: bytes) -> None:
-    with pytest.raises(CredentialError, match="no join bundle"):
+    with pytest.raises(CredentialError, match="not a join bundle"):
         bundle.read_label(data)

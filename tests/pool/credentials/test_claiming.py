@@ -81,7 +81,7 @@ def test_a_copy_is_refused_on_a_second_machine(scene: Scene, role: Role, name: s
         scene.join("second", data)
     assert f"fogft credentials revoke {role.value} {name}" in caught.value.hint
     assert scene.keys("second") == []
-    with pytest.raises(CredentialError, match="was used here before"):
+    with pytest.raises(CredentialError, match="was already used on this machine"):
         scene.join("first", data)
     assert scene.join("second", scene.issue(role, name)).holder.short == f"{name}.2"
     assert len(scene.keys("second")) == 1

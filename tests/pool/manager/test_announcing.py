@@ -19,14 +19,15 @@ from fogft.pool.manager.announcing import ManagerRecords
 from fogft.reason_words import words
 from fogft.records import cache
 from fogft.records.exchange import Exchange
-from fogft.records.record import RecordKind
+from fogft.records.record import RecordKind, read_body
 from fogft.records.record_set import RecordSet
-from fogft.records.roster import admission
+from fogft.records.roster import ServingLease, admission, lease
 from fogft.records.server import RendezvousServer
 from fogft.records.signing import Verifier
 from tests.link.wire_pool import wait_for
 
 UID = "0123456789abcdef"
+LEASE = ServingLease(1e9, 86_400.0)
 
 
 class Place:
@@ -82,14 +83,14 @@ def membership(epoch: int, version: int, *slots: int, revoked: tuple[str, ...] =
 
 def test_every_change_is_published_and_the_next_manager_goes_on(paths, place):
     first = ManagerRecords(paths, UID, 1)
-    first.look((place.endpoint,), membership(1, 1))
+    first.look((place.endpoint,), membership(1, 1), LEASE)
     wait_for(lambda: place.admitted() == membership(1, 1))
-    first.look((place.endpoint,), membership(1, 2, 0, 1))
+    first.look((place.endpoint,), membership(1, 2, 0, 1), LEASE)
     wait_for(lambda: place.admitted() == membership(1, 2, 0, 1))
     assert first.trouble is None
     first.close()
     second = ManagerRecords(paths, UID, 2)
-    second.look((place.endpoint,), membership(2, 1, 0))
+    second.look((place.endpoint,), membership(2, 1, 0), LEASE)
     wait_for(lambda: place.admitted() == membership(2, 1, 0))
     second.close()
     assert {r.body for r in cache.read(paths.manager_records)} == {
@@ -100,23 +101,29 @@ def test_every_change_is_published_and_the_next_manager_goes_on(paths, place):
 def test_revocations_are_published(paths, place):
     gone = Holder(Role.ROBOT, "eve", 1, UID).common_name
     manager = ManagerRecords(paths, UID, 1)
-    manager.look((place.endpoint,), membership(1, 1, 0, revoked=(gone,)))
+    manager.look((place.endpoint,), membership(1, 1, 0, revoked=(gone,)), LEASE)
     wait_for(lambda: place.records.revoked == {gone})
     manager.close()
 
 
-def test_without_a_rendezvous_nothing_is_made(paths):
+def test_without_a_rendezvous_the_lease_is_signed_for_the_client_proxy_to_pass_on(paths):
+    """A new one each minute, or sooner where it is short; never one for each tick."""
     manager = ManagerRecords(paths, UID, 1)
-    manager.look((), membership(1, 1))
-    assert not (paths.credentials / "manager.crt").exists()
+    sequences = []
+    for after_s in (0.0, 1.0, 30.0, 59.0, 60.0, 61.0, 200.0):
+        manager.look((), membership(1, 1), ServingLease(1e9 + after_s, 86_400.0))
+        sequences.append(read_body(cache.read(paths.announcements)[0]).sequence)
+    assert sequences == [1, 1, 1, 1, 2, 2, 3]
+    manager.look((), membership(1, 1), ServingLease(1e9 + 203.0, 30.0))
+    assert lease(read_body(cache.read(paths.announcements)[0])) == ServingLease(1e9 + 203.0, 30.0)
     assert not paths.manager_records.exists()
 
 
 def test_it_says_when_none_can_be_reached_and_follows_a_changed_file(paths, place):
     manager = ManagerRecords(paths, UID, 1)
-    manager.look(("127.0.0.1:1",), membership(1, 1, 0))
+    manager.look(("127.0.0.1:1",), membership(1, 1, 0), LEASE)
     wait_for(lambda: "refused" in words(manager.trouble).lower())
-    manager.look((place.endpoint,), membership(1, 1, 0))
+    manager.look((place.endpoint,), membership(1, 1, 0), LEASE)
     wait_for(lambda: place.admitted() == membership(1, 1, 0))
     manager.close()
 

@@ -41,7 +41,7 @@ def identity(tmp: Path) -> Identity:
 def spec(**task: object) -> PoolSpec:
     health = HealthSpec(suspect_after_s=3.5)
     whole = {"run": "exec serve", **task}
-    return PoolSpec("pool", SERVICES, health=health, orphan_after_s=120.0, task=whole)
+    return PoolSpec("pool", SERVICES, health=health, task=whole)
 
 
 def test_each_side_is_told_how_it_speaks_ros(paths: PoolPaths) -> None:
@@ -67,7 +67,7 @@ def test_the_client_proxy_reads_what_was_written(paths: PoolPaths) -> None:
     assert (config.pool, config.pool_uid, config.services) == ("pool", UID, SERVICES)
     assert (config.suspect_after_s, config.domain_id) == (3.5, None)
     assert (config.membership, config.status) == (paths.membership, paths.proxy_status)
-    assert (config.lease, config.lock) == (paths.lease, paths.proxy_lock)
+    assert (config.lock, config.announcements) == (paths.proxy_lock, paths.announcements)
     assert config.credentials.key == paths.credentials / "robot.key"
     assert not configuration.write_proxy_config(paths, identity(paths.folder), spec())
 
@@ -100,7 +100,7 @@ def test_the_server_proxy_reads_what_was_written(paths: PoolPaths, run: str) -> 
     assert config.run == run
     assert config.envs == {"KEY": NASTY, "EMPTY": "", "NUMBER": "3"}
     assert [(s.name, s.type) for s in config.services] == [(s.name, s.type) for s in SERVICES]
-    assert (config.listen, config.domain_id, config.orphan_after_s) == ("127.0.0.1:5", 4, 120.0)
+    assert (config.listen, config.domain_id) == ("127.0.0.1:5", 4)
     described = authority.describe(config.credentials.certificate)
     assert described.common_name == f"replica.3.7.{UID}"
     assert described.role == authority.Role.REPLICA.value

@@ -164,7 +164,7 @@ def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> No
     [launched, _] = pools.judge_links("p", [LinkReport(id_of(105, 2), LinkState.SUSPECT)])
     assert "replica `1000.2` is suspect" in by_hand.text
     assert "replica `105.2` is suspect" in launched.text
-    assert "nobody replaces it" in by_hand.advice
+    assert "is not replaced automatically" in by_hand.advice
     assert "`fogft logs 105`" in launched.advice
 
 

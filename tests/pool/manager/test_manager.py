@@ -26,7 +26,13 @@ def test_manager_brings_up_what_the_file_asks_for(scene: Scene) -> None:
     for private in (scene.paths.proxy_config, scene.paths.credentials / "robot.key"):
         assert private.stat().st_mode & 0o777 == 0o600
     machine = disk.read_json(next(scene.cloud.folder.glob("*.json")))
-    assert machine["files"] == ["ca.crt", "replica.crt", "replica.key", "replica.yaml"]
+    assert machine["files"] == [
+        "announcements.json",
+        "ca.crt",
+        "replica.crt",
+        "replica.key",
+        "replica.yaml",
+    ]
 
 
 def test_killed_manager_stops_nothing_and_the_next_one_adopts(scene: Scene) -> None:
@@ -136,7 +142,7 @@ def test_a_pool_ends_by_itself_when_its_hours_are_over(scene: Scene) -> None:
     status = scene.status()
     assert status["ended"] == "by itself, after 0.0001 hours (`max_hours`)"
     assert (status["replicas"], status["proxy_alive"]) == ([], False)
-    assert "`max_hours` is over" in {e["detail"] for e in status["events"]}
+    assert "`max_hours` has passed" in {e["detail"] for e in status["events"]}
     scene.write(replicas=2, max_hours=2)
     scene.start_manager()
     scene.wait(lambda: scene.whole(2) and not scene.status()["ended"])
@@ -165,7 +171,7 @@ def test_a_cloud_that_does_not_answer_does_not_end_the_ending(scene: Scene) -> N
     (scene.cloud.folder / "outage").touch()
     scene.wait(lambda: not scene.status()["cloud_reachable"])
     scene.let_hours_pass(2)
-    scene.wait(lambda: any("are over" in note for note in scene.status()["notes"]))
+    scene.wait(lambda: {"cause": "max_hours", "seconds": 7200.0} in scene.status()["reasons"])
     assert process.poll() is None
     (scene.cloud.folder / "outage").unlink()
     assert process.wait(30) == 0

@@ -104,7 +104,8 @@ def test_down_that_gets_no_answer_lists_what_may_still_run(scene: Scene) -> None
         "may still run: replica 1.1 (folder/three/a)",
     ]
     assert caught.value.hint == (
-        "run `fogft down pool` again; what hears of no manager ends by itself after 3600 s"
+        "run `fogft down pool` again; "
+        "replicas that hear of no manager end by themselves after 24 hours"
     )
 
 

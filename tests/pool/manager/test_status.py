@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import StateError
+from fogft.metrics.outcomes import Outcomes
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import LinkState, ReplicaId
-from fogft.planning.observed.history import Event, EventKind
+from fogft.model.replica import LinkState, Observed, ReplicaId
+from fogft.planning.observed.history import Event, EventKind, History
+from fogft.planning.planner import plan
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager import proxy_report, status
 from fogft.pool.manager.reconciler import Tick
@@ -39,6 +42,40 @@ def test_a_report_is_read_whole() -> None:
     assert (link.id, link.state) == (ReplicaId(UID, 1, 2), LinkState.UP)
     assert (link.ready, link.won, link.rtt_s) == (frozenset({"/plan"}), 3, 0.01)
     assert report.services["/plan"]["answered"] == 3
+
+
+def test_the_phases_of_a_launch_are_told_as_far_as_they_are_known() -> None:
+    base = replica(0, 1).machine
+    for running_at, set_up_at, ready_at, told in (
+        (0.0, 0.0, None, (None, None, None, None)),
+        (NOW - 60, 0.0, None, (40.0, None, None, None)),
+        (NOW - 60, NOW - 30, None, (40.0, 30.0, None, None)),
+        (NOW - 60, NOW - 30, NOW - 10, (40.0, 30.0, 20.0, 90.0)),
+        (0.0, 0.0, NOW - 10, (None, None, None, 90.0)),
+    ):
+        history = History([Event(NOW - 100, EventKind.LAUNCH, 0, 1, base.placement.location)])
+        if ready_at:
+            history.add(Event(ready_at, EventKind.READY, 0, 1))
+        machine = replace(base, running_at=running_at, set_up_at=set_up_at)
+        observed = Observed(NOW, (machine,))
+        decided = plan(UID, spec(), Intent(), observed, history)
+        identity = Identity("pool", UID, "sky", "/pool.yaml", NOW)
+        tick = Tick(identity, spec(), Intent(), observed, decided, None)
+        seen = status.of_tick(
+            tick, history=history, report=None, recent=[], epoch=1, manager_pid=1, proxy_alive=True
+        )
+        [one] = seen.replicas
+        assert (one.provisioning_s, one.setup_s, one.starting_s, one.ready_after_s) == told
+
+
+def test_what_a_client_proxy_counts_is_read() -> None:
+    """From its first moment on, and in order where a service has state."""
+    fresh = {**Outcomes().report(), "pending": 0, "order": {"trouble": "a\nb", "last": None}}
+    later = {**fresh, "poisoned_at": 1.7e9, "p50_s": 0.1, "p99_s": 0.2}
+    for counted in (fresh, later):
+        report = proxy_report.parse({**REPORT, "services": {"/plan": counted}}, UID)
+        assert report is not None
+        assert report.services["/plan"] == counted
 
 
 @pytest.mark.parametrize(("now", "fresh"), [(100, True), (105, True), (106, False), (90, False)])

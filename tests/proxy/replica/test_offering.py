@@ -35,7 +35,7 @@ class Scene:
         self.proxy.run_once()
 
     def probe(self):
-        return self.listener.on_probe(Probe("robot", 0.0, True))
+        return self.listener.on_probe(Probe("robot", True))
 
 
 def test_what_run_offers_is_taken_up_and_answered():
@@ -113,4 +113,4 @@ def test_a_replica_without_the_type_stays_and_says_so():
 def test_definitions_are_told_only_where_they_are_asked_for():
     scene = Scene(ServiceSpec("/s", SET_BOOL))
     assert scene.probe().types == {SET_BOOL: Definition(hash=SET_BOOL)}
-    assert scene.listener.on_probe(Probe("robot", 0.0)).types == {}
+    assert scene.listener.on_probe(Probe("robot")).types == {}

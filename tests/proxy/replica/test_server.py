@@ -9,7 +9,15 @@ from fogft.model.spec import ServiceSpec
 from fogft.model.topic import ActionSpec
 from fogft.poolfile.actions import action_services
 from fogft.proxy.replica.server import ServerProxy
-from tests.proxy.fakes import UID, Clock, FakeIncoming, FakeListener, FakeNode, FakeSupervisor
+from tests.proxy.fakes import (
+    UID,
+    Clock,
+    FakeIncoming,
+    FakeListener,
+    FakeNode,
+    FakeSupervisor,
+    lease,
+)
 
 HEADER = b"\0\1\0\0"
 ACCEPTED, UNKNOWN, SUCCEEDED = HEADER + b"\1", HEADER + b"\0", HEADER + b"\4"
@@ -27,7 +35,6 @@ class Scene:
             self.listener,
             lambda: self.make_node(),
             self.supervisor,  # type: ignore[arg-type]
-            orphan_after_s=60.0,
             clock=self.clock,
         )
         self.proxy.start()
@@ -39,8 +46,8 @@ class Scene:
     def client(self):
         return self.nodes[-1].clients["/s"]
 
-    def probe(self, manager_age_s: float | None = 0.0):
-        return self.listener.on_probe(Probe("robot", manager_age_s))
+    def probe(self):
+        return self.listener.on_probe(Probe("robot"))
 
 
 def test_ready_when_the_command_lives_and_the_service_is_discovered():
@@ -57,6 +64,20 @@ def test_not_ready_while_discovery_does_not_find_the_service():
     answer = scene.probe()
     assert answer.ready == frozenset()
     assert answer.detail == "`run` does not offer /s yet"
+
+
+def test_not_ready_while_the_service_is_on_another_middleware():
+    """Discovery shows it, and it would never answer."""
+    scene = Scene()
+    scene.client().stranger = "`/s` runs on rmw_cyclonedds_cpp"
+    scene.proxy.run_once()
+    answer = scene.probe()
+    assert answer.ready == frozenset()
+    assert answer.detail == "`/s` runs on rmw_cyclonedds_cpp"
+    scene.client().stranger = ""
+    scene.proxy.run_once()
+    assert scene.probe().ready == {"/s"}
+    assert not scene.probe().detail
 
 
 def test_a_probe_names_slot_and_generation():
@@ -130,6 +151,59 @@ def test_a_service_that_the_command_restarts_by_itself_loses_its_work():
     assert later.outcome == []
 
 
+def hang(scene: Scene, *, remaining_s: float = 2.0) -> None:
+    """Have a service that has answered in 0.1 s get two requests that it does not answer."""
+    scene.proxy.run_once()
+    for name in (b"a", b"b", b"c"):
+        scene.listener.on_request(FakeIncoming(name * 16, remaining_s=remaining_s))
+        if name == b"a":
+            scene.clock.now += 0.1
+            scene.client().calls[0][1](b"r")
+
+
+def test_a_service_that_answers_nothing_of_what_it_has_is_told_and_then_started_anew():
+    scene = Scene()
+    hang(scene)
+    scene.clock.now += 0.9
+    assert scene.probe().hanging == frozenset()
+    scene.clock.now += 1.0
+    answer = scene.probe()
+    assert (answer.ready, answer.hanging) == ({"/s"}, {"/s"})
+    assert answer.detail == "`/s` has work and has answered nothing for 2 s"
+    for _ in range(600):
+        scene.clock.now += 0.1
+        scene.proxy.run_once()
+    assert scene.supervisor.restarts == 1
+    assert scene.probe().hanging == frozenset()
+
+
+def test_a_service_that_answers_again_does_not_hang_any_more():
+    scene = Scene()
+    hang(scene)
+    scene.clock.now += 30.0
+    scene.proxy.run_once()
+    scene.client().calls[1][1](b"r")
+    assert scene.probe().hanging == frozenset()
+    scene.clock.now += 45.0  # its longest answer took 30 s
+    scene.proxy.run_once()
+    assert (scene.supervisor.restarts, scene.probe().hanging) == (0, frozenset())
+
+
+def test_a_long_call_and_a_service_that_has_never_answered_are_not_ended():
+    """Who waits for an hour says that it may take an hour; a model may load at the first call."""
+    scene = Scene()
+    hang(scene, remaining_s=3600.0)
+    new = Scene()
+    new.proxy.run_once()
+    for name in (b"a", b"b"):
+        new.listener.on_request(FakeIncoming(name * 16, remaining_s=2.0))
+    for one in (scene, new):
+        for _ in range(100):
+            one.clock.now += 10.0
+            one.proxy.run_once()
+        assert one.supervisor.restarts == 0
+
+
 def absent(node: FakeNode) -> FakeNode:
     make = node.client
 
@@ -142,32 +216,24 @@ def absent(node: FakeNode) -> FakeNode:
     return node
 
 
-def test_orphaned_when_no_manager_was_heard_of_for_long():
+def test_it_says_how_long_it_serves_on_without_a_manager():
+    """Robots' probes do not prolong it; only a lease that the manager signed does."""
     scene = Scene()
-    scene.clock.now += 59.0
-    scene.probe(manager_age_s=0.0)
-    scene.clock.now += 59.0
-    assert not scene.proxy.orphaned
-    scene.clock.now += 2.0
-    assert scene.proxy.orphaned
-
-
-def test_a_robot_that_has_not_seen_the_manager_keeps_nobody_alive():
-    """Probes alone are no sign of a manager: they carry when it was last seen."""
-    scene = Scene()
-    for _ in range(61):
+    assert scene.probe().lease_left_s is None
+    scene.listener.signed = lease(1, at=1e9, lasts_s=60.0)
+    scene.proxy.run_once()
+    for _ in range(59):
         scene.clock.now += 1.0
-        scene.probe(manager_age_s=None)
-    assert scene.proxy.orphaned
-
-
-def test_an_old_sign_does_not_undo_a_newer_one():
-    scene = Scene()
-    scene.clock.now += 50.0
-    scene.probe(manager_age_s=0.0)
-    scene.probe(manager_age_s=49.0)
-    scene.clock.now += 30.0
-    assert not scene.proxy.orphaned
+        scene.probe()
+        scene.proxy.run_once()
+    assert (scene.probe().lease_age_s, scene.probe().lease_left_s) == (59.0, 1.0)
+    assert not scene.proxy.lease_is_over
+    scene.clock.now += 1.0
+    assert scene.proxy.lease_is_over
+    scene.listener.signed = lease(2, at=1e9 + 60.0, lasts_s=60.0)
+    scene.proxy.run_once()
+    assert scene.probe().lease_left_s == 60.0
+    assert not scene.proxy.lease_is_over
 
 
 def test_close_stops_the_command_and_leaves_the_wire_and_ros():

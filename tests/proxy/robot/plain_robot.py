@@ -23,7 +23,7 @@ from fogft.proxy.config import read_client
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
-from fogft.proxy.robot.process import make_dialer
+from fogft.proxy.robot.process import make_dialer, try_step
 
 
 class Callers:
@@ -54,6 +54,9 @@ class Callers:
 
     def client(self, name: str, type_name: str) -> Any:
         raise RosError("there is no ROS here")
+
+    def mismatch(self) -> str:
+        return ""
 
     def close(self) -> None:
         pass
@@ -98,7 +101,7 @@ class Callers:
 def main() -> None:
     config = read_client(Path(sys.argv[1]))
     callers = Callers(int(sys.argv[2]) if len(sys.argv) > 2 else 1)
-    dialer = make_dialer(config, lambda: None)
+    dialer = make_dialer(config)
     proxy = ClientProxy(
         config.pool_uid,
         callers,
@@ -110,12 +113,15 @@ def main() -> None:
     certificate = Watched(config.credentials.certificate)
     certificate.changed()
 
+    def follow() -> None:
+        membership = following.look()
+        if membership is not None:
+            proxy.follow(membership)
+
     def keep() -> None:
         while True:
             proxy.run_once()
-            membership = following.look()
-            if membership is not None:
-                proxy.follow(membership)
+            try_step(follow, config.membership)
             if certificate.changed():
                 proxy.renew()
                 following.renew()

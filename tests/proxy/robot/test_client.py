@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from fogft.errors import RosError
 from fogft.link.port import ProbeAnswer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import Member, Membership, ReplicaId
-from fogft.model.spec import Part, ServiceSpec
+from fogft.model.spec import HedgingMode, Part, ServiceSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
@@ -69,6 +71,23 @@ def test_the_service_is_advertised_once_a_replica_can_answer():
     assert scene.node.servers == {}
     scene.ready(*scene.dialer.links)
     assert list(scene.node.servers) == ["/s"]
+
+
+def test_a_client_on_another_middleware_is_told(caplog):
+    """It would wait for ever, and nothing else would say why."""
+    scene = Scene()
+    scene.follow(member(0))
+    scene.ready(*scene.dialer.links)
+    scene.node.servers["/s"].stranger = "a client of `/s` runs on rmw_cyclonedds_cpp"
+    for _ in range(3):
+        scene.clock.now += 5.0
+        scene.proxy.run_once(0)
+    assert scene.proxy.report()["services"]["/s"]["trouble"].endswith("rmw_cyclonedds_cpp")
+    assert caplog.text.count("client_not_answered") == 1
+    scene.node.servers["/s"].stranger = ""
+    scene.clock.now += 5.0
+    scene.proxy.run_once(0)
+    assert scene.proxy.report()["services"]["/s"]["trouble"] == ""
 
 
 def test_a_request_goes_to_every_ready_replica_and_the_answer_to_the_caller():
@@ -275,6 +294,19 @@ def test_a_replica_whose_type_differs_is_not_asked_and_says_which_field():
         [],
     )
     assert "field `request.data` is `boolean` here and `int64` on the replica" in bad["detail"]
+
+
+def test_what_a_replica_that_says_it_hangs_has_is_sent_to_another():
+    scene = Scene()
+    scene.proxy.serve([ServiceSpec("/s", SET_BOOL, hedging=HedgingMode.FAILOVER)])
+    scene.follow(member(0), member(1))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    first, second = scene.dialer.links
+    first.told = replace(told(0, "boolean"), hanging=frozenset({"/s"}))
+    scene.ready(first)
+    assert [len(link.offered) for link in (first, second)] == [1, 1]
+    assert scene.proxy.report()["links"][0]["hanging"] == ["/s"]
 
 
 def test_where_every_type_differs_nothing_is_advertised():

@@ -101,3 +101,19 @@ def test_counters_that_begin_anew_are_no_trouble():
     diagnosis = Diagnosis("arm", "r")
     look(diagnosis, report(link(0), silent=7))
     assert look(diagnosis, report(link(0), silent=0), 1.0)["service /plan"].level is Level.OK
+
+
+@pytest.mark.parametrize(
+    ("left_s", "level", "said"),
+    [
+        (None, Level.OK, ""),
+        (7200.0, Level.OK, ""),
+        (600.0, Level.WARN, "the cloud's credentials end in 10 min"),
+        (-5.0, Level.WARN, "the cloud's credentials have ended"),
+    ],
+)
+def test_credentials_of_the_cloud_are_counted_down(left_s: float | None, level: Level, said: str):
+    told = look(Diagnosis("arm", "r"), {**report(link(0)), "credentials_left_s": left_s})["pool"]
+    assert told.level is level
+    assert said in told.message
+    assert told.values.get("credentials end in_s") == (None if left_s is None else f"{left_s:g}")

@@ -17,8 +17,7 @@ from fogft.model import membership
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.proxy.config import read_client, read_server
 from fogft.proxy.robot import process
-from fogft.proxy.robot.manager_sign import ManagerSign
-from tests.proxy.fakes import UID, Clock
+from tests.proxy.fakes import UID
 
 CLIENT = f"""\
 pool: p
@@ -26,7 +25,6 @@ pool_uid: "{UID}"
 robot: robot
 membership: membership.json
 status: proxy-status.json
-lease: lease.json
 lock: proxy.lock
 credentials: {{ca: ca.crt, certificate: robot.crt, key: robot.key}}
 services: [{{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 2.0}}]
@@ -42,7 +40,6 @@ listen: 127.0.0.1:7447
 services: [{{name: /plan, type: nav_msgs/srv/GetPlan}}]
 run: exec serve
 credentials: {{ca: ca.crt, certificate: replica.crt, key: replica.key}}
-orphan_after_s: 60
 """
 MEMBERS = json.dumps(
     membership.to_dict(Membership("p", UID, 1, 1, (Member(ReplicaId(UID, 0, 1), "h:1"),)))
@@ -94,16 +91,6 @@ def test_a_damaged_membership_names_nobody_else(tmp_path_factory, content):
 
     found = value_or_error(read, tmp_path_factory.getbasetemp() / "membership.json", content)
     assert found is None or membership.to_dict(found) == json.loads(MEMBERS)
-
-
-@given(damaged('{"epoch": 1, "pid": 4, "beat": 7}'))
-@example(b"[" * 100_000)
-def test_a_damaged_lease_is_no_error(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "lease.json"
-    path.write_bytes(content)
-    sign = ManagerSign(path, Clock())
-    sign.look()
-    assert sign.age_s() is None
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,18 @@ def test_auto_is_near_the_shortest_queue_from_idle_to_full(service, load):
     assert p99(worlds) <= 1.4 * shortest_queue(service, load) + 0.020
 
 
+@pytest.mark.parametrize(
+    ("service", "load"),
+    [("constant", 0.1), ("stalling", 0.1), ("stalling", 0.8), ("exponential", 0.8)],
+)
+def test_auto_is_never_much_worse_than_one_copy_to_the_shortest_queue(service, load):
+    """Beyond the round trip: p99 at most 1.05 of it, where copies gain nothing or lack room.
+
+    At 10 % three copies of each request would make three in ten wait, where one in a hundred may.
+    """
+    assert p99(served(AUTO, service, load)) - 0.002 <= 1.05 * shortest_queue(service, load)
+
+
 def test_copies_cut_the_tail_of_a_service_that_stalls():
     """At a third of what three can do, p99 is well below that of one copy to the shortest queue."""
     queue = shortest_queue("stalling", 0.3, seconds=400.0)
@@ -92,7 +104,7 @@ def test_copies_become_fewer_with_load():
         [world] = served(AUTO, "constant", load)
         ran.append(sum(link.replica.service.ran for link in world.links) / len(world.asked))
     assert ran == sorted(ran, reverse=True)
-    assert ran[0] > 2.0
+    assert ran[0] > 1.7
     assert ran[-1] < 1.05
 
 
@@ -145,6 +157,49 @@ def test_a_service_that_hangs_for_a_while_loses_nothing_and_gets_requests_again(
         assert min(ran) > 0.1 * sum(ran)
 
 
+@pytest.mark.parametrize("fault", ["killed", "frozen", "hangs"])
+@pytest.mark.parametrize("service", ["constant", "exponential"])
+def test_a_fault_at_seventy_percent_costs_little_beyond_the_replica(fault, service):
+    """Nothing is lost; p99 during it is at most 1.25 of a third that left in good order."""
+    assert during("leaves", service) * 1.25 >= during(fault, service)
+
+
+def during(fault: str, service: str, seconds: float = 6.0) -> float:
+    """Return p99 from a fault on, at 70 % of what three replicas can do."""
+    world = World(AUTO, timeout_s=2.0)
+    for _ in range(3):
+        world.replica(SERVICES[service], serial=True)
+    world.poisson(105.0, 10.0, random.Random(1))
+    before, link = len(world.asked), world.links[0]
+    if fault == "leaves":
+        del world.links[0]
+        world.route()
+    elif fault == "hangs":
+        link.replica.service.hangs_until = world.now + seconds
+    else:
+        link.frozen = fault == "frozen"
+        world.at(world.now + (2.0 if fault == "frozen" else 0.003), link.lose)
+    world.poisson(105.0, seconds, random.Random(2))
+    world.run(2.5)
+    assert lost([world]) == 0
+    return percentile(world.latencies(before), 99)
+
+
+def test_what_a_replica_that_says_it_hangs_has_goes_to_others_at_once():
+    """Of one that has answered little the robot itself would see nothing for 2 s."""
+    for mode in (AUTO, FAILOVER):
+        world = World(mode)
+        world.replica(constant(1.0), serial=True)
+        world.replica(constant(0.1), serial=True)
+        world.links[0].frozen = True
+        while not world.links[0].offers:
+            world.ask()
+        world.run(0.5)
+        world.dispatcher.route(world.links, hanging={world.links[0].peer.id})
+        world.run(0.5)
+        assert lost([world]) == 0
+
+
 def test_one_that_is_ten_times_as_slow_gets_few_requests():
     world = World(AUTO, timeout_s=2.0)
     for service_s in (0.2, 0.02, 0.02):
@@ -167,12 +222,15 @@ def test_over_capacity_what_is_answered_is_answered_in_time_and_the_rest_costs_n
     """At 150 % nearly all that three can do is done, and afterwards all is as before."""
     [world] = served(AUTO, "constant", 1.5, seconds=20.0)
     assert len(world.answers) >= 0.95 * 150 * 20
+    assert world.dispatcher.report()["needed_replicas"] in (4, 5, 6)  # 4.5 would be full
     before = len(world.asked)
     world.poisson(45.0, 5.0, random.Random(2))
     world.run(2.5)
     latencies = world.latencies(before)
     assert len(latencies) == len(world.asked) - before
     assert percentile(latencies, 50) < 0.025
+    world.poisson(75.0, 20.0, random.Random(3))
+    assert world.dispatcher.report()["needed_replicas"] == 0
 
 
 @pytest.mark.parametrize("hedging", list(HedgingMode))

@@ -11,6 +11,10 @@ Three servers, all inside a network namespace of the test's own:
     POST /notice?id=I&in_s=S            a preemption notice: taken in S seconds (AWS: 120)
     POST /rebalance?id=I                a rebalance recommendation
     POST /preempt?id=I                  taken now
+    POST /deny?action=A                 A is not allowed any more; without A all is again
+
+With `ENFORCED` set, who launches may do what the policy of docs/how-to/clouds.md allows, and a VM
+what its role allows (`policy`).
 """
 
 from __future__ import annotations
@@ -34,14 +38,19 @@ from pathlib import Path
 from typing import Any
 
 import boto3
+import flask
 import yaml
-from moto.core.responses import ActionResult
+from moto.core.exceptions import ServiceException
+from moto.core.responses import ActionResult, BaseResponse
 from moto.ec2.exceptions import EC2ClientError
 from moto.ec2.models import ec2_backends, elastic_network_interfaces, instances
 from moto.ec2.responses import spot_instances
 from moto.server import ThreadedMotoServer
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parents[2]))
+from tests.sky.emulated_aws.policy import OF_VMS, PAGE, Policy, statements  # noqa: E402
+
 IMAGE = Path(os.environ["EMULATION"])
 HIDDEN = [folder for folder in os.environ.get("HIDDEN", "").split(":") if folder]
 SPOT = {"us-east-1": 0.019, "us-west-2": 0.024, "eu-west-1": 0.039}
@@ -174,6 +183,42 @@ def patch_moto() -> None:
         setattr(instances.Instance, name, killing(getattr(instances.Instance, name)))
 
 
+LAUNCHER, VM = Policy(statements(PAGE.read_text())), Policy(OF_VMS)
+
+
+def enforce() -> None:
+    """Refuse what the policies do not allow, in AWS's words."""
+    call = BaseResponse.call_action
+
+    def call_action(self: Any) -> Any:
+        action = f"{self.service_name}:{self._get_action()}"
+        mine = flask.request.remote_addr == "127.0.0.1"
+
+        def tags() -> list[dict[str, str]]:
+            wanted = set(self._get_param("InstanceIds", []) or self._get_multi_param("InstanceId"))
+            found = [i for _, _, i in all_instances() if i.id in wanted]
+            return [{tag["key"]: tag["value"] for tag in one.get_tags()} for one in found]
+
+        if (LAUNCHER if mine else VM).allows(action, tags):
+            return call(self)
+        who = "arn:aws:iam::123456789012:" + ("user/lab" if mine else "role/skypilot-v1")
+        WORLD.say("denied", action=action, by=who)
+        code, does = "AccessDenied", ""
+        if self.service_name == "ec2":
+            code, does = (
+                "UnauthorizedOperation",
+                "You are not authorized to perform this operation. ",
+            )
+        words = (
+            f"{does}User: {who} is not authorized to perform: {action} because no identity-based "
+        )
+        error = ServiceException(f"{words}policy allows the {action} action")
+        error.code = code
+        return self.serialized(ActionResult(error))
+
+    BaseResponse.call_action = call_action
+
+
 def price_history(self: Any) -> ActionResult:
     """Answer with prices a little below the catalogue's, so that a test can tell them apart."""
     kinds = self._get_param("InstanceTypes", [])
@@ -247,6 +292,8 @@ class Control(Handler):
             timer = threading.Timer(in_s, WORLD.preempt, [asked["id"]])
             timer.daemon = True
             timer.start()
+        elif url.path == "/deny":
+            LAUNCHER.taken = {asked["action"]} if "action" in asked else set()
         elif url.path == "/rebalance":
             WORLD.rebalance[asked["id"]] = f"{now:%Y-%m-%dT%H:%M:%SZ}"
         else:
@@ -316,6 +363,8 @@ def main() -> None:
     patch_moto()
     ThreadedMotoServer(ip_address="0.0.0.0", port=5566, verbose=False).start()
     prepare_account()
+    if os.environ.get("ENFORCED"):
+        enforce()
 
     def stop(*_: Any) -> None:
         for id in list(WORLD.vms):

@@ -13,6 +13,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 REGIONS = {"us-east-1": ("use1", 0.020), "us-west-2": ("usw2", 0.025), "eu-west-1": ("euw1", 0.040)}
+OTHERS = (
+    ("m5.large", 8, "x86_64", 0.002),
+    ("r5.large", 16, "x86_64", 0.004),
+    ("c5.large", 4, "x86_64", 0.001),
+    ("m6g.large", 8, "arm64", 0.001),
+    ("t3.large", 8, "x86_64", 0.001),
+)
 IMAGE = "ami-1e749f67"  # one that moto has in every region
 MARK = "a credential of the lab's"
 OF_OTHER_CLOUDS = (
@@ -40,6 +47,11 @@ def main(home: Path) -> None:
         for n in (1, 2)
         for kind, cpus in (("m6i.large", 2), ("m6i.xlarge", 4))
     ]  # fmt: skip
+    for region, (zone, spot) in REGIONS.items():  # what may come in place of an `m6i.large`
+        for kind, memory, arch, more in OTHERS:
+            price = 0.1 + more, spot + more
+            row = [kind, "", "", 2, memory, "", *price, region, f"{zone}-az1", arch]
+            rows.append(row)
     write(catalogue / "aws/vms.csv", VMS.split(","), rows)
     tags = ("cpu-ubuntu", "gpu-ubuntu", "gpu-ubuntu-cuda13")
     images = [
@@ -50,7 +62,8 @@ def main(home: Path) -> None:
     header = ["Tag", "Region", "OS", "OSVersion", "ImageId", "CreationDate"]
     write(catalogue / "aws/images.csv", header, images)
     quotas = ["InstanceType", "OnDemandInstanceCode", "SpotInstanceCode"]
-    write(catalogue / "aws/instance_quota_mapping.csv", quotas, [])
+    codes = [["m6i.large", "L-1216C47A", "L-34B43A08"]]
+    write(catalogue / "aws/instance_quota_mapping.csv", quotas, codes)
     write(catalogue / "common/metadata.csv", ["GPU", "MemoryGB"], [])
     text(
         home / ".aws/credentials", "[default]\naws_access_key_id=test\naws_secret_access_key=test\n"

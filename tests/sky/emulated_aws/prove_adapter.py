@@ -95,7 +95,8 @@ class Proof:
         with step("offers"):
             offers = self.cloud.offers(RESOURCES)
         assert {o.source for o in offers} == {"live"}
-        assert offers[0].usd_per_hour == 0.019
+        more = offers[0].extras_usd_per_hour
+        assert (offers[0].usd_per_hour, more > 0) == (0.019 + more, True)
         assert {o.placement.region for o in offers} == {"us-east-1", "us-west-2", "eu-west-1"}
         with step("launch two, until SkyPilot has accepted both"):
             a = self.launch(0, 1, "us-east-1")

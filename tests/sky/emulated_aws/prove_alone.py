@@ -41,7 +41,7 @@ SHORTENED = (
     ("vm_guard.sh", "@ALONE_MINUTES@", "4"),
 )
 DOOR = "10.66.0.1:7460"  # where VMs find the robot
-ORPHAN_AFTER_S = 60
+UNMANAGED_MAX_S = 60
 ALONE = f"""\
 name: alone
 resources: {{cpus: 2, use_spot: true, infra: aws/us-east-1}}
@@ -67,7 +67,7 @@ run: |
 fogft:
   replicas: 1
   dial_in: {DOOR}
-  orphan_after_s: {ORPHAN_AFTER_S}
+  unmanaged_max_hours: {UNMANAGED_MAX_S / 3600}
   services:
     - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}}
 """
@@ -136,7 +136,8 @@ def what_the_machine_has(pool: Pool) -> None:
 
 
 def kill(pool: Pool) -> None:
-    os.kill(pool.pid("manager"), signal.SIGKILL)
+    """End a manager for good: one that is killed is started again."""
+    os.kill(pool.pid("manager"), signal.SIGTERM)
 
 
 def main() -> int:
@@ -171,7 +172,7 @@ def main() -> int:
     kill_server()
     with step("manager and API server are gone: until the VM that hangs has ended itself"):
         until("it is gone", lambda: not of_pool(hangs))
-    with step("... until the orphan has ended itself, too"):
+    with step("... until the replica without a manager has ended itself, too"):
         until("it is gone", lambda: not of_pool(alone))
     with step("... until the VM that was never set up has shut itself down"):
         until("it is gone", lambda: not running())

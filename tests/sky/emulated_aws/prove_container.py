@@ -42,7 +42,7 @@ run: |
   exec python3 plan_service.py
 fogft:
   replicas: 1
-  orphan_after_s: 60
+  unmanaged_max_hours: 0.0167
   services:
     - {name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}
 """
@@ -75,9 +75,9 @@ def main() -> int:
         print(result)
         assert result["answered"] == result["requests"] > 10, result
         assert result["failed"] == result["wrong"] == result["twice"] == 0, result
-        os.kill(pool.pid("manager"), signal.SIGKILL)
+        os.kill(pool.pid("manager"), signal.SIGTERM)
         kill_server()
-        with step("manager and API server are gone: until the orphan has ended its machine"):
+        with step("manager and API server are gone: until the replica has ended its machine"):
             until("it is gone", lambda: not running())
         pool.sky_api("start")
         with step("`down`, which finds nothing"):

@@ -115,7 +115,7 @@ class Proof:
         print(said)
         assert "`aws` can be used" in said
         assert "live, " in said
-        assert "nobody is there to say yes" in said
+        assert "cannot ask for confirmation: there is no terminal" in said
         assert not running()
         assert not HOME.exists() or not list((HOME / "pools").glob("*"))
 
@@ -138,7 +138,7 @@ class Proof:
             assert (home / "setup-ran").read_text() == "setup of hello with t0p-secret\n"
             assert (home / "run-found").read_text() == "hello t0p-secret\n"
             ours = home / ".fogft/replica"
-            files = {"replica.yaml", "ca.crt", "replica.crt", "replica.key"}
+            files = {"announcements.json", "replica.yaml", "ca.crt", "replica.crt", "replica.key"}
             assert {path.name for path in ours.iterdir()} == files
             modes = {path.stat().st_mode & 0o777 for path in (ours, *ours.iterdir())}
             assert modes == {0o700, 0o600}, modes
@@ -192,9 +192,8 @@ class Proof:
             self.pool.fogft("scale", "up", "1")
             until("it exists", lambda: len(running()) == 3)
         os.kill(self.pool.pid("manager"), signal.SIGKILL)
-        with step("the manager is killed in mid launch; `up` starts another"):
-            said = self.pool.fogft("up", str(self.pool.file))
-        assert "it had no manager" in said, said
+        with step("the manager is killed in mid launch; the client proxy or `up` starts another"):
+            self.pool.fogft("up", str(self.pool.file))
         with step("... until whole again, with the same launch"):
             self.whole(3)
         assert before < {*self.pool.replicas()}

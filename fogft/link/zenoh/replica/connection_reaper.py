@@ -30,7 +30,7 @@ from fogft.link.zenoh.sockets import Address
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 0.25
+LOOK_EVERY_S = 0.5
 _LOOK_AGAIN_S = 0.01  # while somebody comes, or is kept out
 RUSH_LIMIT = 2  # so many new ones since the last look
 # A robot that is out of reach has long opened another link by then.

@@ -43,7 +43,7 @@ from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.records.record import SignedRecord
+from fogft.records.record import Record, RecordKind, SignedRecord
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import LazyVerifier
 
@@ -304,6 +304,10 @@ class ZenohListener:
     def take_records(self, records: Sequence[SignedRecord]) -> None:
         """Take what the pool has signed; before `serve`, none of the revoked is ever let in."""
         self._control.take(records)
+
+    def lease(self) -> Record | None:
+        """Return the newest lease that the manager signed, of those that robots brought."""
+        return self._control.known(RecordKind.LEASE)
 
     def revoke(self, names: Collection[str]) -> None:
         """Let these holders in no more; what they ask from now on is refused."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from fogft.errors import CredentialError, WireError
 from fogft.link.port import LinkEvents, Peer
@@ -30,8 +30,6 @@ class ZenohDialer:
         credentials: The robot's certificate and key, and the pool's CA.
         pool_uid: The pool; peers of another are refused.
         suspect_after_s: Probes unanswered for so long make a link suspect.
-        manager_age: Seconds since the pool's manager gave a sign, None if never; told to
-            replicas with each probe.
         tell_losers: Whether replicas are told which requests are no longer wanted.
     """
 
@@ -42,7 +40,6 @@ class ZenohDialer:
         robot: str,
         pool_uid: str,
         suspect_after_s: float = 2.0,
-        manager_age: Callable[[], float | None] = lambda: None,
         settings: LinkSettings | None = None,
         tell_losers: bool = True,
     ) -> None:
@@ -50,7 +47,6 @@ class ZenohDialer:
             credentials,
             robot,
             suspect_after_s,
-            manager_age,
             settings or LinkSettings(),
             tell_losers,
         )

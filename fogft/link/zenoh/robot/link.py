@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 
 import zenoh
 
+from fogft import __version__
 from fogft.errors import CredentialError, WireError
 from fogft.link.compression import ZLIB, ZLIB_ANSWERS
 from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
@@ -374,7 +375,7 @@ class ZenohLink:
         known = self._probing.answer
         # Its types are asked for once a connection: it may be another process at each.
         describe = self._live is not connection or known is None or not known.types
-        probe = Probe(self._shared.robot, self._shared.manager_age(), describe)
+        probe = Probe(self._shared.robot, describe, __version__)
         try:
             self._probing.ask(connection, probe, now)
         except zenoh.ZError as error:

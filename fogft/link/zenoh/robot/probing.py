@@ -43,6 +43,11 @@ class Silence:
         if self._since is not None and held_up_s > 0:
             self._since = min(self._since + held_up_s, now)
 
+    @property
+    def lasts(self) -> bool:
+        """Whether it has begun, and no answer has come since."""
+        return self._since is not None
+
     def for_s(self, now: float) -> float:
         """Return for how long it has lasted; 0 while probes are answered."""
         return 0.0 if self._since is None else max(0.0, now - self._since)
@@ -82,6 +87,7 @@ class Probing:
         self._of_replica = Silence()
         self._of_connection = Silence()
         self._doubted = False
+        self._content = b""  # of the last answer: what is idle says the same again and again
         self.answer: ProbeAnswer | None = None
         self.heard_at: float | None = None
         self.rtt_s: float | None = None
@@ -125,6 +131,8 @@ class Probing:
 
     def _read(self, content: bytes) -> ProbeAnswer:
         id, at = self._peer.id, self._peer.endpoint
+        if content == self._content and self.answer is not None:
+            return self.answer
         try:
             answer = probe_frames.decode_probe_answer(content)
         except FrameError as error:
@@ -133,7 +141,7 @@ class Probing:
             raise WireError(
                 f"`{at}` says that it is {answer.slot}.{answer.generation}, not {id.short}"
             )
-        known = self.answer
+        self._content, known = content, self.answer
         if not answer.types and known is not None and known.incarnation == answer.incarnation:
             return replace(answer, types=known.types)
         return answer
@@ -164,8 +172,11 @@ class Probing:
     def late(self, now: float) -> tuple[bool, float]:
         """Return whether an answer is late, true once a silence; and how long it has still.
 
-        The second is infinite once it is late.
+        The second is infinite once it is late, and while none is awaited.
         """
+        if not self._of_replica.lasts:
+            self._doubted = False
+            return False, float("inf")
         left_s = doubted_after_s(self.rtt_s) - self.silent_s(now)
         was, self._doubted = self._doubted, left_s <= 0
         return self._doubted and not was, left_s if left_s > 0 else float("inf")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fogft.link.large_send_gate import LargeSendGate
@@ -19,7 +18,6 @@ class Shared:
     Attributes:
         robot: The robot's name.
         suspect_after_s: Probes unanswered for so long make a link suspect.
-        manager_age: Seconds since the pool's manager gave a sign, None if never.
         settings: Zenoh's times.
         tell_losers: Whether replicas are told which requests are no longer wanted.
         options: How each service is sent.
@@ -30,7 +28,6 @@ class Shared:
     credentials: CredentialPaths
     robot: str
     suspect_after_s: float
-    manager_age: Callable[[], float | None]
     settings: LinkSettings
     tell_losers: bool
     options: SendOptions = DEFAULT_OPTIONS

@@ -1,0 +1,95 @@
+"""``fogft top``: one pool on a full screen: status, trends of latencies, events and cost."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections import deque
+from typing import TYPE_CHECKING
+
+from fogft.cli import output
+from fogft.cli.options import PoolArgument, PoolOption
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from fogft.pool.commands.current import Seen
+    from fogft.pool.folder.store import PoolStore
+
+LOOK_EVERY_S = 1.0
+_LOOKS_KEPT = 60
+_EVENTS_SHOWN = 12
+_BARS = "▁▂▃▄▅▆▇█"
+
+
+def top(pool: PoolArgument = None, named: PoolOption = None) -> None:
+    """Watch a pool on a full screen: replicas, latencies, events and cost.
+
+    Updates every second; Ctrl-C ends it. Without a terminal, prints the screen once.
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    from fogft.pool.commands import composition
+    from fogft.pool.commands.status import read
+
+    store = composition.store_of(pool or named)
+    latencies: dict[str, deque[float]] = {}
+
+    def screen() -> RenderableType:
+        seen = read(store.paths, time.time())
+        _remember(latencies, seen)
+        return _screen(seen, store, latencies, output.width(sys.stdout))
+
+    if not output.is_terminal(sys.stdout):
+        output.show(screen())
+        return
+    with contextlib.suppress(KeyboardInterrupt), Live(console=Console(), screen=True) as live:
+        while True:
+            live.update(screen(), refresh=True)
+            time.sleep(LOOK_EVERY_S)
+
+
+def _remember(latencies: dict[str, deque[float]], seen: Seen) -> None:
+    """Add what was just seen: the 99th percentile of each service, the round trip of each link."""
+    now = {f"P99 {one.name}": one.counters.get("p99_s") for one in seen.status.services}
+    now |= {f"RTT {one.slot}.{one.generation}": one.rtt_s for one in seen.status.replicas}
+    for gone in latencies.keys() - now.keys():
+        del latencies[gone]
+    for name, value in now.items():
+        if value is not None:
+            latencies.setdefault(name, deque(maxlen=_LOOKS_KEPT)).append(value)
+
+
+def _screen(
+    seen: Seen, store: PoolStore, latencies: dict[str, deque[float]], width: int | None
+) -> RenderableType:
+    from rich.console import Group
+
+    from fogft.cli import status_text
+    from fogft.cli.overview import event_rows
+    from fogft.cli.table import table
+
+    trends = [
+        [name, sparkline(values), status_text.milliseconds(values[-1])]
+        for name, values in latencies.items()
+    ]
+    parts: list[RenderableType] = [
+        status_text.rendered(seen, width=width),
+        "",
+        output.cell(f"spent ${seen.status.usd_to_date:.2f} so far"),
+    ]
+    if trends:
+        parts += ["", table(("LATENCY", "LAST MINUTE", "NOW"), trends, width=width, right=("NOW",))]
+    events = event_rows(store, _EVENTS_SHOWN)[::-1]
+    if events:
+        names = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
+        parts += ["", table(names, events, width=width, folds=("LOCATION", "WHY"))]
+    return Group(*parts)
+
+
+def sparkline(values: deque[float]) -> str:
+    """Return values as a line of bars, the highest for the greatest of them."""
+    most = max(values) or 1.0
+    return "".join(_BARS[min(len(_BARS) - 1, int(len(_BARS) * one / most))] for one in values)

@@ -1,0 +1,159 @@
+"""What SkyPilot's catalogue sells for a task as it will be launched, and which clouds cannot.
+
+SkyPilot chooses one machine without accelerators; one type alone often has no capacity. So others
+of a cloud's general families are offered beside it: as many vCPUs, no less memory.
+
+Owns: the reading of SkyPilot's catalogue. Not here: which of it is offered (`prices`).
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.sky.sdk import Sale
+from fogft.model.replica import Offer, Placement
+
+CHOICES = 5
+"""Types of machines that are offered in one location."""
+
+_ZONE_ID = re.compile(r"[a-z]{2,5}\d-[a-z]{2,4}\d")  # `use1-az1`: a zone whose name is not known
+# What runs a steady load on x86: no burstable, bare-metal or old machines.
+_FAMILIES = {
+    "aws": r"[cmr][5-9][a-z-]*\.\d*x?large",
+    "azure": r"Standard_[DEF]\d+[a-z]*_v[2-9]",
+    "gcp": r"[cn][2-4]d?-\w+-\d+",
+}
+_MISSING = {
+    "spot_instance": "it sells no spot machines",
+    "open_ports": "it opens no ports, which `fogft.dial_in` does not need",
+    "autodown": "a machine there cannot end itself",
+    "docker_image": "it runs no `docker:` images",
+    "custom_disk_tier": "it has no choice of `disk_tier`",
+    "image_id": "it takes no images of one's own",
+}
+
+
+def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
+    """Return what is sold for SkyPilot's `Resources`; `enabled` is for those that name no cloud."""
+    prices: dict[Placement, float] = {}
+    left_out: dict[str, str] = {}
+    vcpus: dict[str, float] = {}
+    quotas: dict[tuple[str, bool], str] = {}
+    for one in asked:
+        for cloud in enabled if one.cloud is None else [one.cloud]:
+            name, wanted = str(cloud).lower(), one.copy(cloud=cloud)
+            reason = missing(cloud, wanted)
+            found = [] if reason else _machines(cloud, wanted)
+            if not found:
+                left_out.setdefault(name, reason or "it sells nothing that fits")
+            for machine in found:
+                for place, price in _sold(name, machine):
+                    prices[place] = min(prices.get(place, price), price)
+                    key = place.instance, place.spot
+                    if key not in quotas:
+                        quotas[key] = _quota_code(name, *key)
+                        vcpus[place.instance] = _vcpus(cloud, machine.instance_type)
+    fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in prices}}
+    offers = [Offer(p, price, "catalogue", fetched[p.cloud]) for p, price in prices.items()]
+    offers.sort(key=lambda o: (o.usd_per_hour, o.placement))
+    sold = {place.cloud for place in prices}
+    left_out = {name: why for name, why in left_out.items() if name not in sold}
+    return Sale(offers, left_out, vcpus, {key: code for key, code in quotas.items() if code})
+
+
+def missing(cloud: Any, resources: Any) -> str:
+    """Return which features of a launch a cloud does not have; empty where it has all."""
+    features = importlib.import_module("sky.clouds").CloudImplementationFeatures
+    no = importlib.import_module("sky.exceptions").NotSupportedError
+    lacking = []
+    needed = {*resources.get_required_cloud_features(), features.AUTODOWN}
+    for feature in sorted(needed, key=lambda one: str(one.value)):
+        try:
+            cloud.check_features_are_supported(resources, {feature})
+        except no:
+            lacking.append(_MISSING.get(feature.value, f"it has no `{feature.value}`"))
+    return "; ".join(lacking)
+
+
+def _machines(cloud: Any, resources: Any) -> list[Any]:
+    """Return launchable machines that would do, SkyPilot's own choice first."""
+    chosen = list(cloud.get_feasible_launchable_resources(resources, num_nodes=1).resources_list)
+    if len(chosen) != 1 or resources.instance_type or resources.accelerators:
+        return chosen
+    exact = not str(resources.memory or "+").endswith(("+", "x"))
+    kinds = _like(str(cloud).lower(), chosen[0].instance_type, exact=exact)
+    return [*chosen, *(chosen[0].copy(instance_type=kind) for kind in kinds)]
+
+
+def _like(cloud: str, instance: str, *, exact: bool) -> list[str]:
+    """Return other types with as many vCPUs and no less memory, the cheapest first."""
+    family = _FAMILIES.get(cloud)
+    if family is None:
+        return []
+    common = importlib.import_module("sky.catalog.common")
+    rows = common.read_catalog(f"{cloud}/vms.csv")
+    mine = rows[rows["InstanceType"] == instance]
+    if mine.empty:
+        return []
+    first = mine.iloc[0]
+    same = rows["vCPUs"] == first["vCPUs"]
+    same &= rows["AcceleratorName"].isna() & rows["InstanceType"].str.fullmatch(family)
+    memory = rows["MemoryGiB"]
+    same &= memory == first["MemoryGiB"] if exact else memory >= first["MemoryGiB"]
+    if "Arch" in rows.columns:
+        same &= rows["Arch"] == first["Arch"]
+    least = rows[same].groupby("InstanceType")["Price"].min().sort_values()
+    return [str(kind) for kind in least.index if kind != instance][: 2 * CHOICES]
+
+
+def _sold(cloud: str, machine: Any) -> Iterator[tuple[Placement, float]]:
+    instance = machine.instance_type
+    if machine.accelerators and cloud == "gcp":
+        name, count = next(iter(machine.accelerators.items()))
+        instance = f"{instance}+{name}:{count}"  # there the type does not imply them
+    for region in machine.get_valid_regions_for_launchable():
+        for zone in [zone.name for zone in region.zones or ()] or [None]:
+            named = None if zone is None or _ZONE_ID.fullmatch(zone) else zone
+            place = Placement(cloud, region.name, named or "", instance, machine.use_spot)
+            yield place, float(machine.copy(region=region.name, zone=zone).get_cost(3600))
+
+
+def _vcpus(cloud: Any, instance: str) -> float:
+    found = cloud.get_vcpus_mem_from_instance_type(instance)[0]
+    return float(found or 0.0)
+
+
+def _quota_code(cloud: str, instance: str, spot: bool) -> str:
+    if cloud != "aws":
+        return ""
+    codes = importlib.import_module("sky.catalog.aws_catalog")
+    return str(codes.get_quota_code(instance, spot) or "")
+
+
+def _fetched_at(cloud: str) -> float:
+    """Return when SkyPilot last fetched a cloud's catalogue: seconds since the epoch, 0 unknown."""
+    try:
+        common = importlib.import_module("sky.catalog.common")
+        return Path(common.get_catalog_path(f"{cloud}/vms.csv")).stat().st_mtime
+    except (ImportError, AttributeError, OSError):
+        return 0.0
+
+
+def best(offers: Sequence[Offer]) -> tuple[list[Offer], Mapping[Placement, Sequence[Offer]]]:
+    """Return of each location the cheapest offer, and by its placement what would do instead.
+
+    At most `CHOICES` together, none at more than twice the cheapest one's price.
+    """
+    by_supply: dict[str, list[Offer]] = {}
+    for offer in sorted(offers, key=lambda o: (o.usd_per_hour, o.placement)):
+        by_supply.setdefault(offer.placement.supply, []).append(offer)
+    instead = {
+        first.placement: [o for o in rest if o.usd_per_hour <= 2 * first.usd_per_hour]
+        for first, *rest in (found[:CHOICES] for found in by_supply.values())
+    }
+    firsts = [found[0] for found in by_supply.values()]
+    return sorted(firsts, key=lambda o: (o.usd_per_hour, o.placement)), instead

@@ -1,0 +1,251 @@
+"""systemd units for the parts of a pool on this machine: written, started, removed.
+
+The manager and two client proxies, one of which stands by; or a gateway or a rendezvous with a
+configuration file. systemd restarts what dies or hangs; what ends well stays ended.
+
+Owns: the units' text and names, their environment, and the calls of systemctl.
+Not here: what the processes tell systemd (`fogft.process`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pwd
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fogft import disk
+from fogft.errors import FogftError, StateError
+from fogft.pool.folder.paths import PoolPaths, home
+from fogft.pool.manager import process_control
+
+SYSTEM_FOLDER = Path("/etc/systemd/system")
+STANDBY_LIMIT_S = 60.0
+HANDOVER_LIMIT_S = 180.0
+MARK = "# Written by `fogft service install`"
+# What a sourced ROS 2, its middleware and fogft itself are told by. No credentials: clouds' own
+# tools keep those in files.
+_TAKEN = re.compile(
+    r"ROS_.*|RMW_IMPLEMENTATION|AMENT_.*|COLCON_.*|CYCLONEDDS_URI|FAST(DDS|RTPS)_.*|ZENOH_.*|"
+    r"PATH|PYTHONPATH|LD_LIBRARY_PATH|VIRTUAL_ENV|LANG|HOME|FOGFT_HOME|XDG_STATE_HOME"
+)
+
+_UNIT = """\
+{mark}
+[Unit]
+Description=fogft {what}
+After=network-online.target
+Wants=network-online.target
+ConditionPathExists={needs}
+StartLimitIntervalSec=600
+StartLimitBurst=30
+
+[Service]
+Type=notify
+NotifyAccess=main
+ExecStart={command}
+EnvironmentFile={environment}
+{user}Restart=on-failure
+RestartSec=1
+TimeoutStartSec=300
+TimeoutStopSec=180
+WatchdogSec=120
+KillMode=process
+
+[Install]
+WantedBy={wanted_by}
+"""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One unit's name and text."""
+
+    name: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Services:
+    """Where units go, and whose they are.
+
+    Args:
+        system: Of the machine, which starts them at boot; else of this user.
+        folder: Where unit files are.
+    """
+
+    system: bool
+    folder: Path
+
+    def systemctl(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Call systemctl.
+
+        Raises:
+            FogftError: It is missing.
+        """
+        scope = [] if self.system else ["--user"]
+        try:
+            return subprocess.run(
+                ["systemctl", *scope, *words], capture_output=True, text=True, check=False
+            )
+        except FileNotFoundError:
+            raise FogftError("there is no systemd here", "run the parts by hand") from None
+
+
+def services(*, system: bool, environ: Mapping[str, str] = os.environ) -> Services:
+    """Return where this user's units go, or the machine's."""
+    if system:
+        return Services(True, SYSTEM_FOLDER)
+    config = environ.get("XDG_CONFIG_HOME") or str(Path(environ.get("HOME", "~"), ".config"))
+    return Services(False, Path(config).expanduser() / "systemd" / "user")
+
+
+def of_pool(paths: PoolPaths, *, system: bool) -> list[Unit]:
+    """Return the units of a pool's manager and client proxies."""
+    pool, environment = paths.folder.name, paths.folder / "service.env"
+    proxy = ("proxy", "--standby", "--config", str(paths.proxy_config))
+    parts = {
+        f"fogft-{pool}-manager": ("manager", "--no-proxy", pool),
+        f"fogft-{pool}-proxy-a": proxy,
+        f"fogft-{pool}-proxy-b": proxy,
+    }
+    return [
+        _unit(name, words, paths.identity, environment, system=system)
+        for name, words in parts.items()
+    ]
+
+
+def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
+    """Return the unit of a gateway or a rendezvous.
+
+    Raises:
+        StateError: There is no such configuration.
+    """
+    config = config.resolve()
+    if not config.is_file():
+        raise StateError(f"there is no `{config}`", "`fogft join` writes it")
+    words = (command, "--config", str(config))
+    environment = config.with_suffix(".env")
+    return [_unit(f"fogft-{command}-{config.stem}", words, config, environment, system=system)]
+
+
+def _unit(name: str, words: Sequence[str], needs: Path, environment: Path, *, system: bool) -> Unit:
+    command = " ".join(_quoted(word) for word in (sys.executable, "-m", "fogft", *words))
+    owner = pwd.getpwuid(needs.stat().st_uid).pw_name
+    text = _UNIT.format(
+        mark=MARK,
+        what=name.removeprefix("fogft-"),
+        needs=str(needs).replace("%", "%%"),
+        command=command,
+        environment=str(environment).replace("%", "%%"),
+        user=f"User={owner}\n" if system else "",
+        wanted_by="multi-user.target" if system else "default.target",
+    )
+    return Unit(f"{name}.service", text)
+
+
+def _quoted(word: str) -> str:
+    if re.fullmatch(r"[\w@/.:+,=-]+", word):
+        return word
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + escaped.replace("%", "%%").replace("$", "$$") + '"'
+
+
+def environment(environ: Mapping[str, str] = os.environ) -> str:
+    """Return an environment file with what ROS, its middleware and fogft need."""
+    taken = {name: value for name, value in environ.items() if _TAKEN.fullmatch(name)}
+    taken.setdefault("FOGFT_HOME", str(home(environ)))
+    lines = []
+    for name, value in sorted(taken.items()):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("`", "\\`")
+        lines.append(f'{name}="{escaped}"'.replace("\n", " "))
+    return "\n".join(lines) + "\n"
+
+
+def install(where: Services, units: Sequence[Unit], env_file: Path) -> list[str]:
+    """Write units and their environment, have them started now and at each boot.
+
+    Returns:
+        What systemd said against it; nothing where they were started.
+
+    Raises:
+        StateError: A file cannot be written.
+    """
+    disk.write_whole(env_file, environment())
+    where.folder.mkdir(parents=True, exist_ok=True)
+    for unit in units:
+        disk.write_whole(where.folder / unit.name, unit.text)
+        (where.folder / unit.name).chmod(0o644)
+    names = [unit.name for unit in units]
+    said = [where.systemctl("daemon-reload"), where.systemctl("enable", *names)]
+    if not any(one.returncode for one in said):
+        said.append(where.systemctl("restart", "--no-block", *names))
+    return [one.stderr.strip() for one in said if one.returncode]
+
+
+def yield_to(paths: PoolPaths) -> None:
+    """End the manager and the standby that systemd did not start: its own take their places."""
+    for lock in (paths.manager_lock, paths.standby_lock):
+        process_control.end_holder(lock, suspected_pid=None)
+
+
+def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
+    """Have the client proxy that systemd did not start give way to one that it did.
+
+    Told to end, it hands over to whoever stands by: that one is waited for, so no request is lost.
+    """
+    old = process_control.lock_holder(paths.proxy_lock)
+    if old is None:
+        return
+    if _wait(lambda: disk.is_locked(paths.standby_lock), STANDBY_LIMIT_S):
+        gone = threading.Event()
+        process_control.call_at_end(old, gone.set)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(old, signal.SIGTERM)
+        gone.wait(HANDOVER_LIMIT_S)
+    # The second one found no place before, and may have given up.
+    names = [unit.name for unit in units]
+    where.systemctl("reset-failed", *names)
+    where.systemctl("start", "--no-block", *names)
+
+
+def _wait(condition: Callable[[], bool], limit_s: float) -> bool:
+    end = time.monotonic() + limit_s
+    while not (found := condition()) and time.monotonic() < end:
+        time.sleep(process_control.POLL_S)
+    return found
+
+
+def installed(where: Services, names: Sequence[str] = ()) -> list[str]:
+    """Return the units that `install` wrote, or those of these names that are there."""
+    if not where.folder.is_dir():
+        return []
+    found = sorted(where.folder.glob("fogft-*.service"))
+    ours = [path.name for path in found if path.read_text().startswith(MARK)]
+    return [name for name in ours if not names or name in names]
+
+
+def states(where: Services, names: Sequence[str]) -> dict[str, str]:
+    """Return each unit's state as systemd has it; `unknown` where that does not run."""
+    if shutil.which("systemctl") is None:
+        return dict.fromkeys(names, "unknown")
+    return {name: where.systemctl("is-active", name).stdout.strip() or "unknown" for name in names}
+
+
+def remove(where: Services, names: Sequence[str]) -> None:
+    """Stop units, and delete them."""
+    if shutil.which("systemctl") is not None and names:
+        where.systemctl("disable", "--now", *names)
+    for name in names:
+        (where.folder / name).unlink(missing_ok=True)
+    if shutil.which("systemctl") is not None:
+        where.systemctl("daemon-reload")

@@ -1,0 +1,183 @@
+"""What a pool's machines have cost so far, by replica and day (UTC), as its manager saw them.
+
+Each look charges the time since the last one at the price of that time: the present price of a spot
+machine where it is known, else what it was ordered for. A machine that went while no manager looked
+is charged for as long as it can have run without one. What a cloud refused costs nothing.
+
+The file stays when the pool has ended.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from fogft import disk
+from fogft.errors import StateError
+from fogft.model.plain import from_plain, to_plain
+from fogft.model.reason import Cause
+from fogft.model.replica import Machine, Offer, Placement
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY_S = 10.0
+WRITE_EVERY_S = 60.0
+DAY_S = 86_400.0
+_COST_NOTHING = frozenset({Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS})
+_DAYS_KEPT = 400
+
+
+@dataclass(frozen=True)
+class Spent:
+    """What one replica has cost on one day.
+
+    Attributes:
+        day: As in ``2026-11-23``, of UTC.
+        replica: ``slot.generation``.
+        usd: With its disk, its address and the responses that leave the cloud.
+    """
+
+    day: str
+    replica: str
+    location: str
+    instance: str
+    spot: bool
+    hours: float
+    usd: float
+
+
+@dataclass(frozen=True)
+class Running:
+    """A machine that was seen last: until when it is charged, and its price then."""
+
+    until: float
+    usd_per_hour: float
+    placement: Placement
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What one pool has cost. Earlier days that are not kept any more are in `before_usd`."""
+
+    pool: str
+    uid: str
+    spent: tuple[Spent, ...] = ()
+    running: Mapping[str, Running] = field(default_factory=dict)
+    before_usd: float = 0.0
+
+    @property
+    def usd(self) -> float:
+        """All of it."""
+        return self.before_usd + sum(one.usd for one in self.spent)
+
+
+class CostBook:
+    """Keeps the costs of one pool: one process writes them."""
+
+    def __init__(self, path: Path, pool: str, uid: str) -> None:
+        self._path = path
+        self._written_at: float | None = None
+        self._looked_at = 0.0
+        found = _read(path)
+        known = found is not None and found.uid == uid
+        self.costs = found if found is not None and known else Costs(pool, uid)
+        self._days = {(one.day, one.replica): one for one in self.costs.spent}
+        self._running = dict(self.costs.running)
+        self._before_usd = self.costs.before_usd
+
+    def look(
+        self, now: float, machines: Sequence[Machine], offers: Sequence[Offer], alone_s: float
+    ) -> None:
+        """Charge what runs, up to now, and write it down from time to time.
+
+        Args:
+            machines: The cloud's own list.
+            offers: What is sold now: spot machines are charged at these prices.
+            alone_s: For how long a machine runs on of which no manager has heard.
+
+        Raises:
+            StateError: It cannot be written; it is kept, and tried again.
+        """
+        same = self._running.keys() == {machine.id.short for machine in machines}
+        if same and 0 <= now - self._looked_at < LOOK_EVERY_S:
+            return
+        self._looked_at = now
+        spots = {m.placement for m in machines if m.placement.spot}
+        prices = {o.placement: o.usd_per_hour for o in offers if o.placement in spots}
+        seen: dict[str, Running] = {}
+        gone = dict(self._running)
+        for machine in machines:
+            name, place = machine.id.short, machine.placement
+            last = gone.pop(name, None)
+            if machine.failure is not None and machine.failure.cause in _COST_NOTHING:
+                self._days = {key: one for key, one in self._days.items() if key[1] != name}
+                continue
+            price = prices.get(place, machine.usd_per_hour)
+            begun = last.until if last is not None else machine.launched_at or now
+            self._charge(name, place, begun, now, price)
+            seen[name] = Running(now, price, place)
+        for name, last in gone.items():
+            until = min(now, last.until + alone_s)
+            self._charge(name, last.placement, last.until, until, last.usd_per_hour)
+        ended = self._running.keys() - seen.keys()
+        self._running = seen
+        due = self._written_at is None or not 0 <= now - self._written_at < WRITE_EVERY_S
+        if due or ended:
+            self._settle(now)
+            disk.make_folder(self._path.parent)
+            disk.write_json(self._path, to_plain(self.costs), durable=False)
+            self._written_at = now
+
+    @property
+    def usd(self) -> float:
+        """All that it has cost."""
+        return self._before_usd + sum(one.usd for one in self._days.values())
+
+    def _charge(self, name: str, place: Placement, begun: float, end: float, price: float) -> None:
+        while begun < end:
+            day_ends = (begun // DAY_S + 1) * DAY_S
+            until, day = min(end, day_ends), _day(begun)
+            hours = (until - begun) / 3600
+            before = self._days.get((day, name)) or Spent(
+                day, name, place.location, place.instance, place.spot, 0.0, 0.0
+            )
+            self._days[day, name] = replace(
+                before, hours=before.hours + hours, usd=before.usd + hours * price
+            )
+            begun = until
+
+    def _settle(self, now: float) -> None:
+        oldest = _day(now - _DAYS_KEPT * DAY_S)
+        old = [key for key in self._days if key[0] < oldest]
+        self._before_usd += sum(self._days.pop(key).usd for key in old)
+        spent = tuple(self._days[key] for key in sorted(self._days))
+        self.costs = Costs(
+            self.costs.pool, self.costs.uid, spent, dict(self._running), self._before_usd
+        )
+
+
+def read_all(folder: Path) -> list[Costs]:
+    """Return the costs of all pools of this user, those that have ended too, by name."""
+    found = (_read(path) for path in sorted(folder.glob("*.json")))
+    return [one for one in found if one is not None]
+
+
+def path_of(folder: Path, pool: str, uid: str) -> Path:
+    """Return where the costs of a pool are kept."""
+    return folder / f"{pool}-{uid}.json"
+
+
+def _read(path: Path) -> Costs | None:
+    try:
+        raw = disk.read_json(path)
+        return None if raw is None else from_plain(Costs, raw)
+    except (StateError, ValueError) as error:
+        log.warning("costs_damaged file=%s reason=%r", path, str(error))
+        return None
+
+
+def _day(at: float) -> str:
+    return time.strftime("%Y-%m-%d", time.gmtime(at))

@@ -1,0 +1,54 @@
+"""For how long a replica goes on without hearing of the pool's manager. Pure.
+
+The manager signs leases, and signs a new one every minute or sooner: each says when it was signed
+and how long it lasts. Robots and rendezvous pass them on, and nothing else that they say or do
+keeps a machine alive.
+
+Owns: when the lease is over. Not here: signatures (`fogft.records`), ending (`process`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fogft.records import roster
+from fogft.records.record import Order, Record
+
+
+class HeldLease:
+    """The lease of one replica; without one it never ends.
+
+    It ends no later than it would if every lease had come at the moment it was signed, so nobody
+    gains by holding leases back to show them one after another. A manager's clock that is set back
+    shortens none: it only makes new leases useless until the old one is over.
+
+    Args:
+        clock: Monotonic seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._order: Order = (-1, -1)
+        self._ahead: float | None = None  # our clock less the manager's, at the first lease
+        self._heard_at = self._ends_at = 0.0
+
+    def renew(self, record: Record) -> None:
+        """Take a lease whose signature was checked; an older one changes nothing."""
+        if record.order <= self._order:
+            return
+        lease, now = roster.lease(record), self._clock()
+        if self._ahead is None:
+            self._ahead = now - lease.at
+        ends_at = min(now, lease.at + self._ahead) + lease.lasts_s
+        self._order, self._heard_at = record.order, now
+        self._ends_at = max(ends_at, self._ends_at)
+
+    @property
+    def age_s(self) -> float | None:
+        """Seconds since a newer lease came; None where none ever did."""
+        return None if self._ahead is None else self._clock() - self._heard_at
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until it is over; None where there is none."""
+        return None if self._ahead is None else max(0.0, self._ends_at - self._clock())

@@ -1,0 +1,110 @@
+"""A client proxy that is told to end lets the standby take over while it still serves.
+
+For half a second both serve: each request goes to both, under one id, so that a replica runs it
+once and the caller gets one answer. Then this one takes no more, and finishes what it has taken.
+
+What only one may serve, stateful services and actions, is not shared: there this one stops first.
+
+Owns: that order. Not here: the standby's side, which is its usual start (`standby`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fogft import disk
+from fogft.errors import StateError
+from fogft.model.names import REQUEST_ID_BYTES
+from fogft.model.proxy_config import ClientProxyConfig
+from fogft.process import Watchdog
+from fogft.proxy.robot.client import ClientProxy
+
+log = logging.getLogger(__name__)
+
+BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
+KNOWN_AFTER_S = 0.5  # once it offers them and knows the callers: until they know its services
+FINISH_LIMIT_S = 60.0
+_PACED_S = 0.5  # until responses that are spread for their client are out
+
+
+def request_ids(key: Path) -> Callable[[str, Any], bytes]:
+    """Return what gives requests their ids: both proxies of a robot give a request the same.
+
+    Others cannot guess it: the robot's private key is part of it. A request without an id of ROS's
+    own gets a random one.
+
+    Args:
+        key: The robot's private key.
+    """
+    try:
+        secret = hashlib.sha256(key.read_bytes()).digest()
+    except OSError:  # who needs the key will say so
+        secret = os.urandom(32)
+
+    def id_of(service: str, handle: Any) -> bytes:
+        if not isinstance(handle, bytes):
+            return os.urandom(REQUEST_ID_BYTES)
+        told = service.encode() + b"\0" + handle
+        return hashlib.blake2b(told, key=secret, digest_size=REQUEST_ID_BYTES).digest()
+
+    return id_of
+
+
+def hand_over(
+    config: ClientProxyConfig,
+    proxy: ClientProxy,
+    callers: Callable[[], Mapping[str, int]],
+    release: Callable[[], None],
+) -> None:
+    """Let the standby take over, if there is one; return when nothing is left to do.
+
+    Args:
+        config: This proxy's. Replicas that dial in have one door, so with it nothing is shared.
+        proxy: What serves; its thread calls this.
+        callers: Counts who may call each service that we offer.
+        release: Gives up the lock, and all else that the standby needs for itself.
+    """
+    try:
+        if config.dial_in or not disk.is_locked(disk.standby_lock(config.lock)):
+            return
+    except OSError as error:
+        log.error("handover_failed reason=%r", str(error))
+        return
+    log.info("handover_began pool=%s", config.pool)
+    proxy.take_no_more(shared=False)
+    _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting(shared=False) == 0)
+    release()
+    if _run(proxy, BEGIN_LIMIT_S, lambda: _takes(config.status, callers())):
+        _run(proxy, KNOWN_AFTER_S, lambda: False)
+    proxy.take_no_more(shared=True)
+    if _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting(shared=True) == 0):
+        _run(proxy, _PACED_S, lambda: False)
+    log.info("handover_ended pool=%s", config.pool)
+
+
+def _run(proxy: ClientProxy, limit_s: float, done: Callable[[], bool]) -> bool:
+    end, watchdog = time.monotonic() + limit_s, Watchdog()
+    while not (over := done()) and time.monotonic() < end:
+        proxy.run_once()
+        watchdog.work()
+    return over
+
+
+def _takes(report: Path, callers: Mapping[str, int]) -> bool:
+    """Whether another proxy offers all of these services, to as many callers at least."""
+    try:
+        told = disk.read_json(report)
+    except StateError:
+        return False
+    if not isinstance(told, dict) or told.get("pid") == os.getpid():
+        return False
+    theirs = told.get("callers")
+    if not isinstance(theirs, dict):
+        return False
+    return all(theirs.get(name, -1) >= count for name, count in callers.items())

@@ -1,0 +1,93 @@
+"""Start the pool's manager again when it was killed, as it starts a client proxy that was.
+
+Owns: when. Not here: which manager wants it, and how it is started (its own file says so).
+"""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from fogft import disk
+from fogft.child import detached
+from fogft.errors import StateError
+
+log = logging.getLogger(__name__)
+
+NAME = "manager.json"
+LOOK_S = 1.0
+BACKOFF_LIMIT_S = 60.0
+STEADY_S = 60.0
+
+
+class ManagerRestart:
+    """Looks now and then whether the manager of this machine was killed.
+
+    Args:
+        folder: The pool's. Without a manager's file in it nothing is ever started.
+        environ: The environment for it: what our own was before ROS was prepared in it.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        environ: Mapping[str, str],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._folder = folder
+        self._environ = dict(environ)
+        self._clock = clock
+        self._look_at = 0.0
+        self._started_at = float("-inf")
+        self._wait_s = LOOK_S
+        self._missing = False
+        self._lock = folder
+        self.child: subprocess.Popen[bytes] | None = None
+
+    def look(self) -> None:
+        """Start it where it has been missing for a while, less and less often.
+
+        Raises:
+            StateError: It cannot be started, or its file is damaged.
+        """
+        now = self._clock()
+        if now < self._look_at:
+            return
+        self._look_at = now + LOOK_S
+        told = disk.read_json(self._folder / NAME)
+        if told is None or (self.child is not None and self.child.poll() is None):
+            self._missing = False
+            return
+        try:
+            locks = [self._folder / str(told[key]) for key in ("lock", "changing")]
+            command, folder = [str(word) for word in told["command"]], Path(told["folder"])
+            log_path = self._folder / str(told["log"])
+        except (TypeError, KeyError) as error:
+            raise StateError(f"`{self._folder / NAME}` is damaged: {error!r}") from error
+        self._lock = locks[0]
+        missing = not any(map(disk.is_locked, locks))
+        if missing and self._missing:  # not for an instant only, as between two commands
+            self._start(command, folder, log_path)
+        self._missing = missing
+
+    def _start(self, command: list[str], folder: Path, log_path: Path) -> None:
+        now = self._clock()
+        ran_s = now - self._started_at
+        self._wait_s = LOOK_S if ran_s > STEADY_S else min(2 * self._wait_s, BACKOFF_LIMIT_S)
+        self._look_at, self._started_at = now + self._wait_s, now
+        try:
+            self.child = detached(command, log_path, folder=folder, environ=self._environ)
+        except OSError as error:
+            raise StateError(f"the manager cannot be started again: {error}") from error
+        log.warning("manager_started_again pid=%d", self.child.pid)
+
+    def close(self) -> None:
+        """End one that has not begun to work: whoever ends us may be ending the pool."""
+        child = self.child
+        if child is not None and child.poll() is None and not disk.is_locked(self._lock):
+            child.kill()
+            child.wait()

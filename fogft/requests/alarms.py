@@ -1,0 +1,50 @@
+"""Which replicas are believed when they say that a service died over a request. Pure.
+
+One that is broken, or lies, says so of requests that others answer. Were it believed, the others
+would run each of those alone.
+
+Owns: that judgement. Not here: what follows from a death (`pending`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+FALSE_ALARMS = 3
+"""So many false alarms within `LATELY_S`, and a replica is not believed until they are older."""
+LATELY_S = 60.0
+ALARM_S = 1.0  # what is said within it, counted from the first time, is about one death
+
+
+class Alarms:
+    """Which replicas are believed when they say that a service died over a request.
+
+    A service that dies ends all that it has at once, so what one says in the same moment is one
+    alarm, however many requests it names. It is false where another replica answered one of them,
+    and right where one of them was found to kill services.
+    """
+
+    def __init__(self) -> None:
+        self._said_at: dict[int, float] = {}
+        self._judged: set[int] = set()  # whose last alarm counts as a false one already
+        self._false: dict[int, list[float]] = {}
+
+    def believed(self, replica: int, now: float) -> bool:
+        """Take an alarm; return whether it counts."""
+        if now - self._said_at.get(replica, -ALARM_S) >= ALARM_S:
+            self._said_at[replica] = now
+            self._judged.discard(replica)
+        lately = [at for at in self._false.get(replica, ()) if now - at < LATELY_S]
+        self._false[replica] = lately
+        return len(lately) < FALSE_ALARMS
+
+    def was_false(self, replica: int, now: float) -> None:
+        """Another replica has answered a request over which this one's service is said to die."""
+        if replica not in self._judged:
+            self._judged.add(replica)
+            self._false.setdefault(replica, []).append(now)
+
+    def were_right(self, replicas: Iterable[int]) -> None:
+        """A request that these replicas have named does kill services."""
+        for replica in replicas:
+            self._false.pop(replica, None)

@@ -1,0 +1,225 @@
+"""When a response may be sent, so that no client's queue overflows. Pure; seconds come in.
+
+All clients of a service share one topic for its responses, and each has a queue of its own:
+of ten, by default, from which the eleventh pushes the first, whoever it is for. So what counts
+for a client is how many responses, of anybody's, were sent since the oldest of its own that it
+may not have taken.
+
+What shows that a client takes: its executor's answer to a probe (each is a turn, and in each turn
+a client takes one response), or the next request of one that had none open. Where its node answers
+no probes, any request that takes the place of another, and time.
+
+Owns: that account. Not here: sending, probing, waiting (`pacer`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from enum import Enum, auto
+from typing import Any
+
+QUEUE = 10  # of rmw_qos_profile_services_default
+WINDOW = 5  # of them, where nothing shows how quickly a client takes
+PROBED_WINDOW = 8  # C++ executors answer a probe before they take, in the same turn
+WINDOW_LIMIT = 64
+PROBES = 4  # at once
+# What waits for one client; what comes beyond is sent at once, as a fast service would.
+WAITING_LIMIT, WAITING_BYTES_LIMIT = 1024, 64 << 20
+EVERY_S = 0.005  # so a burst may meet a client that takes nothing for 25 ms
+# A client may ask before discovery has told the way back to it. ROS waits 0.1 s a try.
+FIND_LIMIT_S = 10.0
+_QUIET_S = 0.05  # after so long without a request a client must prove anew that it is quick
+_USUAL_GROWS = 4  # each `EVERY_S`, and by a twentieth of what is open: faster is a burst
+_CLIENTS_KEPT = 64
+_PROBE_AGAIN_S = 1.0  # one was lost
+_SILENT_S = 0.2  # who answers no probe for so long holds up none but itself
+_GIVEN_UP_S = 30.0  # who answers none for so long gets its responses by time
+
+
+class Probing(Enum):
+    """Whether a client's node answers probes."""
+
+    UNASKED = auto()  # it never had two requests open
+    ASKED = auto()
+    YES = auto()
+    NO = auto()
+
+
+class ClientPace:
+    """One client.
+
+    Attributes:
+        waiting: Responses that may not be sent yet: handle and bytes.
+        untaken: Numbers of its responses that it may not have taken, oldest first.
+        probed_at: When the oldest probe was sent that is not answered; None for none.
+        finding_until: Until when discovery is given to find it; None where it has.
+        find_again_at: When to try again.
+    """
+
+    def __init__(self, now: float, sent: int) -> None:
+        self.waiting: deque[tuple[Any, bytes]] = deque()
+        self.untaken: deque[int] = deque()
+        self.probing = Probing.UNASKED
+        self.probed_at: float | None = None
+        self.finding_until: float | None = None
+        self.find_again_at = now
+        self.asked_at = now
+        self._probes: deque[int] = deque()  # the last response before each that is not answered
+        self._probe_again_at = now
+        self._waiting_bytes = 0
+        self._taken = sent  # all up to this number have left its queue
+        self._open = 0  # asked and not answered; one that is never answered stays: no harm
+        # Of one whose node answers no probes.
+        self._usual = WINDOW  # no more open than this is nothing new
+        self._window = WINDOW
+        self._proofs = 0
+        self._refilled_at = self._grown_at = now
+
+    @property
+    def strict(self) -> bool:
+        """Whether only probes show what it takes."""
+        return self.probing in (Probing.ASKED, Probing.YES)
+
+    def requested(self, now: float, *, together: bool = False) -> None:
+        """Note a request; `together` with another, when it cannot follow from a response."""
+        self.refill(now)
+        if now - self.asked_at > _QUIET_S:
+            self._window, self._proofs, self._usual = WINDOW, 0, WINDOW
+        if self._open == 0:
+            self._usual = min(self._usual, WINDOW)
+        self.asked_at = now
+        self._open += 1
+        together = together or self._open > 1
+        if together and self.probing is Probing.UNASKED:
+            self.probing = Probing.ASKED
+        if together if self.strict else self._open > self._usual:
+            # It only asks for more, and who asks in a burst does not take meanwhile.
+            self._proofs, self._refilled_at = 0, now
+        elif self.untaken:
+            self._took(self.untaken[0])
+            self._proofs += 1
+            if self._proofs >= 4 * self._window:
+                self._window, self._proofs = min(2 * self._window, WINDOW_LIMIT), 0
+
+    def hold(self, handle: Any, payload: bytes) -> bool:
+        """Have a response wait; False where too much waits already."""
+        whole = self._waiting_bytes + len(payload)
+        if self.waiting and (len(self.waiting) >= WAITING_LIMIT or whole > WAITING_BYTES_LIMIT):
+            return False
+        self._waiting_bytes = whole
+        self.waiting.append((handle, payload))
+        return True
+
+    def next(self) -> tuple[Any, bytes]:
+        """Return the response that waited for longest."""
+        handle, payload = self.waiting.popleft()
+        self._waiting_bytes -= len(payload)
+        return handle, payload
+
+    def not_found(self, handle: Any, payload: bytes, now: float) -> None:
+        """Have a response wait that was sent before discovery had found the client."""
+        self.waiting.appendleft((handle, payload))
+        self._waiting_bytes += len(payload)
+        self.finding_until = self.finding_until or now + FIND_LIMIT_S
+        self.find_again_at = now + EVERY_S
+        self._open += 1
+        self.untaken.clear()  # what was sent together with it did not reach it either
+
+    def sent(self, number: int) -> None:
+        """Note that a response to it was sent."""
+        if not self.untaken:  # the older ones of others that it has not taken lie before it
+            self._taken = min(max(self._taken, number - QUEUE), number - 1)
+        self.untaken.append(number)
+        self._open = max(self._open - 1, 0)
+
+    def has_room(self, sent: int) -> bool:
+        """Whether one more response leaves the oldest that it has not taken in its queue."""
+        return not self.untaken or sent + 1 < self.untaken[0] + self._size()
+
+    def _size(self) -> int:
+        if self.probing is Probing.NO:
+            return self._window
+        return PROBED_WINDOW if self.probing is Probing.YES else WINDOW
+
+    def answered_probe(self, now: float) -> None:
+        """Note that its executor had a turn."""
+        if self._probes:
+            self._took(min(self._taken + 1, self._probes.popleft()))
+        self.probed_at = now if self._probes else None
+
+    def probes_due(self, now: float, sent: int) -> int:
+        """Return how many probes to send now; they count as sent."""
+        if self.probing is not Probing.YES or (self._probes and now < self._probe_again_at):
+            return 0
+        self._probes = deque([sent] * min(PROBES, len(self.untaken)))
+        self._probe_again_at = now + _PROBE_AGAIN_S
+        if self.probed_at is None:
+            self.probed_at = now
+        return len(self._probes)
+
+    def silent(self, now: float, limit_s: float = _SILENT_S) -> bool:
+        """Whether it has answered no probe for long."""
+        return self.probed_at is not None and now - self.probed_at > limit_s
+
+    def refill(self, now: float) -> None:
+        """Take what time alone shows."""
+        steps = int((now - self._refilled_at) / EVERY_S)
+        if steps > 0:
+            self._refilled_at += steps * EVERY_S
+            if not self.strict or not self.untaken:
+                self._took(self._taken + steps)
+        steps = int((now - self._grown_at) / EVERY_S)
+        if steps > 0:
+            self._grown_at += steps * EVERY_S
+            grown = self._usual + steps * (_USUAL_GROWS + self._open // 20)
+            self._usual = max(self._usual, min(grown, self._open + self._open // 4))
+        if self.silent(now, _GIVEN_UP_S):
+            self.probing, self.probed_at = Probing.NO, None
+            self._probes.clear()
+
+    def _took(self, number: int) -> None:
+        self._taken = max(self._taken, number)
+        while self.untaken and self.untaken[0] <= self._taken:
+            self.untaken.popleft()
+
+
+class Pace:
+    """The clients of one service."""
+
+    def __init__(self) -> None:
+        self.clients: dict[bytes, ClientPace] = {}
+        self.sent = 0
+
+    def client(self, id: bytes, now: float) -> ClientPace:
+        """Return a client, which may be new; of many those are forgotten that asked long ago."""
+        pace = self.clients.get(id)
+        if pace is None:
+            if len(self.clients) >= _CLIENTS_KEPT:
+                idle = [c for c, p in self.clients.items() if not p.waiting]
+                idle.sort(key=lambda c: self.clients[c].asked_at)
+                for gone in idle[: _CLIENTS_KEPT // 2]:
+                    del self.clients[gone]
+            pace = self.clients[id] = ClientPace(now, self.sent)
+        return pace
+
+    def take(self, client: ClientPace, now: float) -> bool:
+        """Whether a response to a client may be sent now; if so, it counts as sent."""
+        client.refill(now)  # also where there is room: time is not saved up
+        if any(self.in_the_way(client, now)):
+            return False
+        self.send(client)
+        return True
+
+    def send(self, client: ClientPace) -> None:
+        """Count a response as sent, in any case."""
+        self.sent += 1
+        client.sent(self.sent)
+
+    def in_the_way(self, client: ClientPace, now: float) -> Iterator[tuple[bytes, ClientPace]]:
+        """Return the clients whose queues have no room for a response to this one."""
+        for id, other in self.clients.items():
+            if other.untaken:
+                other.refill(now)
+            if not other.has_room(self.sent) and (other is client or not other.silent(now)):
+                yield id, other

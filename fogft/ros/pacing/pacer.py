@@ -1,0 +1,216 @@
+"""Send responses no faster than their clients take them.
+
+An ordinary ROS client keeps the last ten responses that it has not taken yet and silently
+loses more. A service answers one request after another, but a proxy answers in bursts: all
+that a failover held up, at once. So what a client's queue has no room for waits here.
+
+A client that discovery has not found yet gets its first response again until it has; the others
+wait behind it.
+
+Owns: the responses that wait, and the thread that sends them. Not here: when one may be sent
+(`pace`), sending it (`entities`), asking a client's node (`client_probes`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+from fogft.errors import RosError
+from fogft.ros.pacing.pace import EVERY_S, ClientPace, Pace, Probing
+from fogft.ros.port import NotFoundYet
+
+log = logging.getLogger(__name__)
+
+_ASK_EVERY_S, _ASK_LIMIT_S = 0.02, 1.0  # whether a node answers probes
+_LOOK_EVERY_S = 0.2
+_GUID_BYTES = 16
+
+
+class Probes(Protocol):
+    """How a service learns that a client's executor has had a turn."""
+
+    def answers(self, client: bytes) -> bool | None:
+        """Whether the client's node answers probes; None while discovery does not tell."""
+
+    def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
+        """Send a probe; `on_answer` comes from the take loop, or never."""
+
+
+class NoProbes:
+    """No client's node answers."""
+
+    def answers(self, client: bytes) -> bool | None:
+        """Return that it does not."""
+        return False
+
+    def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
+        """Do nothing."""
+
+
+def _client(handle: Any) -> bytes:
+    """Return who asked. rclpy's own handles do not tell: those clients share a pace."""
+    return handle[:_GUID_BYTES] if isinstance(handle, bytes) else b""
+
+
+class Pacer:
+    """Sends the responses of one service, at each client's pace. Any thread.
+
+    Args:
+        send: Sends a response; may raise RosError.
+        probes: Asks the clients' nodes.
+        client_of: Returns who asked, of a request's handle.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[Any, bytes], None],
+        probes: Probes | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        client_of: Callable[[Any], bytes] = _client,
+    ) -> None:
+        self._client_of = client_of
+        self._send = send
+        self._probes = probes or NoProbes()
+        self._clock = clock
+        self._pace = Pace()
+        self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
+        self._asked: dict[bytes, float] = {}  # those whose nodes may answer probes: until when
+        self._wake = threading.Condition()
+        self._thread: threading.Thread | None = None  # made when there is something to wait for
+        self._closed = False
+
+    @property
+    def clients(self) -> int:
+        """How many clients are remembered."""
+        return len(self._pace.clients)
+
+    def requested(self, handle: Any, *, together: bool = False) -> None:
+        """Note a request as it is taken; `together` with the one before it."""
+        now = self._clock()
+        id = self._client_of(handle)
+        with self._wake:
+            client = self._pace.client(id, now)
+            client.requested(now, together=together)
+            if client.probing is Probing.ASKED and id not in self._asked:
+                self._asked[id] = now + _ASK_LIMIT_S
+                self._begin()
+            elif client.waiting:
+                self._wake.notify()
+
+    def respond(self, handle: Any, payload: bytes) -> None:
+        """Send a response now, or as soon as its client can bear it.
+
+        Raises:
+            RosError: It was sent now, and ROS refused it.
+        """
+        now = self._clock()
+        id = self._client_of(handle)
+        with self._wake:
+            client = self._pace.client(id, now)
+            if client.waiting or client.finding_until or not self._pace.take(client, now):
+                if client.hold(handle, payload):
+                    self._held[id] = client
+                    self._begin()
+                    return
+                self._pace.send(client)
+        self._try(id, client, handle, payload)
+
+    def _try(self, id: bytes, client: ClientPace, handle: Any, payload: bytes) -> None:
+        """Send now; have it wait if the client is not found yet. Raises RosError."""
+        try:
+            self._send(handle, payload)
+        except NotFoundYet:
+            now = self._clock()
+            with self._wake:
+                if client.finding_until is None or now < client.finding_until:
+                    client.not_found(handle, payload, now)
+                    self._held[id] = client
+                    self._begin()
+                    return
+            raise
+        client.finding_until = None
+
+    def _begin(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="ros-pacer", daemon=True)
+            self._thread.start()
+        self._wake.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                due, probed, wait_s = self._step(self._clock())
+                if not due and not probed and not self._closed:
+                    self._wake.wait(wait_s)
+                    due, probed, wait_s = self._step(self._clock())
+                asked = list(self._asked)
+                if self._closed:
+                    return
+            for id, client, handle, payload in due:
+                try:
+                    self._try(id, client, handle, payload)
+                except RosError as error:
+                    log.warning("response_refused reason=%r", error.message)
+            for id, count in probed:
+                for _ in range(count):
+                    self._probes.send(id, partial(self._answered, id))
+            for id in asked:
+                self._ask(id)
+
+    def _step(
+        self, now: float
+    ) -> tuple[list[tuple[bytes, ClientPace, Any, bytes]], list[tuple[bytes, int]], float | None]:
+        """Return what to send now, whom to probe how often, and how long to wait if nothing."""
+        due: list[tuple[bytes, ClientPace, Any, bytes]] = []
+        in_the_way: dict[bytes, ClientPace] = {}
+        for id, client in list(self._held.items()):
+            finding = client.finding_until is not None
+            if finding and now < client.find_again_at:
+                continue
+            while client.waiting and self._pace.take(client, now):
+                due.append((id, client, *client.next()))
+                if finding:
+                    break
+            if client.waiting:
+                in_the_way.update(self._pace.in_the_way(client, now))
+            else:
+                del self._held[id]
+        probed = []
+        for id, client in in_the_way.items():
+            count = client.probes_due(now, self._pace.sent)
+            if count:
+                probed.append((id, count))
+        if self._asked:
+            return due, probed, _ASK_EVERY_S
+        by_time = any(not client.strict for client in in_the_way.values())
+        if by_time or any(client.finding_until for client in self._held.values()):
+            return due, probed, EVERY_S
+        return due, probed, _LOOK_EVERY_S if self._held else None
+
+    def _ask(self, id: bytes) -> None:
+        """Find out whether a client's node answers probes."""
+        answers = self._probes.answers(id)
+        now = self._clock()
+        with self._wake:
+            until = self._asked.get(id, now)
+            if answers is None and now < until:
+                return
+            self._asked.pop(id, None)
+            self._pace.client(id, now).probing = Probing.YES if answers else Probing.NO
+
+    def _answered(self, id: bytes) -> None:
+        now = self._clock()
+        with self._wake:
+            self._pace.client(id, now).answered_probe(now)
+            self._wake.notify()
+
+    def close(self) -> None:
+        """Send no more; what waits is dropped. Repeatable."""
+        with self._wake:
+            self._closed = True
+            self._wake.notify()

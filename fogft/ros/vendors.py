@@ -1,0 +1,48 @@
+"""Which DDS an endpoint is of, and whether it understands our services. Pure.
+
+Two implementations of DDS find each other and exchange topics, but not services: Fast DDS and
+CycloneDDS put requests behind headers of their own. Discovery shows a service that never answers.
+What tells them apart is the number of the implementation, which every identifier begins with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+FAST_DDS, CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # as the OMG assigns them
+_MIDDLEWARE = {FAST_DDS: "rmw_fastrtps_cpp", CYCLONE_DDS: "rmw_cyclonedds_cpp"}
+_OF_DYNAMIC = {"rmw_fastrtps_dynamic_cpp": "rmw_fastrtps_cpp"}
+
+
+def strangers(ours: str, identifiers: Iterable[bytes]) -> list[str]:
+    """Return the middleware of each endpoint that does not understand our services.
+
+    Of a middleware that is not known here nothing is said.
+
+    Args:
+        ours: Our middleware, such as ``rmw_fastrtps_cpp``.
+        identifiers: Those of the endpoints (GID), as discovery tells them.
+    """
+    ours = _OF_DYNAMIC.get(ours, ours)
+    if ours not in _MIDDLEWARE.values():
+        return []
+    theirs = [_MIDDLEWARE.get(bytes(one[:2]), ours) for one in identifiers]
+    return [one for one in theirs if one != ours]
+
+
+def of_client(service: str, ours: str, theirs: str) -> str:
+    """Say that a client of a service is not heard, and what to do."""
+    return (
+        f"a client of `{service}` runs on {theirs} and the client proxy on {ours}: it gets no "
+        f"answers; set RMW_IMPLEMENTATION={ours} where that node starts, or ={theirs} for "
+        "`fogft up`, after `fogft down`"
+    )
+
+
+def of_server(service: str, ours: str, theirs: str) -> str:
+    """Say that a service cannot be called, and what to do."""
+    return (
+        f"`{service}` runs on {theirs} and the server proxy on {ours}: it cannot be called; write "
+        "`envs: {RMW_IMPLEMENTATION: ...}` in the pool file, which holds for both, and set it "
+        "nowhere else"
+    )

@@ -1,0 +1,63 @@
+"""What one or two of three replicas in wrong hands cost the requests that the others answer."""
+
+from __future__ import annotations
+
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.rig import Rig
+from tests.bench.service import FLAG
+from tests.estimates import percentile
+
+SLEEP_S = 0.02
+LIES = ("junk 11", "crashed", "boasting")
+_PER_S = 30.0
+_SETTLES_S = 1.0  # an avoided replica is tried again, and found honest
+_MOST = 2
+
+
+def hostile(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Compare 0, 1 and 2 of 3 replicas that lie, in turns, for each of some lies.
+
+    They lie to every request for as long as a block lasts, and nobody takes them away: no manager
+    runs. `wrong` counts answers that the service does not give.
+    """
+    rounds, count = (2, 60) if quick else (5, 200)
+    orders = {slot: folder / f"orders-{slot}" for slot in range(_MOST)}
+    rows = []
+    with Rig(folder, 3, sleep_s=SLEEP_S, hostile=orders) as rig:
+        caller = Caller(rig.robot_domain, "bench_hostile")
+        caller.wait()
+        payload, source = payloads()[FLAG[0]], random.Random(1)
+        caller.spread(FLAG[0], payload, count, _PER_S, source)  # delays and loads become known
+        for lie in LIES:
+            took: dict[int, list[float]] = {bad: [] for bad in range(_MOST + 1)}
+            wrong = dict.fromkeys(took, 0)
+            for _ in range(rounds):
+                for bad in took:
+                    for slot, path in orders.items():
+                        path.write_text(lie if slot < bad else "honest")
+                    before = caller.wrong
+                    took[bad] += caller.spread(FLAG[0], payload, count, _PER_S, source)
+                    wrong[bad] += caller.wrong - before
+                    for path in orders.values():
+                        path.write_text("honest")
+                    time.sleep(_SETTLES_S)
+            rows += [_row(lie, bad, took, wrong[bad], rounds * count) for bad in took]
+        caller.close()
+    return rows
+
+
+def _row(
+    lie: str, bad: int, took: dict[int, list[float]], wrong: int, count: int
+) -> dict[str, Any]:
+    row: dict[str, Any] = {"lie": lie, "hostile": f"{bad} of 3", "requests": count}
+    row |= {"unanswered": count - len(took[bad]), "wrong": wrong}
+    for percent in (50, 99):
+        value = percentile(took[bad], percent)
+        row[f"p{percent}_ms"] = milliseconds([value])[0]
+        row[f"p{percent}_ratio"] = value / percentile(took[0], percent)
+    return row

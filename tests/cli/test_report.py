@@ -1,0 +1,64 @@
+"""``fogft top`` and ``fogft report``: what they show of a pool on disk."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+
+from fogft.cli import main
+from fogft.cli.screens.report import ready_spans
+from fogft.cli.screens.top import sparkline
+from fogft.planning.observed.history import Event, EventKind
+from fogft.pool.commands import composition
+from tests.cli.pools import alive, lay_down
+from tests.needs import needs
+
+EVENTS = [
+    Event(100.0, EventKind.LAUNCH, 0, 1, location="local/<west>/a"),
+    Event(110.0, EventKind.READY, 0, 1),
+    Event(150.0, EventKind.UNREADY, 0, 1),
+    Event(160.0, EventKind.READY, 0, 1),
+    Event(190.0, EventKind.GONE, 0, 1),
+    Event(170.0, EventKind.READY, 1, 1),
+]
+
+
+def test_a_screen_has_trends_events_and_cost(home, capsys):
+    """Without a terminal it is printed once."""
+    with alive(lay_down(home)):
+        for event in EVENTS:
+            composition.make_store("planner").append(event)
+        assert main.run(["top"]) == 0
+    shown = capsys.readouterr().out
+    assert "1 of 3 ready" in shown
+    assert re.search(r"P99 /plan +█ +148 ms", shown)
+    assert re.search(r"RTT 0\.1 +█ +0\.42 ms", shown)
+    assert "spent $0.00 so far" in shown
+    assert "local/<west>/a" in shown
+
+
+def test_a_trend_is_a_line_of_bars():
+    assert sparkline(deque([0.0, 0.5, 1.0])) == "▁▅█"
+    assert sparkline(deque([0.0])) == "▁"
+
+
+def test_a_replica_is_ready_from_its_readiness_to_its_end():
+    assert list(ready_spans(EVENTS, 200.0)) == [
+        ("0.1", 110.0, 150.0), ("0.1", 160.0, 190.0), ("1.1", 170.0, 200.0)
+    ]  # fmt: skip
+
+
+@needs("matplotlib")
+def test_a_page_tells_a_pools_life(home, capsys, tmp_path):
+    with alive(lay_down(home)):
+        for event in EVENTS:
+            composition.make_store("planner").append(event)
+        assert main.run(["report", "planner", "--into", str(tmp_path / "page.html")]) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert page.startswith("<!doctype html>")
+    assert "At least one replica was ready for" in page
+    assert "<svg" in page
+    assert "local/&lt;west&gt;/a" in page, "what comes from elsewhere is escaped"
+    assert "148 ms" in page
+    assert not re.findall(r'(?:src|href)="https?:', page), "it needs no other file"
+    assert "done: wrote" in capsys.readouterr().err

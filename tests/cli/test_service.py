@@ -1,0 +1,140 @@
+"""`fogft service`: what systemd is given, judged by systemd, and what it is told."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fogft import disk
+from fogft.cli import main
+from fogft.pool.commands import service
+from fogft.pool.folder.paths import PoolPaths
+from fogft.process import Watchdog, notify
+from tests.cli.pools import lay_down
+from tests.needs import needs
+
+
+class Systemd:
+    """Stands in for systemctl: notes what it is asked, and answers as told."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.asked = folder / "asked"
+        folder.mkdir()
+        program = folder / "systemctl"
+        program.write_text(f'#!/bin/sh\necho "$@" >> {self.asked}\necho active\n')
+        program.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
+
+
+@pytest.fixture
+def units(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A pool, a home for units, and an environment as of a sourced ROS 2."""
+    lay_down(home, None)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "not to be written")
+    return tmp_path / "config" / "systemd" / "user"
+
+
+def test_units_are_written_started_shown_and_removed(home, units, tmp_path, monkeypatch, capsys):
+    systemd = Systemd(tmp_path / "bin", monkeypatch)
+    assert main.run(["service", "install"]) == 0
+    names = [f"fogft-planner-{part}.service" for part in ("manager", "proxy-a", "proxy-b")]
+    assert capsys.readouterr().out.split() == [str(units / name) for name in names]
+    assert systemd.asked.read_text().splitlines() == [
+        "--user daemon-reload",
+        f"--user enable {' '.join(names)}",
+        f"--user restart --no-block {' '.join(names)}",
+    ]
+    env_file = home / "pools" / "planner" / "service.env"
+    told = env_file.read_text()
+    assert 'RMW_IMPLEMENTATION="rmw_fastrtps_cpp"\n' in told
+    assert 'ROS_DOMAIN_ID="7"\n' in told
+    assert "not to be written" not in told
+    assert env_file.stat().st_mode & 0o777 == 0o600
+    manager = (units / names[0]).read_text()
+    assert f"ExecStart={sys.executable} -m fogft manager --no-proxy planner\n" in manager
+    assert f"EnvironmentFile={env_file}\n" in manager
+    assert main.run(["service", "status"]) == 0
+    assert capsys.readouterr().out.splitlines() == [f"{name}  active" for name in names]
+    assert main.run(["service", "remove"]) == 0
+    assert list(units.iterdir()) == []
+    assert main.run(["service", "status"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_units_of_a_gateway_and_of_the_machine(tmp_path, monkeypatch):
+    """A part with its own file; units of the machine run as the file's owner."""
+    config = tmp_path / "edge 1%.yaml"
+    config.write_text("")
+    [unit] = service.of_part("gateway", config, system=True)
+    assert f'gateway --config "{tmp_path}/edge 1%%.yaml"\n' in unit.text
+    assert "User=root\n" in unit.text
+    assert "WantedBy=multi-user.target\n" in unit.text
+
+
+@needs("systemd")
+def test_systemd_finds_nothing_wrong_with_the_units(home, units, tmp_path):
+    paths = PoolPaths.of("planner", home)
+    (paths.folder / "service.env").write_text(service.environment())
+    config = tmp_path / "rendezvous.yaml"
+    config.write_text("")
+    wanted = service.of_pool(paths, system=True)
+    wanted += service.of_part("rendezvous", config, system=True)
+    for unit in wanted:
+        (tmp_path / unit.name).write_text(unit.text)
+    judged = subprocess.run(
+        ["systemd-analyze", "verify", *(str(tmp_path / unit.name) for unit in wanted)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (judged.returncode, judged.stderr) == (0, "")
+
+
+def test_systemd_is_told_when_a_process_is_ready_and_that_it_works(tmp_path):
+    now = [100.0]
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told:
+        told.bind(str(tmp_path / "notify"))
+        told.settimeout(10)
+        environ = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4000000"}
+        notify("READY=1", environ)
+        assert told.recv(100) == b"READY=1"
+        watchdog = Watchdog(lambda: now[0], environ)
+        for at in (100.0, 100.5, 101.0):
+            now[0] = at
+            watchdog.work()
+        assert [told.recv(100), told.recv(100)] == [b"WATCHDOG=1"] * 2
+        told.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            told.recv(100)
+    Watchdog(lambda: now[0], {}).work()  # nobody to tell
+    notify("READY=1", {"NOTIFY_SOCKET": str(tmp_path / "nobody")})
+
+
+def test_the_client_proxy_that_runs_gives_way_once_another_stands_by(
+    home, units, tmp_path, monkeypatch
+):
+    """It is told to end, never killed; systemd is asked again for what found no place before."""
+    systemd, paths = Systemd(tmp_path / "bin", monkeypatch), PoolPaths.of("planner", home)
+    holds = (
+        "import fcntl, sys; file = open(sys.argv[1], 'w'); fcntl.flock(file, 2);"
+        "print(flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", holds, str(paths.proxy_lock)]
+    with subprocess.Popen(command, stdin=-1, stdout=-1) as old:
+        assert old.stdout is not None
+        old.stdout.readline()
+        with disk.locked(paths.standby_lock):
+            wanted = service.of_pool(paths, system=False)
+            service.hand_over(service.services(system=False), paths, wanted)
+        assert old.wait(20) == -signal.SIGTERM
+    names = " ".join(unit.name for unit in wanted)
+    assert systemd.asked.read_text().splitlines() == [
+        f"--user reset-failed {names}",
+        f"--user start --no-block {names}",
+    ]

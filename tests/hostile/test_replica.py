@@ -1,0 +1,62 @@
+"""One of three replicas is in wrong hands: no request that the others answer is wrong or lost.
+
+A real client proxy and real replicas; the hostile one has a good certificate. Without a manager,
+nobody takes it away: each request of the whole test may meet it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fogft.model.choices import Speaks
+from tests.bench.caller import Caller, payloads
+from tests.bench.rig import Rig
+from tests.bench.service import FLAG
+from tests.estimates import percentile
+from tests.nightly import by_day
+from tests.rmw_zenoh import rmw_router
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+
+COUNT, PER_S = by_day(60, at_night=2000), 40.0
+SLEEP_S = 0.01
+LIES = (
+    "junk 0", "junk 4", "junk 11", "junk 65536",
+    "crashed", "refused", "swallowed", "boasting", "claims", "escapes",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=["rclpy", "zenoh"])
+def scene(request, tmp_path_factory) -> Iterator[tuple[Caller, Path]]:
+    folder = tmp_path_factory.mktemp("hostile")
+    orders, speaks = folder / "orders", Speaks(request.param)
+    with contextlib.ExitStack() as held:
+        environ = {}
+        if speaks is Speaks.ZENOH:
+            environ = held.enter_context(rmw_router.running()).environ
+        rig = held.enter_context(
+            Rig(folder, 3, sleep_s=SLEEP_S, hostile={0: orders}, rmw=speaks.value, environ=environ)
+        )
+        caller = Caller(rig.robot_domain, "hostile", speaks=speaks, environ=environ)
+        held.callback(caller.close)
+        caller.wait()
+        yield caller, orders
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_what_one_replica_does_costs_no_answer(scene: tuple[Caller, Path], lie: str) -> None:
+    caller, orders = scene
+    calm = caller.spread(FLAG[0], payloads()[FLAG[0]], COUNT // 2, PER_S, random.Random(lie))
+    orders.write_text(lie)
+    took = caller.spread(FLAG[0], payloads()[FLAG[0]], COUNT, PER_S, random.Random(lie))
+    orders.write_text("honest")
+    print(f"{lie}: p50 {percentile(calm, 50) * 1e3:.1f} -> {percentile(took, 50) * 1e3:.1f} ms, "
+          f"p99 {percentile(calm, 99) * 1e3:.1f} -> {percentile(took, 99) * 1e3:.1f} ms, "
+          f"lost {COUNT - len(took)}, wrong {caller.wrong}")  # fmt: skip
+    assert len(took) == COUNT
+    assert caller.wrong == 0

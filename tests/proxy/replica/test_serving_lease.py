@@ -1,0 +1,69 @@
+"""How long a replica serves on, whoever brings it the manager's leases, and when."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.proxy.replica.serving_lease import HeldLease
+from tests.proxy.fakes import Clock, lease
+
+DAY_S = 86_400.0
+
+
+def test_without_a_lease_it_never_ends():
+    held = HeldLease(Clock())
+    assert (held.age_s, held.left_s) == (None, None)
+
+
+def test_a_new_lease_prolongs_it_and_an_old_one_does_not():
+    clock = Clock()
+    held = HeldLease(clock)
+    held.renew(lease(1, at=0.0, lasts_s=DAY_S))
+    clock.now += 3600.0
+    held.renew(lease(2, at=3600.0, lasts_s=DAY_S))
+    assert (held.age_s, held.left_s) == (0.0, DAY_S)
+    clock.now += 60.0
+    held.renew(lease(1, at=0.0, lasts_s=DAY_S))
+    held.renew(lease(2, at=3600.0, lasts_s=DAY_S))
+    assert (held.age_s, held.left_s) == (60.0, DAY_S - 60.0)
+
+
+def test_a_new_manager_s_first_lease_is_newer_than_all_of_the_old_one_s():
+    clock = Clock()
+    held = HeldLease(clock)
+    held.renew(lease(900, epoch=1, at=0.0, lasts_s=60.0))
+    clock.now += 30.0
+    held.renew(lease(1, epoch=2, at=30.0, lasts_s=60.0))
+    assert held.left_s == 60.0
+
+
+@given(st.lists(st.floats(0, 3 * DAY_S), min_size=1, max_size=30))
+def test_leases_that_were_held_back_keep_nothing_alive(delays):
+    """A hostile robot shows them one by one, as late as it likes, and wins not one second."""
+    clock = Clock()
+    began = clock.now
+    held = HeldLease(clock)
+    held.renew(lease(0, at=0.0, lasts_s=DAY_S))
+    for number, delay in enumerate(delays, start=1):
+        clock.now += delay
+        held.renew(lease(number, at=60.0 * number, lasts_s=DAY_S))
+        assert held.left_s is not None
+        signed_at = began + 60.0 * number
+        assert held.left_s <= max(0.0, signed_at + DAY_S - clock.now) + 1e-6
+
+
+@given(st.lists(st.tuples(st.floats(0, DAY_S), st.floats(-1e6, 1e6)), max_size=30))
+def test_a_clock_that_is_set_ends_no_replica_early(steps):
+    """Neither the manager's clock nor a successor's on another machine; nor is it ever late."""
+    clock, at, longest = Clock(), 1e8, 0.0
+    held = HeldLease(clock)
+    for number, (wait, jump) in enumerate([(0.0, 0.0), *steps]):
+        clock.now += wait
+        at += wait + jump
+        before = held.left_s
+        held.renew(lease(number, at=at, lasts_s=DAY_S))
+        longest = max(longest, clock.now + DAY_S)
+        assert held.left_s is not None
+        assert before is None or held.left_s >= before - 1e-6
+        assert clock.now + held.left_s <= longest + 1e-6

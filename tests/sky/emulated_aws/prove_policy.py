@@ -1,0 +1,84 @@
+"""The policy of docs/how-to/clouds.md is enough, and nothing that is missing in it goes unnoticed.
+
+Runs inside a world (`world.sh`), whose AWS enforces that policy. Replicas are launched under it
+without each of its permissions, one after the other: what needs one names it. Then one is launched
+and ended under exactly it. Prints a table of steps; ends with status 1 at the first thing wrong.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from fogft.cloud.port import Launch
+from fogft.cloud.sky.adapter import SkyCloud
+from fogft.errors import CloudError
+from fogft.model.reason import Cause
+from fogft.model.replica import Machine, MachinePhase, ReplicaId
+from tests.sky.emulated_aws.emulation import Steps, control, running, until
+from tests.sky.emulated_aws.policy import PAGE, actions, statements
+from tests.sky.emulated_aws.prove_adapter import FILES, TASK, UID
+from tests.sky.emulated_aws.under_contract import RESOURCES, adapter, stub_server
+
+step = Steps()
+# What fogft can do without, as the page says; and what is no call of its own.
+NOT_NEEDED = {"servicequotas:GetServiceQuota", "iam:ListAttachedRolePolicies", "iam:PassRole"}
+AT_THE_END = {"ec2:TerminateInstances", "ec2:DeleteSecurityGroup"}
+
+
+def outcome(cloud: SkyCloud, slot: int) -> Machine | None:
+    """Launch a replica; return what became of it, None where it was refused at once."""
+    offer = cloud.offers(RESOURCES)[0]
+    id = ReplicaId(UID, slot, 1)
+    cloud.launch(Launch(id, "proof", offer.placement, offer.usd_per_hour, "abcd", TASK, FILES))
+
+    def ended() -> Machine | None:
+        found = next(m for m in cloud.machines(UID) if m.id == id)
+        return found if found.phase is not MachinePhase.PROVISIONING else None
+
+    machine = until(f"{id.short} has come to something", ended)
+    return machine if isinstance(machine, Machine) else None
+
+
+def main() -> int:
+    stub_server()
+    cloud = adapter(Path.home() / "policy")
+    with step("credentials are good"):
+        assert cloud.check(["aws"]) == {"aws": ""}
+    listed = actions(statements(PAGE.read_text()))
+    for slot, action in enumerate([one for one in listed if one not in NOT_NEEDED | AT_THE_END]):
+        control(f"/deny?action={action}")
+        with step(f"a launch without {action} fails and names it"):
+            machine = outcome(cloud, slot)
+            assert machine is not None
+            failure = machine.failure
+            assert failure is not None, machine
+            print(f"        {failure.cause.value}: {failure.words}", flush=True)
+            assert failure.cause is Cause.CREDENTIALS, failure
+            assert action.split(":")[1].rstrip("*") in failure.words, failure
+        control("/deny")
+        cloud.terminate(machine.id)
+    assert running() == []
+    with step("under the whole policy a replica runs"):
+        machine = outcome(cloud, 50)
+        assert machine is not None
+        assert machine.phase is MachinePhase.RUNNING, machine.failure
+    control("/deny?action=ec2:TerminateInstances")
+    with step("without ec2:TerminateInstances its end is not believed, and the reason is told"):
+        with pytest.raises(CloudError, match="TerminateInstances") as refused:
+            cloud.terminate(machine.id)
+        print(f"        {refused.value.message}", flush=True)
+        assert len(running()) == 1
+    control("/deny")
+    with step("... and with it it ends"):
+        cloud.terminate(machine.id)
+        assert running() == []
+    denied = {one["action"] for one in control("/log", post=False) if one["event"] == "denied"}
+    print(f"        asked for in vain: {', '.join(sorted(denied))}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
