@@ -133,6 +133,8 @@ def test_bytes_of_another_shape_go_to_nobody(
             node.client("/arm/grasp", TYPE).call(BODY, lambda _: None)
         held: list[Any] = []
         server = node.serve("/arm/grasp", TYPE, lambda payload, handle: held.append(handle))
+        # Told after the service itself, on the same way: who sees it, reaches the service.
+        wait_for(lambda: any("/SS/" in token for token in tokens(peer)), "the service's token")
         attachment = request_attachment(1, 1, GID)
         peer.get(KEY, payload=BODY, attachment=attachment, timeout=LIMIT_S)
         handle = wait_for(lambda: held, "the request")[0]
