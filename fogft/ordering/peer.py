@@ -1,6 +1,10 @@
 """A replica as one term of a sequencer knows it, and an order to it. Pure values.
 
-Owns: what is remembered of each replica. Not here: what follows from it (`term`).
+The first answer counts, so callers go as fast as the fastest replica. A slower one falls behind for
+as long as that lasts; should the faster ones die, every caller would wait until it has applied all
+that it lacks. So one that is far behind is given a snapshot instead, though not too often.
+
+Owns: what is remembered of each replica. Not here: what follows from it (`sequencer`).
 """
 
 from __future__ import annotations
@@ -8,11 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
-from fogft.ordering import lag
 from fogft.ordering.orders import Op, Promise
 
 RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.5
+# Further behind than this, a replica is given a new snapshot rather than every request since.
+LAG_LIMIT = 256
+RESTORE_FIRST_S = 2.0
+RESTORE_LONGEST_S = 16.0
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,31 @@ class Phase(Enum):
     JOINED = "joined"  # it applies what is sent to it
 
 
+def far_behind(requests: int) -> bool:
+    """Whether a replica that lacks so many requests is to have a snapshot rather than them."""
+    return requests > LAG_LIMIT
+
+
+class Lag:
+    """How one replica keeps up. A snapshot costs its giver a pause: the next ones come rarer."""
+
+    def __init__(self) -> None:
+        self._wait_s = RESTORE_FIRST_S
+        self._next_at = 0.0
+
+    def too_far(self, behind: int, now: float) -> bool:
+        """Whether a replica is to be restored now that has not answered so many requests."""
+        if not far_behind(behind):
+            if now >= self._next_at + self._wait_s:
+                self._wait_s = RESTORE_FIRST_S  # it has kept up for as long again
+            return False
+        if now < self._next_at:
+            return False
+        self._next_at = now + self._wait_s
+        self._wait_s = min(2 * self._wait_s, RESTORE_LONGEST_S)
+        return True
+
+
 @dataclass
 class Peer:
     """A replica as this term knows it."""
@@ -50,12 +82,23 @@ class Peer:
     retry_at: float = 0.0
     checked_at: float = 0.0
     waits_since: float | None = None
-    lag: lag.Lag = field(default_factory=lag.Lag)
+    lag: Lag = field(default_factory=Lag)
     lags: bool = False  # it is sent no more: a snapshot takes it further
+
+    @property
+    def joined(self) -> bool:
+        """Whether it applies what is sent to it."""
+        return self.phase is Phase.JOINED
+
+    def join(self, expected: int) -> None:
+        """It has joined, and expects this number next."""
+        self.phase, self.member = Phase.JOINED, True
+        self.wait_s, self.rewind = RETRY_FIRST_S / 2, None
+        self.next, self.acked = expected, expected - 1
 
     def go_back(self, expected: int) -> None:
         """Send again from a number, once what is on its way has been answered."""
-        if self.phase is Phase.JOINED and expected <= self.next:
+        if self.joined and expected <= self.next:
             self.rewind = expected if self.rewind is None else min(self.rewind, expected)
 
     def pause(self, now: float) -> None:

@@ -1,22 +1,31 @@
-"""One term of a stateful service's order: the first answer counts. Pure.
+"""One term of a stateful service's order: claim replicas, let them join, take what they say. Pure.
 
-It begins from the state of one replica, never from one before the mark, and one replica is
-enough. When most of the replicas that stay run another version, that takes over at one point of
-the order.
+A term claims the replicas and begins from the state of one of them, never from one before the mark;
+one replica is enough. From then on it numbers requests, and the first answer counts. When most of
+the replicas that stay run another version, that takes over at one point of the order.
 
-Owns: from what a term begins, which answer is returned, and when it is handed over.
-Not here: numbers and how replicas come to them (`term`), callers and deadlines
-(`fogft.proxy.robot.ordered_dispatcher`). Protocol and its argument: docs/design/state.md.
+The owner sends what `take` returns, and reports each order's end, once, by `replied`, `refused` or
+`declined`.
+
+Owns: how far each replica obeys, from what a term begins, which answer is returned, and when it is
+handed over. Not here: what each replica is to be sent (`catching_up`), callers and deadlines
+(`fogft.proxy.robot.service_order`). Protocol and its argument: docs/design/state.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from fogft.model.refusal import Refusal
+from fogft.ordering import orders
 from fogft.ordering.active_version import ActiveVersion
-from fogft.ordering.orders import START, Op, Position
+from fogft.ordering.catching_up import CatchingUp
+from fogft.ordering.log import OrderedLog
+from fogft.ordering.orders import START, Op, Position, Promise
 from fogft.ordering.peer import Order, Peer, Phase
-from fogft.ordering.term import OrderedTerm
+
+CHECK_EVERY_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,7 @@ class Handover:
     state: bytes
 
 
-class Sequencer(OrderedTerm):
+class Sequencer:
     """One term of a sequencer.
 
     Args:
@@ -44,6 +53,12 @@ class Sequencer(OrderedTerm):
         begin: What the term begins from, where a version takes over from another.
         log_entries: Requests kept at most.
         log_bytes: Their bytes at most.
+
+    Attributes:
+        active: Whose answers count.
+        deposed_by: A later term that replicas obey.
+        held_by: Another robot whose order they obey.
+        handover: This term's end: the next begins from it.
     """
 
     def __init__(
@@ -56,26 +71,66 @@ class Sequencer(OrderedTerm):
         log_entries: int = 8192,
         log_bytes: int = 64 << 20,
     ) -> None:
-        super().__init__(epoch, mark=mark, log_entries=log_entries, log_bytes=log_bytes)
+        self.epoch = epoch
+        self.mark = mark
         self.active = ActiveVersion(begin.version if begin else holder)
-        self.handover: Handover | None = None  # this term's end: the next begins from it
-        self._begin = begin
+        self.deposed_by: int | None = None
+        self.held_by = ""
+        self.handover: Handover | None = None
+        self._versions: Mapping[int, str] = {}
+        self._leaving: frozenset[int] = frozenset()
         self._change_to: str | None = None  # no number is given meanwhile
         self._unanswered: dict[int, None] = {}
+        self._replicas = CatchingUp(
+            epoch,
+            self._counts,
+            handed_over=begin is not None,
+            log_entries=log_entries,
+            log_bytes=log_bytes,
+        )
+        self._peers = self._replicas.peers
         if begin is not None:
-            self._begin_at(begin.at)
-            self._keep_checkpoint(begin.at.index, begin.state)
+            self._replicas.begin_at(begin.at)
+            self._replicas.take_checkpoint(begin.at.index, begin.state)
+
+    # -- what the owner asks --------------------------------------------------------------
 
     @property
-    def changing(self) -> bool:
-        """Whether another version is to take over as soon as all is answered."""
-        return self._change_to is not None
+    def log(self) -> OrderedLog | None:
+        """The numbers given; None until the term has begun."""
+        return self._replicas.log
+
+    @property
+    def ready(self) -> bool:
+        """Whether a number given now is sent at once to somebody whose answer counts."""
+        return self._replicas.ready
+
+    @property
+    def joined(self) -> list[int]:
+        """The replicas that apply what is sent to them."""
+        return [replica for replica, peer in self._peers.items() if peer.joined]
+
+    @property
+    def stranded(self) -> bool:
+        """Whether replicas answer, and none of them can be brought to the present state."""
+        phases = [peer.phase for peer in self._peers.values()]
+        return Phase.CLAIMED in phases and Phase.ASKED not in phases and not self.ready
+
+    @property
+    def due(self) -> bool:
+        """Whether the owner has something to do at once: to send, or to end the term."""
+        ends = self.deposed_by is not None or self.handover is not None
+        return ends or self._replicas.sends or self._change_to is not None
+
+    def take(self) -> list[Order]:
+        """Return the orders to send, in this order, and forget them."""
+        return self._replicas.take()
 
     def submit(self, payload: bytes) -> int | None:
         """Number a request and order it applied; None while the term has not begun or is full."""
-        if self._change_to is not None:
+        if self._change_to is not None or self.deposed_by is not None:
             return None
-        index = self._append(payload)
+        index = self._replicas.append(payload)
         if index is not None:
             self._unanswered[index] = None
         return index
@@ -84,10 +139,107 @@ class Sequencer(OrderedTerm):
         """Nobody waits for the answer to this number any more. It is applied all the same."""
         self._unanswered.pop(index, None)
 
+    def reach(
+        self,
+        replicas: Iterable[int],
+        now: float,
+        *,
+        versions: Mapping[int, str] | None = None,
+        leaving: Iterable[int] = (),
+    ) -> None:
+        """Set which replicas can be sent to; new ones are claimed at once.
+
+        Args:
+            replicas: Them.
+            now: In seconds.
+            versions: What each runs; all the same unless told.
+            leaving: Those that are to go soon.
+        """
+        wanted = set(replicas)
+        self._versions, self._leaving = versions or {}, frozenset(leaving)
+        for replica in [r for r in self._peers if r not in wanted]:
+            del self._peers[replica]
+            self._gave_no_checkpoint(replica)
+        for replica in sorted(wanted - self._peers.keys()):
+            self._peers[replica] = Peer()
+        self.tick(now)
+
+    def _version(self, replica: int) -> str:
+        return self._versions.get(replica, "")
+
     def _counts(self, replica: int) -> bool:
         return self.active.counts(self._version(replica))
 
-    def _applied(self, replica: int, index: int, payload: bytes) -> bool:
+    def _gave_no_checkpoint(self, replica: int) -> None:
+        if self._replicas.donor == replica:
+            self._replicas.donor = None
+
+    def tick(self, now: float) -> None:
+        """Do what is due: claim again, send what is missing, ask for a checkpoint."""
+        if self.deposed_by is not None:
+            return
+        for replica, peer in self._peers.items():
+            if peer.phase is Phase.UNCLAIMED and peer.retry_at <= now:
+                self._claim(replica, peer)
+            elif peer.phase is Phase.CLAIMED:
+                self._replicas.bring(replica, peer)
+                self._claim_again(replica, peer, now)
+            elif peer.joined:
+                self._replicas.look_at_lag(peer, now)
+                self._replicas.feed(replica, peer)
+                self._check(replica, peer, now)
+        self._govern(now)
+        self._replicas.see_to_checkpoint(now)
+
+    def _claim(self, replica: int, peer: Peer) -> None:
+        peer.phase = Phase.ASKED
+        self._replicas.order(replica, Op.CLAIM)
+
+    def _claim_again(self, replica: int, peer: Peer, now: float) -> None:
+        """Claim anew one that waits for long: it may have applied more since it was asked."""
+        if peer.phase is not Phase.CLAIMED:
+            return
+        if peer.waits_since is None:
+            peer.waits_since = now
+        elif now - peer.waits_since > CHECK_EVERY_S and self._replicas.donor is None:
+            self._claim(replica, peer)
+
+    def _check(self, replica: int, peer: Peer, now: float) -> None:
+        """Ask an idle replica where it stands: no request would tell that its service died."""
+        if peer.joined and not peer.open and now - peer.checked_at > CHECK_EVERY_S:
+            peer.checked_at = now
+            self._replicas.order(replica, Op.CLAIM)
+
+    # -- what replicas say ----------------------------------------------------------------
+
+    def replied(self, replica: int, op: Op, index: int, payload: bytes) -> bool:
+        """Take a reply. Return whether it is the answer to a number: return it, after having
+        written down `mark`.
+
+        Raises:
+            OrderError: The bytes are not what this operation is answered with.
+        """
+        peer = self._peers.get(replica)
+        if op in (Op.APPLY, Op.RECALL):
+            answers = self._applied(replica, index)
+            if peer is not None:
+                peer.open.discard(index)
+                peer.acked = max(peer.acked, index)
+                peer.won += answers
+                if peer.joined:
+                    self._replicas.feed(replica, peer)
+            return answers
+        if op is Op.SNAPSHOT:
+            self._gave_no_checkpoint(replica)
+            self._take_checkpoint(*orders.decode_snapshot(payload))
+        elif peer is not None and op is Op.CLAIM:
+            self._promised(replica, peer, orders.decode_promise(payload))
+        elif peer is not None and op in (Op.JOIN, Op.RESTORE):
+            self._has_joined(replica, peer, orders.decode_index(payload))
+        return False
+
+    def _applied(self, replica: int, index: int) -> bool:
+        """A replica says that it has applied a number. Return whether that answers it."""
         first = index in self._unanswered and self._counts(replica)
         if first:
             del self._unanswered[index]
@@ -95,36 +247,97 @@ class Sequencer(OrderedTerm):
             self.mark = max(self.mark, Position(self.epoch, index))
         return first
 
+    def _take_checkpoint(self, index: int, state: bytes) -> None:
+        log = self.log
+        if log is None or self.deposed_by is not None:
+            return
+        self._replicas.take_checkpoint(index, state)
+        if self._change_to is not None and index == log.last and not self._unanswered:
+            self.handover = Handover(self._change_to, Position(self.epoch, index), state)
+
+    def _promised(self, replica: int, peer: Peer, promise: Promise) -> None:
+        if promise.position.epoch != self.epoch:
+            peer.member = False
+            if peer.joined:
+                peer.phase = Phase.UNCLAIMED
+        if peer.phase is not Phase.ASKED:
+            return
+        peer.phase = Phase.CLAIMED
+        peer.promise, peer.waits_since = promise, None
+        self.held_by = ""
+        if self._replicas.base is not None:
+            self._replicas.bring(replica, peer)
+        else:
+            self._lead(replica, promise)
+
+    def _lead(self, replica: int, promise: Promise) -> None:
+        """Begin the term from the state of a claimed replica, if it may be."""
+        if not promise.sound or promise.position < self.mark:
+            return
+        if self.active.may_lead(self._version(replica)):
+            self.active.version = self._version(replica)
+            self._replicas.begin_at(promise.position)
+            self._replicas.bring_all()
+
+    def _has_joined(self, replica: int, peer: Peer, expected: int) -> None:
+        log = self.log
+        if peer.phase is not Phase.ASKED or log is None:
+            return
+        if not log.covers(expected - 1):  # the log has moved on meanwhile
+            peer.phase = Phase.UNCLAIMED
+            return
+        peer.join(expected)
+        self._recall(replica, expected)
+        self._replicas.feed(replica, peer)
+
     def _recall(self, replica: int, before: int) -> None:
-        peer = self._peers[replica]
+        """Ask a replica for answers that never came: it has applied those, and keeps them."""
         for index in self._unanswered:
-            if index < before and index not in peer.open:
-                peer.open.add(index)
-                self._out.append(Order(replica, Op.RECALL, index))
+            if index < before:
+                self._replicas.recall(replica, index)
 
-    # -- how a term begins ----------------------------------------------------------------
+    # -- what does not succeed ------------------------------------------------------------
 
-    def _lead(self, replica: int, peer: Peer) -> None:
-        """Begin the term from the state of a replica, if it may be."""
-        promise = peer.promise
-        if promise is None or not promise.sound or promise.position < self.mark:
+    def refused(
+        self, replica: int, op: Op, index: int, reason: Refusal, now: float, *, detail: str = ""
+    ) -> None:
+        """Take a refusal, or the loss of an order: the replica may or may not have obeyed it."""
+        epoch = orders.read_epoch(detail) if reason is Refusal.FENCED else None
+        if epoch is not None and epoch > self.epoch:
+            self.deposed_by = max(epoch, self.deposed_by or 0)
+            self._replicas.take()
             return
-        if not self.active.may_lead(self._version(replica)):
+        if reason is Refusal.HELD:
+            self.held_by = detail
+        peer = self._peers.get(replica)
+        if op is Op.SNAPSHOT:
+            self._gave_no_checkpoint(replica)
+            self._replicas.bring_all(waited=True)
             return
-        self.active.version = self._version(replica)
-        self._begin_at(promise.position)
-        self._bring_all()
+        if peer is None:
+            return
+        if op in (Op.APPLY, Op.RECALL):
+            peer.open.discard(index)
+            if reason in (Refusal.FORGOTTEN, Refusal.MALFORMED):
+                peer.acked = max(peer.acked, index)
+                return
+            expected = orders.read_index(detail) if reason is Refusal.GAP else None
+            if expected is not None:
+                peer.go_back(expected)
+                return
+        peer.pause(now)
 
-    def _find_base(self) -> None:
-        for replica, peer in self._peers.items():
-            if self.base is None and peer.phase is Phase.CLAIMED:
-                self._lead(replica, peer)
-
-    def _has_own_state(self, replica: int, at: Position) -> bool:
-        """Whether a replica's state is one that this term knows, and not one it stood by with."""
-        of_another = self._begin is not None and self._counts(replica) and at.epoch != self.epoch
-        # One of the version that took over begins from what was handed over.
-        return not of_another and super()._has_own_state(replica, at)
+    def declined(self, replica: int, op: Op, index: int, now: float) -> None:
+        """An order was not taken by the link: it was not sent."""
+        peer = self._peers.get(replica)
+        if op is Op.SNAPSHOT:
+            self._gave_no_checkpoint(replica)
+        elif peer is not None:
+            peer.open.discard(index)
+            if op is Op.APPLY:
+                peer.go_back(index)
+            else:
+                peer.pause(now)
 
     # -- versions -------------------------------------------------------------------------
 
@@ -133,8 +346,10 @@ class Sequencer(OrderedTerm):
         joined = self.joined
         standing = [self._version(r) for r in joined]
         self.active.look(standing, now)
-        if self.base is None:
-            self._find_base()
+        if self._replicas.base is None:
+            for replica, peer in self._peers.items():
+                if self._replicas.base is None and peer.phase is Phase.CLAIMED and peer.promise:
+                    self._lead(replica, peer.promise)
         elif (heir := self.active.successor(standing)) is not None:
             self.active.version = heir
             self._change_to = None
@@ -154,14 +369,6 @@ class Sequencer(OrderedTerm):
         donors = [
             (r in self._leaving, p.won, r)
             for r, p in self._peers.items()
-            if p.phase is Phase.JOINED and self._counts(r) and p.acked >= log.last and not p.open
+            if p.joined and self._counts(r) and p.acked >= log.last and not p.open
         ]
-        if donors and self._asked_for_checkpoint is None and now >= self._checkpoint_at:
-            self._ask_for_checkpoint(min(donors)[-1], now)
-
-    def _keep_checkpoint(self, index: int, state: bytes) -> None:
-        super()._keep_checkpoint(index, state)
-        log = self.log
-        last = log is not None and index == log.last and not self._unanswered
-        if self._change_to is not None and last:
-            self.handover = Handover(self._change_to, Position(self.epoch, index), state)
+        self._replicas.ask_for_checkpoint(donors, now)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from fogft.ordering.lag import FIRST_S, LIMIT, LONGEST_S, Lag
+from fogft.ordering.peer import LAG_LIMIT, RESTORE_FIRST_S, RESTORE_LONGEST_S, Lag
 
 
 def restores(behind: int, seconds: float) -> list[float]:
@@ -14,25 +14,25 @@ def restores(behind: int, seconds: float) -> list[float]:
 
 
 def test_one_that_keeps_up_is_left_alone():
-    assert restores(LIMIT, 60) == []
+    assert restores(LAG_LIMIT, 60) == []
 
 
 def test_one_that_never_keeps_up_is_restored_ever_more_seldom():
-    times = restores(LIMIT + 1, 120)
+    times = restores(LAG_LIMIT + 1, 120)
     gaps = [after - before for before, after in itertools.pairwise(times)]
     assert times[0] == 0.0
-    assert gaps[0] == FIRST_S
+    assert gaps[0] == RESTORE_FIRST_S
     assert gaps == sorted(gaps)
-    assert gaps[-1] == LONGEST_S
+    assert gaps[-1] == RESTORE_LONGEST_S
 
 
 def test_one_that_kept_up_for_long_is_restored_soon_again():
     one = Lag()
     at = 0.0
     for _ in range(5):
-        while not one.too_far(LIMIT + 1, at):
+        while not one.too_far(LAG_LIMIT + 1, at):
             at += 0.1
-    assert not one.too_far(0, at + 2 * LONGEST_S + 0.1)
-    assert one.too_far(LIMIT + 1, at + 2 * LONGEST_S + 0.2)
-    assert not one.too_far(LIMIT + 1, at + 2 * LONGEST_S + 0.3)
-    assert one.too_far(LIMIT + 1, at + 2 * LONGEST_S + 0.2 + FIRST_S)
+    assert not one.too_far(0, at + 2 * RESTORE_LONGEST_S + 0.1)
+    assert one.too_far(LAG_LIMIT + 1, at + 2 * RESTORE_LONGEST_S + 0.2)
+    assert not one.too_far(LAG_LIMIT + 1, at + 2 * RESTORE_LONGEST_S + 0.3)
+    assert one.too_far(LAG_LIMIT + 1, at + 2 * RESTORE_LONGEST_S + 0.2 + RESTORE_FIRST_S)

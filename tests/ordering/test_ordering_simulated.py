@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from fogft.ordering import lag
+from fogft.ordering import peer
 from fogft.ordering.catching_up import WINDOW
 from tests.linearizability import Call, counter, key_value, linearizable
 from tests.nightly import by_day
@@ -187,7 +187,7 @@ def busy_world(requests: int) -> World:
 
 def test_a_new_replica_gets_a_fresh_snapshot_rather_than_hundreds_of_requests():
     """The log would do, and the checkpoint too; both would keep it from being ready for long."""
-    world = busy_world(lag.LIMIT + 10)
+    world = busy_world(peer.LAG_LIMIT + 10)
     newest = world.add_replica()
     world.settle()
     assert world.restored == 1
@@ -234,7 +234,8 @@ def test_a_slow_replica_does_not_fall_ever_further_behind(slower):
         world.tick(0.01)
         worst = max(worst, asked - world.hosts[slow].machine.position.index)
     assert len(world.history) == 4000
-    assert lag.LIMIT < worst < lag.LIMIT + (slower + 1) * WINDOW + lag.LONGEST_S / 0.01
+    most = peer.LAG_LIMIT + (slower + 1) * WINDOW + peer.RESTORE_LONGEST_S / 0.01
+    assert peer.LAG_LIMIT < worst < most
     world.remove_replica(fast)
     world.ask(0, ("add", 1))
     for _ in range(worst + WINDOW):

@@ -177,8 +177,7 @@ class ServiceOrder:
         return order if order[1] == self._term.epoch else None
 
     def _wake_if_due(self) -> None:
-        term = self._term
-        if term.sends or term.deposed_by is not None or term.handover is not None or term.changing:
+        if self._term.due:
             self._wake()
 
     # -- what is sent ---------------------------------------------------------------------
