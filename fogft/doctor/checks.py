@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fogft.doctor import leftovers, machine, pools, ros
 from fogft.doctor.finding import Check, Finding, Situation, run
-from fogft.pool.folder import known_pools
+from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 from fogft.poolfile.file import read
 
@@ -22,5 +22,5 @@ def examine(file: Path | None = None) -> Iterator[Finding]:
         SpecError: The first mistake in the pool file.
     """
     spec = None if file is None else read(file)
-    pools_here = tuple(known_pools.names(home()))
+    pools_here = tuple(composition.pools())
     yield from run(ALL, Situation(home(), pools_here, spec, time.time()))

@@ -18,7 +18,6 @@ from fogft.model.names import POOL_UID_PATTERN
 # The longest role, dots, six digits and the uid take 36 of a common name's 64 characters.
 NAME_LIMIT = 28
 NAME_PATTERN = re.compile(rf"[A-Za-z0-9]([A-Za-z0-9_-]{{0,{NAME_LIMIT - 2}}}[A-Za-z0-9])?")
-GENERATION_LIMIT = 999_999
 
 
 class Role(str, Enum):
@@ -54,6 +53,11 @@ class Holder:
     def short(self) -> str:
         """Name and generation, as people see it: ``ada.2``."""
         return f"{self.name}.{self.generation}"
+
+
+def manager_of(pool_uid: str) -> Holder:
+    """Return who signs a pool's membership."""
+    return Holder(Role.MANAGER, "manager", 1, pool_uid)
 
 
 def holder_of(common_name: str) -> Holder:

@@ -79,16 +79,6 @@ def cancel_key(pool_uid: str, slot: int) -> str:
     return f"{slot_prefix(pool_uid, slot)}/cancel"
 
 
-def robot_certificate_name(pool_uid: str, robot: str, generation: int = 1) -> str:
-    """Return the common name of a robot's certificate; each rotation has its generation."""
-    return f"robot.{robot}.{generation}.{pool_uid}"
-
-
-def gateway_certificate_name(pool_uid: str, gateway: str, generation: int = 1) -> str:
-    """Return the common name of a gateway's certificate."""
-    return f"gateway.{gateway}.{generation}.{pool_uid}"
-
-
 def gateway_slot(gateway: str) -> int:
     """Return the slot of a gateway, which is like a replica to those who talk to it.
 
@@ -98,21 +88,13 @@ def gateway_slot(gateway: str) -> int:
     return GATEWAY_SLOTS + int.from_bytes(digest[:4], "big")
 
 
-def rendezvous_certificate_name(pool_uid: str, rendezvous: str, generation: int = 1) -> str:
-    """Return the common name of a rendezvous's certificate."""
-    return f"rendezvous.{rendezvous}.{generation}.{pool_uid}"
-
-
-def manager_certificate_name(pool_uid: str) -> str:
-    """Return the common name of the certificate whose key signs the pool's membership."""
-    return f"manager.manager.1.{pool_uid}"
-
-
 def is_endpoint(text: str) -> bool:
     """Whether this is ``host:port``; an IPv6 address stands in brackets."""
     host, _, port = text.rpartition(":")
     in_brackets = host.startswith("[") and host.endswith("]")
-    if not host or not (in_brackets or ":" not in host) or not host.isascii():
+    if not host or len(host) > 255 or not (in_brackets or ":" not in host):
+        return False
+    if not host.isascii() or not host.isprintable():
         return False
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
 

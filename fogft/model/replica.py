@@ -12,8 +12,9 @@ from enum import Enum
 from functools import cached_property
 from typing import Annotated
 
+from fogft.model.credentials import Holder, Role
 from fogft.model.keys import only
-from fogft.model.names import EndpointOrEmpty, PoolUid, gateway_certificate_name
+from fogft.model.names import EndpointOrEmpty, PoolUid
 from fogft.model.plain import Count
 from fogft.model.reason import Reason
 from fogft.model.topology import Topology
@@ -42,8 +43,8 @@ class ReplicaId:
 
     @property
     def certificate_name(self) -> str:
-        """The common name of its certificate: slot, generation and pool."""
-        return f"replica.{self.slot}.{self.generation}.{self.pool_uid}"
+        """The common name of its certificate."""
+        return Holder(Role.REPLICA, str(self.slot), self.generation, self.pool_uid).common_name
 
     def __str__(self) -> str:
         return f"{self.pool_uid}-{self.slot}.{self.generation}"
@@ -293,7 +294,7 @@ class Member:
         """The common name that its certificate must have."""
         if self.gateway:
             id = self.id
-            return gateway_certificate_name(id.pool_uid, self.gateway, id.generation)
+            return Holder(Role.GATEWAY, self.gateway, id.generation, id.pool_uid).common_name
         return self.id.certificate_name
 
 

@@ -7,12 +7,11 @@ Not here: what is told with each probe (`server`), records (`fogft.records.recor
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol
 
 from fogft.link.dial_out.replica import DialOut
+from fogft.model.plain import to_plain
 from fogft.model.proxy_config import ServerProxyConfig
 from fogft.model.replica import ReplicaId
 from fogft.records.client import Known, RendezvousClient
@@ -22,7 +21,6 @@ from fogft.records.signing import Signer
 
 log = logging.getLogger(__name__)
 
-LOAD_EVERY_S = 5.0
 _NOTHING = Known()
 
 
@@ -48,7 +46,6 @@ class Announcer:
         endpoint: ``host:port`` as it was told; empty if it was not.
         port: The port that it listens at.
         dials_out: It cannot be reached.
-        clock: Monotonic seconds.
     """
 
     def __init__(
@@ -59,18 +56,15 @@ class Announcer:
         endpoint: str,
         port: int,
         dials_out: bool,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._id = id
         self._records = records
         self._fixed = SlotState(endpoint=endpoint, dials_out=dials_out)
         self._port = port
-        self._clock = clock
         self._said: SlotState | None = None
-        self._said_at = 0.0
 
-    def look(self, ready: frozenset[str], *, draining: bool, in_flight: int) -> bool:
-        """Publish what has changed: the load only now and then; return whether it did."""
+    def look(self, ready: frozenset[str], *, draining: bool) -> bool:
+        """Publish what has changed; return whether anything did."""
         seen = self._records.known.seen_host
         host = f"[{seen}]" if ":" in seen else seen
         state = replace(
@@ -78,17 +72,12 @@ class Announcer:
             observed_endpoint=f"{host}:{self._port}" if host else "",
             services=tuple(sorted(ready)),
             draining=draining,
-            in_flight=in_flight,
         )
-        said = self._said
-        if said is not None and state == said:
+        if state == self._said:
             return False
-        only_load = said is not None and replace(state, in_flight=said.in_flight) == said
-        if only_load and self._clock() - self._said_at < LOAD_EVERY_S:
-            return False
-        self._said, self._said_at = state, self._clock()
+        self._said = state
         self._records.publish(
-            RecordKind.SLOT, str(self._id.slot), self._id.generation, state.to_content()
+            RecordKind.SLOT, str(self._id.slot), self._id.generation, to_plain(state)
         )
         return True
 
@@ -128,11 +117,11 @@ class Presence:
             self._dial_out = DialOut(listening, config.id.pool_uid, sign)
             self._dial_out.follow(config.dial_out)
 
-    def look(self, ready: frozenset[str], *, draining: bool, in_flight: int) -> Known:
+    def look(self, ready: frozenset[str], *, draining: bool) -> Known:
         """Say what is new of us, dial new doors; return what is known there."""
         if self._client is None or self._announcer is None:
             return _NOTHING
-        self._announcer.look(ready, draining=draining, in_flight=in_flight)
+        self._announcer.look(ready, draining=draining)
         known = self._client.known
         if known is not self._seen:
             self._seen = known

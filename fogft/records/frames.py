@@ -11,21 +11,24 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+from fogft.model.plain import Count
 from fogft.records.record import (
-    COUNT_LIMIT,
+    VERSION,
     Key,
     Order,
     RecordError,
     SignedRecord,
+    check_version,
     from_plain,
+    read,
     read_json,
     to_plain,
 )
 from fogft.records.record_set import Digest
 
-VERSION = 1
 FRAME_LIMIT = 256 << 10
 NONCE_BYTES = 32
 _LENGTH = struct.Struct(">I")
@@ -135,6 +138,11 @@ def ping() -> bytes:
     return frame({"type": "ping"})
 
 
+@dataclass(frozen=True)
+class _Have:
+    digest: tuple[tuple[str, str, Count, Count], ...]
+
+
 def have(digest: Digest) -> bytes:
     """Return what is held, for the other side to send what is lacking."""
     return frame({"type": "have", "digest": [[*key, *order] for key, order in digest.items()]})
@@ -146,17 +154,10 @@ def read_have(message: dict[str, Any]) -> dict[Key, Order]:
     Raises:
         RecordError: It is none.
     """
-    rows = message.get("digest")
-    if not isinstance(rows, list) or len(rows) > _DIGEST_LIMIT:
-        raise RecordError("malformed", "a digest that is none")
-    found: dict[Key, Order] = {}
-    for row in rows:
-        if not isinstance(row, list) or [type(x) for x in row] != [str, str, int, int]:
-            raise RecordError("malformed", "a digest that is none")
-        if not all(0 <= number < COUNT_LIMIT for number in row[2:]):
-            raise RecordError("malformed", "a digest that is none")
-        found[row[0], row[1]] = (row[2], row[3])
-    return found
+    rows = read(_Have, message).digest
+    if len(rows) > _DIGEST_LIMIT:
+        raise RecordError("malformed", f"a digest of {len(rows)} records")
+    return {(kind, subject): (first, then) for kind, subject, first, then in rows}
 
 
 def records(all: Sequence[SignedRecord]) -> Iterator[bytes]:
@@ -199,16 +200,14 @@ def unpack(data: bytes) -> list[SignedRecord]:
         RecordError: They are none.
     """
     message = read_json(data, FRAME_LIMIT)
-    if message.get("v") is True or message.get("v") != VERSION:
-        raise RecordError("version", f"version {message.get('v')!r:.20} is not spoken here")
+    check_version(message)
     return read_records(message)
 
 
 def _expect(message: dict[str, Any], kind: str) -> None:
     if message.get("type") != kind:
         raise RecordError("malformed", f"no {kind}")
-    if message.get("v") is True or message.get("v") != VERSION:
-        raise RecordError("version", f"version {message.get('v')!r:.20} is not spoken here")
+    check_version(message)
 
 
 def _hex(text: str, length: int = 0) -> bytes:

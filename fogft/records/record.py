@@ -18,18 +18,21 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
-from fogft.model import names
-from fogft.model.replica import ReplicaId
+from fogft.model import plain
+from fogft.model.credentials import Holder, Role, manager_of
+from fogft.model.keys import only
+from fogft.model.names import PoolUid
+from fogft.model.plain import Count
 
-VERSION = 1
+VERSION = 2
 BODY_LIMIT = 64 << 10
 CERTIFICATE_LIMIT = 4 << 10
 SIGNATURE_LIMIT = 256
-COUNT_LIMIT = 2**53
 _SIGNED_PREFIX = b"fogft record 1\n"  # a signature for this purpose is good for no other
-_SUBJECT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_SUBJECT = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.-]{0,63})?")
+T = TypeVar("T")
 
 Key = tuple[str, str]
 Order = tuple[int, int]
@@ -53,7 +56,6 @@ class RecordKind(str, Enum):
     """What a record is about; its writer follows from it."""
 
     ADMISSION = "admission"  # manager: which generation of which slot is let in
-    TOPOLOGY = "topology"  # manager: who talks through whom
     REVOCATION = "revocation"  # manager: certificates that are good no more
     LEASE = "lease"  # manager: how long replicas serve without hearing of it again
     SLOT = "slot"  # replica: its endpoint, services, state and load
@@ -61,9 +63,12 @@ class RecordKind(str, Enum):
     GATEWAY = "gateway"  # gateway: its endpoint
 
 
-MANAGER_KINDS = frozenset(
-    {RecordKind.ADMISSION, RecordKind.TOPOLOGY, RecordKind.REVOCATION, RecordKind.LEASE}
-)
+# All others are the manager's.
+_WRITERS = {
+    RecordKind.SLOT: Role.REPLICA,
+    RecordKind.ROBOT: Role.ROBOT,
+    RecordKind.GATEWAY: Role.GATEWAY,
+}
 
 
 @dataclass(frozen=True)
@@ -78,11 +83,11 @@ class Record:
         content: Plain JSON data; `roster` knows what it means.
     """
 
-    pool_uid: str
+    pool_uid: PoolUid
     kind: RecordKind
-    subject: str
-    generation: int
-    sequence: int
+    subject: Annotated[str, only(_SUBJECT.fullmatch, "a subject")]
+    generation: Count
+    sequence: Count
     content: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -168,74 +173,69 @@ def verified_writer(record: Record, signed: SignedRecord, verify: Verify) -> Wri
         RecordError: One of them is wrong.
     """
     writer = verify(signed.certificate, signed.signature, signed_bytes(signed.body))
-    role, common_name = expected_writer(record)
-    if (writer.role, writer.common_name) != (role, common_name):
+    expected = expected_writer(record)
+    if (writer.role, writer.common_name) != (expected.role.value, expected.common_name):
         what = f"{record.kind.value} record {record.subject}".rstrip()
         raise RecordError("writer", f"`{writer.common_name}` may not write the {what}")
     return writer
 
 
-def expected_writer(record: Record) -> tuple[str, str]:
-    """Return role and common name of the only one who may write this record.
+def expected_writer(record: Record) -> Holder:
+    """Return the only one who may write this record.
 
     A replica's certificate names its generation: it cannot write a later one's record.
 
     Raises:
         RecordError: There can be no such record.
     """
-    uid, subject = record.pool_uid, record.subject
-    if record.kind in MANAGER_KINDS:
+    role, subject = _WRITERS.get(record.kind, Role.MANAGER), record.subject
+    if role is Role.MANAGER:
         if subject:
             raise RecordError("malformed", "a manager's record about somebody")
-        return "manager", names.manager_certificate_name(uid)
-    if record.kind is RecordKind.SLOT:
-        if not subject.isdecimal() or str(int(subject)) != subject:
-            raise RecordError("malformed", "a slot that is not a number")
-        id = ReplicaId(uid, int(subject), record.generation)
-        return "replica", id.certificate_name
+        return manager_of(record.pool_uid)
     if not subject:
         raise RecordError("malformed", "a record about nobody")
-    if record.kind is RecordKind.ROBOT:
-        return "robot", names.robot_certificate_name(uid, subject, record.generation)
-    return "gateway", names.gateway_certificate_name(uid, subject, record.generation)
+    if role is Role.REPLICA and (not subject.isdecimal() or str(int(subject)) != subject):
+        raise RecordError("malformed", "a slot that is not a number")
+    return Holder(role, subject, record.generation, record.pool_uid)
 
 
 # -- bytes ----------------------------------------------------------------------------------
 
 
 def _encode(record: Record) -> bytes:
-    value = {
-        "v": VERSION,
-        "pool": record.pool_uid,
-        "kind": record.kind.value,
-        "subject": record.subject,
-        "generation": record.generation,
-        "sequence": record.sequence,
-        "content": record.content,
-    }
+    value = {"v": VERSION, **plain.to_plain(record)}
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def _decode(body: bytes) -> Record:
     raw = read_json(body, BODY_LIMIT)
-    if raw.get("v") is True or raw.get("v") != VERSION:
-        raise RecordError("version", f"a record of version {raw.get('v')!r:.20}")
-    uid, subject, content = raw.get("pool"), raw.get("subject"), raw.get("content")
-    if not isinstance(uid, str) or not names.POOL_UID_PATTERN.fullmatch(uid):
-        raise RecordError("malformed", "a record without a pool")
-    if not isinstance(subject, str) or (subject and not _SUBJECT.fullmatch(subject)):
-        raise RecordError("malformed", "a record with an odd subject")
-    if not isinstance(content, dict):
-        raise RecordError("malformed", "a record without content")
-    try:
-        kind = RecordKind(raw.get("kind"))
-    except ValueError:
-        raise RecordError("malformed", "a record of an unknown kind") from None
-    record = Record(
-        uid, kind, subject, _count(raw.get("generation")), _count(raw.get("sequence")), content
-    )
+    check_version(raw)
+    record = read(Record, raw)
     expected_writer(record)
     return record
+
+
+def check_version(raw: Mapping[str, Any]) -> None:
+    """See that a message or a record is of this version.
+
+    Raises:
+        RecordError: It is not.
+    """
+    if raw.get("v") is True or raw.get("v") != VERSION:
+        raise RecordError("version", f"version {raw.get('v')!r:.20} is not spoken here")
+
+
+def read(cls: type[T], raw: Any) -> T:
+    """Return the value that plain data describes.
+
+    Raises:
+        RecordError: It describes none of this class.
+    """
+    try:
+        return plain.from_plain(cls, raw)
+    except ValueError as error:
+        raise RecordError("malformed", str(error)) from error
 
 
 def read_json(text: bytes, limit: int) -> dict[str, Any]:
@@ -257,12 +257,6 @@ def read_json(text: bytes, limit: int) -> dict[str, Any]:
 
 def _no_constant(text: str) -> float:
     raise ValueError(text)
-
-
-def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < COUNT_LIMIT:
-        raise RecordError("malformed", "a count that is none")
-    return value
 
 
 def to_plain(signed: SignedRecord) -> dict[str, str]:

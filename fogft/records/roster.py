@@ -9,20 +9,18 @@ Not here: who may write them (`records`) and which one stands (`record_set`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from fogft.errors import StateError
 from fogft.model.credentials import Holder, holder_of
 from fogft.model.membership import from_content
-from fogft.model.names import gateway_slot, is_endpoint
-from fogft.model.plain import Moment, from_plain, to_plain, within
+from fogft.model.names import EndpointOrEmpty, gateway_slot
+from fogft.model.plain import Line, Moment, to_plain, within
 from fogft.model.replica import Member, Membership, ReplicaId
-from fogft.records.record import COUNT_LIMIT, Record, RecordError, RecordKind
+from fogft.records.record import Record, RecordError, RecordKind, read
 
-SERVICES_LIMIT = 256
-NAME_LIMIT = 256
 LEASE_LIMIT_S = 366 * 86_400.0
 
 
@@ -36,26 +34,13 @@ class SlotState:
         dials_out: It cannot be reached: it dials robots and gateways itself.
         services: Names of the services that it can answer now.
         draining: It asked to be left alone.
-        in_flight: Requests that it holds.
     """
 
-    endpoint: str = ""
-    observed_endpoint: str = ""
+    endpoint: EndpointOrEmpty = ""
+    observed_endpoint: EndpointOrEmpty = ""
     dials_out: bool = False
-    services: tuple[str, ...] = ()
+    services: tuple[Line, ...] = ()
     draining: bool = False
-    in_flight: int = 0
-
-    def to_content(self) -> dict[str, Any]:
-        """Return it as a record's content."""
-        return {
-            "endpoint": self.endpoint,
-            "observed_endpoint": self.observed_endpoint,
-            "dials_out": self.dials_out,
-            "services": list(self.services),
-            "draining": self.draining,
-            "in_flight": self.in_flight,
-        }
 
 
 @dataclass(frozen=True)
@@ -75,12 +60,12 @@ class ServingLease:
 class DialIn:
     """Where replicas that cannot be reached may dial a robot or a gateway; empty for nowhere."""
 
-    endpoint: str = ""
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    dial_in: EndpointOrEmpty = ""
 
-    def to_content(self) -> dict[str, Any]:
-        """Return it as a record's content."""
-        return {**self.extra, "dial_in": self.endpoint}
+
+@dataclass(frozen=True)
+class _Revoked:
+    names: tuple[Annotated[str, holder_of], ...]
 
 
 def slot_state(record: Record) -> SlotState:
@@ -89,18 +74,7 @@ def slot_state(record: Record) -> SlotState:
     Raises:
         RecordError: Its content is none.
     """
-    raw = record.content
-    services = raw.get("services")
-    if not isinstance(services, list) or len(services) > SERVICES_LIMIT:
-        raise RecordError("malformed", "services that are no list")
-    return SlotState(
-        endpoint=_endpoint(raw.get("endpoint")),
-        observed_endpoint=_endpoint(raw.get("observed_endpoint")),
-        dials_out=_truth(raw.get("dials_out")),
-        services=tuple(_name(name) for name in services),
-        draining=_truth(raw.get("draining")),
-        in_flight=_count(raw.get("in_flight")),
-    )
+    return read(SlotState, record.content)
 
 
 def dial_in(record: Record) -> str:
@@ -109,7 +83,7 @@ def dial_in(record: Record) -> str:
     Raises:
         RecordError: Its content is none.
     """
-    return _endpoint(record.content.get("dial_in", ""))
+    return read(DialIn, record.content).dial_in
 
 
 def admission_content(membership: Membership) -> dict[str, Any]:
@@ -137,13 +111,7 @@ def revoked_names(record: Record) -> frozenset[str]:
     Raises:
         RecordError: Its content is none.
     """
-    listed = record.content.get("names")
-    if not isinstance(listed, list):
-        raise RecordError("malformed", "names that are no list")
-    try:
-        holders = [holder_of(name) for name in listed]
-    except (ValueError, TypeError, AttributeError):
-        raise RecordError("malformed", "names that are none") from None
+    holders = [holder_of(name) for name in read(_Revoked, record.content).names]
     if any(holder.pool_uid != record.pool_uid for holder in holders):
         raise RecordError("malformed", "names of another pool")
     return frozenset(holder.common_name for holder in holders)
@@ -155,10 +123,7 @@ def lease(record: Record) -> ServingLease:
     Raises:
         RecordError: Its content is none.
     """
-    try:
-        return from_plain(ServingLease, record.content)
-    except ValueError as error:
-        raise RecordError("malformed", str(error)) from error
+    return read(ServingLease, record.content)
 
 
 def check_content(record: Record) -> None:
@@ -167,16 +132,17 @@ def check_content(record: Record) -> None:
     Raises:
         RecordError: It cannot.
     """
-    if record.kind is RecordKind.ADMISSION:
-        admission(record)
-    elif record.kind is RecordKind.REVOCATION:
-        revoked_names(record)
-    elif record.kind is RecordKind.LEASE:
-        lease(record)
-    elif record.kind is RecordKind.SLOT:
-        slot_state(record)
-    elif record.kind in (RecordKind.ROBOT, RecordKind.GATEWAY):
-        dial_in(record)
+    _READERS[record.kind](record)
+
+
+_READERS: dict[RecordKind, Callable[[Record], object]] = {
+    RecordKind.ADMISSION: admission,
+    RecordKind.REVOCATION: revoked_names,
+    RecordKind.LEASE: lease,
+    RecordKind.SLOT: slot_state,
+    RecordKind.ROBOT: dial_in,
+    RecordKind.GATEWAY: dial_in,
+}
 
 
 def located(membership: Membership, slots: Iterable[Record]) -> Membership:
@@ -220,29 +186,3 @@ def _located(member: Member, state: SlotState | None) -> Member:
     endpoint = state.endpoint or member.endpoint or state.observed_endpoint
     draining = member.draining or state.draining
     return replace(member, endpoint="" if state.dials_out else endpoint, draining=draining)
-
-
-def _endpoint(value: Any) -> str:
-    if not isinstance(value, str) or len(value) > NAME_LIMIT or not value.isprintable():
-        raise RecordError("malformed", "an endpoint that is none")
-    if value and not is_endpoint(value):
-        raise RecordError("malformed", "an endpoint that is not host:port")
-    return value
-
-
-def _truth(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise RecordError("malformed", "neither true nor false")
-    return value
-
-
-def _name(value: Any) -> str:
-    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= NAME_LIMIT:
-        raise RecordError("malformed", "a name that is none")
-    return value
-
-
-def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < COUNT_LIMIT:
-        raise RecordError("malformed", "a count that is none")
-    return value

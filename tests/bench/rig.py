@@ -24,13 +24,13 @@ from typing import Any
 
 from fogft import disk
 from fogft.model import membership as memberships
-from fogft.model import names
 from fogft.model.plain import to_plain
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
 from fogft.pool.credentials import authority
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
+from tests import certificate_names
 from tests.bench.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
 from tests.hostile.orders import HOSTILE
 
@@ -252,7 +252,7 @@ class Rig:
         self._issue(
             "robot",
             "robot",
-            names.robot_certificate_name(self._uid, "bench"),
+            certificate_names.robot(self._uid, "bench"),
             authority.Role.ROBOT,
         )
         self._write_policy()
@@ -309,7 +309,7 @@ class Rig:
         folder = self.floor_folder
         for stem, name, role in (
             ("replica", id.certificate_name, authority.Role.REPLICA),
-            ("robot", names.robot_certificate_name(self._uid, "floor"), authority.Role.ROBOT),
+            ("robot", certificate_names.robot(self._uid, "floor"), authority.Role.ROBOT),
         ):
             self._issue(folder.name, stem, name, role)
         self._start("floor", "tests.bench.floor", str(folder), str(port))

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from fogft.cli import main
-from fogft.model import names
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.pool.commands import composition
 from fogft.pool.credentials import authority, bundle
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, write_identity
+from tests import certificate_names
 
 UID = "0123456789abcdef"
 POOL_FILE = """
@@ -108,7 +108,7 @@ def test_the_list_shows_states_and_no_key(paths, capsys):
 
 def test_revoking_what_is_known_to_all_says_so(paths, capsys):
     issue_ada(capsys)
-    revoked = frozenset({names.robot_certificate_name(UID, "ada")})
+    revoked = frozenset({certificate_names.robot(UID, "ada")})
     membership = Membership("planner", UID, 1, 1, (Member(ReplicaId(UID, 0, 1), "h:1"),), revoked)
     composition.make_store("planner").write_membership(membership)
     assert run("credentials", "revoke", "robot", "ada") == 0

@@ -9,7 +9,6 @@ from subprocess import DEVNULL, Popen
 
 import pytest
 
-from fogft.pool.folder.lease import read_pid
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager.process_control import lock_holder
 from tests.e2e.pool import Pool
@@ -28,7 +27,7 @@ def pids(pool: Pool) -> list[int]:
     [folder] = (pool.folder / "home" / "pools").iterdir()
     paths = PoolPaths(folder)
     standby = pool.wait(lambda: lock_holder(paths.standby_lock), 30)
-    manager, proxy = read_pid(paths), pool.status()["proxy_pid"]
+    manager, proxy = lock_holder(paths.manager_lock), pool.status()["proxy_pid"]
     assert manager is not None
     return [manager, proxy, standby]
 

@@ -37,7 +37,7 @@ from fogft.pool.commands.composition import make_store
 from fogft.pool.commands.status import ask
 from fogft.pool.credentials import authority, claiming
 from fogft.pool.credentials.ledger import Ledger
-from fogft.pool.folder import lease
+from fogft.pool.folder.lease import Lease
 from fogft.pool.folder.paths import PoolPaths, latency_file
 from fogft.pool.manager.distances import Latencies
 from fogft.pool.manager.status import EventStatus
@@ -62,7 +62,7 @@ def _lay_down(home: Path) -> PoolPaths:
     disk.write_json(paths.trial, to_plain(Trial()))
     members = Membership(NAME, UID, 1, 1, (Member(ID, "h:1"),))
     disk.write_json(paths.membership, to_dict(members))
-    disk.write_json(paths.lease, {"epoch": 1, "pid": 4711, "beat": 3})
+    disk.write_json(paths.lease, {"epoch": 1, "beat": 3})
     disk.write_json(paths.discovered, to_plain(Discovered("0" * 16, {"/a": "a/srv/B"})))
     events = [
         Event(now, EventKind.LAUNCH, 0, 1, PLACE.location),
@@ -87,7 +87,7 @@ def _pool(paths: PoolPaths) -> None:
         store.good,
         store.intent,
         store.membership,
-        lambda: lease.read_pid(paths),
+        lambda: Lease.take(paths).release(),
         lambda: records_cache.read(paths.records),
         lambda: Ledger(paths.credentials).by_hand(),
         lambda: Ledger(paths.credentials).gateways(),

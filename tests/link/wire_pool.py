@@ -22,6 +22,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Role
+from tests import certificate_names
 from tests.freezing import freeze
 
 POOL_UID = "0123456789abcdef"
@@ -55,7 +56,7 @@ class Authority:
         )
 
     def robot(self, name: str = "robot", generation: int = 1) -> CredentialPaths:
-        name = names.robot_certificate_name(POOL_UID, name, generation)
+        name = certificate_names.robot(POOL_UID, name, generation)
         return self.issue(name, Role.ROBOT)
 
     def replica(self, slot: int = 0, generation: int = 1) -> CredentialPaths:

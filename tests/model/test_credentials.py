@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.model import names
-from fogft.model.credentials import GENERATION_LIMIT, NAME_PATTERN, Holder, Role, holder_of
+from fogft.model.credentials import NAME_PATTERN, Holder, Role, holder_of
 from fogft.model.replica import ReplicaId
+from tests import certificate_names
 
 UID, OTHER = "0123456789abcdef", "f" * 16
 uids = st.sampled_from([UID, OTHER])
-generations = st.integers(1, GENERATION_LIMIT)
+generations = st.integers(1, 999_999)
 holders = st.one_of(
     st.builds(
         Holder,
@@ -43,10 +43,10 @@ def test_any_text_is_a_holder_or_a_value_error(text: str) -> None:
 
 def test_the_names_that_both_ends_derive_are_holders() -> None:
     assert holder_of(ReplicaId(UID, 3, 7).certificate_name).short == "3.7"
-    assert holder_of(names.robot_certificate_name(UID, "ada", 2)).short == "ada.2"
-    assert holder_of(names.gateway_certificate_name(UID, "edge")).role is Role.GATEWAY
-    assert holder_of(names.rendezvous_certificate_name(UID, "port")).role is Role.RENDEZVOUS
-    assert holder_of(names.manager_certificate_name(UID)).role is Role.MANAGER
+    assert holder_of(certificate_names.robot(UID, "ada", 2)).short == "ada.2"
+    assert holder_of(certificate_names.gateway(UID, "edge")).role is Role.GATEWAY
+    assert holder_of(certificate_names.rendezvous(UID, "port")).role is Role.RENDEZVOUS
+    assert holder_of(certificate_names.manager(UID)).role is Role.MANAGER
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from typing import Any
 from fogft import disk
 from fogft.pool.commands import startup
 from fogft.pool.folder.paths import PoolPaths
-from fogft.pool.folder.store import PoolStore, write_identity
+from fogft.pool.folder.store import Identity, PoolStore, write_identity
 from fogft.pool.manager import shutdown
 from fogft.poolfile import file as pool_file
 from tests.pool.folder_cloud import FolderCloud
@@ -54,7 +54,7 @@ class Scene:
 
     def write(
         self, *, replicas: int = 2, timeout_s: float = 5.0, max_hours: float = 100.0
-    ) -> startup.Written:
+    ) -> Identity:
         """Do what `up` does with files."""
         source = FILE.format(replicas=replicas, timeout_s=timeout_s, max_hours=max_hours)
         self.file.write_text(source)

@@ -11,10 +11,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from fogft.model import membership, names
+from fogft.model import membership
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Topology
 from fogft.pool.credentials import authority
+from tests import certificate_names
 from tests.ports import free_port
 
 UID = "0123456789abcdef"
@@ -151,7 +152,7 @@ class Robot:
         self._status = parts.folder / f"{name}-status.json"
         self.config = parts.folder / f"{name}.yaml"
         self.domain = parts.domain()
-        parts.issue(names.robot_certificate_name(UID, name), authority.Role.ROBOT, name)
+        parts.issue(certificate_names.robot(UID, name), authority.Role.ROBOT, name)
         self.config.write_text(
             f'pool: p\npool_uid: "{UID}"\nrobot: {name}\nmembership: {self._members.name}\n'
             f"status: {self._status.name}\nlock: {name}.lock\n"

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from fogft.child import tied
-from fogft.model import membership, names
+from fogft.model import membership
 from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Gateway, RobotRoute, Topology
+from tests import certificate_names
 from tests.link.namespaces import inside
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
 from tests.ports import free_port
@@ -80,7 +81,7 @@ class GatewayPool:
     def gateway(
         self, name: str, *, listen: str = "", where: str = "", generation: int = 1, extra: str = ""
     ) -> Process:
-        common_name = names.gateway_certificate_name(POOL_UID, name, generation)
+        common_name = certificate_names.gateway(POOL_UID, name, generation)
         return Process(
             self, name, "gateway", self.authority.issue(common_name, Role.GATEWAY),
             extra=f"listen: {listen or f'127.0.0.1:{free_port()}'}\n{extra}", where=where,

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fogft.model.replica import ReplicaId
-from fogft.proxy.announcing import LOAD_EVERY_S, Announcer, doors
+from fogft.proxy.announcing import Announcer, doors
 from fogft.records.client import Known
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import slot_state
@@ -33,47 +33,36 @@ class Records:
 
 class Scene:
     def __init__(self, **given: Any) -> None:
-        self.now = 0.0
         self.records = Records()
         how: dict[str, Any] = {"endpoint": "", "port": 7447, "dials_out": False, **given}
-        self._announcer = Announcer(
-            ReplicaId(UID, 1000, 3), self.records, clock=lambda: self.now, **how
-        )
+        self._announcer = Announcer(ReplicaId(UID, 1000, 3), self.records, **how)
 
-    def look(self, *ready: str, draining: bool = False, in_flight: int = 0) -> bool:
-        return self._announcer.look(frozenset(ready), draining=draining, in_flight=in_flight)
+    def look(self, *ready: str, draining: bool = False) -> bool:
+        return self._announcer.look(frozenset(ready), draining=draining)
 
 
 def test_it_writes_its_own_slot_and_launch_and_no_other():
     scene = Scene()
-    for step in range(5):
-        scene.now += LOAD_EVERY_S
-        scene.look("/plan", in_flight=step)
+    for service in ("/plan", "/move", "/look"):
+        assert scene.look(service)
     assert scene.records.keys == {(RecordKind.SLOT, "1000", 3)}
 
 
-def test_endpoint_services_state_and_load_are_said_as_they_change():
+def test_endpoint_services_and_state_are_said_as_they_change():
     scene = Scene()
     assert scene.look()
     assert scene.look("/plan")
     assert scene.look("/plan", draining=True)
-    scene.now += LOAD_EVERY_S
-    assert scene.look("/plan", draining=True, in_flight=7)
     said = scene.records.said
-    assert [one["services"] for one in said] == [[], ["/plan"], ["/plan"], ["/plan"]]
-    assert [one["draining"] for one in said] == [False, False, True, True]
-    assert [one["in_flight"] for one in said] == [0, 0, 0, 7]
+    assert [one["services"] for one in said] == [[], ["/plan"], ["/plan"]]
+    assert [one["draining"] for one in said] == [False, False, True]
 
 
-def test_nothing_is_said_twice_and_the_load_alone_only_now_and_then():
+def test_nothing_is_said_twice():
     scene = Scene()
     scene.look("/plan")
     assert not scene.look("/plan")
-    scene.now += LOAD_EVERY_S / 2
-    assert not scene.look("/plan", in_flight=9)
-    scene.now += LOAD_EVERY_S / 2
-    assert scene.look("/plan", in_flight=9)
-    assert len(scene.records.said) == 2
+    assert len(scene.records.said) == 1
 
 
 @pytest.mark.parametrize(("host", "seen"), [("10.0.0.7", "10.0.0.7"), ("fd00::7", "[fd00::7]")])

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from fogft.model import membership, names
+from fogft.model import membership
 from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
 from fogft.ros import environment
+from tests import certificate_names
 from tests.needs import needs
 from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
 
@@ -41,8 +42,8 @@ class Pool(Parts):
     def __init__(self, folder: Path, domain: Callable[[], int]) -> None:
         super().__init__(folder, domain, services=SERVICES)
         self.meeting = free_endpoint()
-        self.issue(names.rendezvous_certificate_name(UID, "a"), Role.RENDEZVOUS, "rendezvous")
-        self.issue(names.manager_certificate_name(UID), Role.MANAGER, "manager")
+        self.issue(certificate_names.rendezvous(UID, "a"), Role.RENDEZVOUS, "rendezvous")
+        self.issue(certificate_names.manager(UID), Role.MANAGER, "manager")
         self._place = folder / "rendezvous.yaml"
         self._place.write_text(
             f'pool_uid: "{UID}"\nlisten: {self.meeting}\nrecords: place.json\n'

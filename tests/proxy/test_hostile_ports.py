@@ -28,6 +28,7 @@ from fogft.records import frames
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import admission_content
 from fogft.records.signing import Signer
+from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, hears, knows, wait_for
 from tests.ports import free_port
 from tests.proxy.gateway_pool import GatewayPool
@@ -96,13 +97,13 @@ class Scene:
 
     def session(self, files: CredentialPaths) -> zenoh.Session:
         """Return the bare session of somebody whose certificate lets him ask the gateway."""
-        name = names.gateway_certificate_name(POOL_UID, "edge")
+        name = certificate_names.gateway(POOL_UID, "edge")
         peer = Peer(ReplicaId(POOL_UID, SLOT, 1), self.port, name)
         return zenoh.open(settings.to_zenoh(settings.robot_settings(peer, files, LinkSettings())))
 
     def greeting(self, files: CredentialPaths) -> bytes:
         token = bytes(range(8))
-        edge = names.gateway_certificate_name(POOL_UID, "edge")
+        edge = certificate_names.gateway(POOL_UID, "edge")
         proof = Signer(files.certificate, files.key)(frame.greeted_bytes(token, edge))
         return frame.encode_greeting(frame.Greeting(token, *proof))
 
@@ -176,8 +177,8 @@ def _manager(
 def test_a_replayed_membership_at_a_gateways_port(scene):
     """A robot brings old ones of the manager's, and revocations of its own making."""
     eve, manager = scene.authority.robot("eve"), manager_files(scene.authority)
-    revoked = {"names": [names.robot_certificate_name(POOL_UID, "gone")]}
-    all = {"names": [names.robot_certificate_name(POOL_UID, "ada")]}
+    revoked = {"names": [certificate_names.robot(POOL_UID, "gone")]}
+    all = {"names": [certificate_names.robot(POOL_UID, "ada")]}
     nobody = admission_content(Membership("p", POOL_UID, 1, 1, ()))
     elsewhere = Member(ReplicaId(POOL_UID, 0, 1), "127.0.0.1:1")
     admitted = admission_content(Membership("p", POOL_UID, 1, 2, (elsewhere,)))

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from fogft.model import names
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Gateway, RobotRoute, Topology
 from fogft.records import cache
 from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
+from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, wait_for
 from tests.ports import free_port
 from tests.proxy.gateway_pool import GatewayPool, Process, ServerProxy
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.timeout(480)
 
 LIMIT_S = 150.0
 ID = ReplicaId(POOL_UID, 0, 1)
-EVE = names.robot_certificate_name(POOL_UID, "eve")
+EVE = certificate_names.robot(POOL_UID, "eve")
 
 
 class Scene:

@@ -19,7 +19,7 @@ from fogft.records.record_set import RecordSet, Verdict
 from fogft.records.roster import SlotState
 from tests.records import record_worlds as world
 
-_TOKENS = [b"null", b"true", b"-1", b"1e999", b"NaN", b'""', b"[]", b"{}", b'"v":2', b"\\ud800",
+_TOKENS = [b"null", b"true", b"-1", b"1e999", b"NaN", b'""', b"[]", b"{}", b'"v":3', b"\\ud800",
            b"9" * 25, b"\x00", b"\xff", b",", b"}", b"]", b"[" * 50, b'{"a":' * 50]  # fmt: skip
 
 
@@ -27,7 +27,7 @@ def seeds() -> list[bytes]:
     """Return good inputs: bodies, messages, and whole streams."""
     records = [
         world.admission(3, 4, world.member(0, 1, "10.0.0.1:7447"), world.member(1, 2)),
-        world.slot(0, 1, 2, SlotState("10.0.0.1:1", "10.0.0.2:2", True, ("/a", "/b"), False, 3)),
+        world.slot(0, 1, 2, SlotState("10.0.0.1:1", "10.0.0.2:2", True, ("/a", "/b"), False)),
         world.revocation(1, f"robot.eve.1.{world.UID}"),
     ]
     digest = {("slot", "0"): (1, 2), ("admission", ""): (3, 4)}

@@ -23,6 +23,7 @@ from fogft.records import frames
 from fogft.records.record import Record as Statement
 from fogft.records.record import SignedRecord, sign_record
 from fogft.records.signing import Signer
+from tests import certificate_names
 from tests.link.wire_pool import LIMIT_S, POOL_UID, Authority, request_id
 
 HELLO = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"  # how a TLS handshake begins
@@ -69,9 +70,9 @@ def certificates(authority: Authority, stranger: Authority) -> Iterator[Credenti
     yield None
     yield stranger.robot()
     yield authority.replica(1)
-    yield authority.issue(names.rendezvous_certificate_name(POOL_UID, "a"), Role.RENDEZVOUS)
-    yield authority.issue(names.manager_certificate_name(POOL_UID), Role.MANAGER)
-    yield authority.issue(names.robot_certificate_name(POOL_UID, "old"), Role.ROBOT, days=-0.5)
+    yield authority.issue(certificate_names.rendezvous(POOL_UID, "a"), Role.RENDEZVOUS)
+    yield authority.issue(certificate_names.manager(POOL_UID), Role.MANAGER)
+    yield authority.issue(certificate_names.robot(POOL_UID, "old"), Role.ROBOT, days=-0.5)
 
 
 def is_turned_away(endpoint: str, context: ssl.SSLContext) -> None:
@@ -120,7 +121,7 @@ def messages(slot: int, service_key: str) -> Iterator[tuple[Send, bytes, bytes |
     for payload in (b"", b"\x07", bytes(100_000)):
         yield _published(cancel), payload, None
     token = frame.encode_greeting(frame.Greeting(bytes(8)))
-    for payload in (b"", b"{}", b'{"v":9,"records":[]}', b'{"v":1,"records":[7]}', bytes(300_000)):
+    for payload in (b"", b"{}", b'{"v":9,"records":[]}', b'{"v":2,"records":[7]}', bytes(300_000)):
         yield records, payload, token
 
 

@@ -6,6 +6,7 @@ import hashlib
 
 from hypothesis import strategies as st
 
+from fogft.model.plain import to_plain
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import (
     Record,
@@ -42,7 +43,8 @@ def verify(certificate: bytes, signature: bytes, message: bytes) -> Writer:
 
 def signed(record: Record) -> SignedRecord:
     """Return a record signed by the one who may write it."""
-    return sign_record(record, signer(*expected_writer(record)))
+    writer = expected_writer(record)
+    return sign_record(record, signer(writer.role.value, writer.common_name))
 
 
 def admission(epoch: int, version: int, *members: Member) -> SignedRecord:
@@ -54,7 +56,7 @@ def admission(epoch: int, version: int, *members: Member) -> SignedRecord:
 def slot(
     number: int, generation: int, sequence: int, state: SlotState | None = None
 ) -> SignedRecord:
-    content = (state or SlotState()).to_content()
+    content = to_plain(state or SlotState())
     record = Record(UID, RecordKind.SLOT, str(number), generation, sequence, content)
     return signed(record)
 
@@ -76,7 +78,6 @@ states = st.builds(
     dials_out=st.booleans(),
     services=st.lists(st.sampled_from(["/a", "/b"]), unique=True).map(tuple),
     draining=st.booleans(),
-    in_flight=st.integers(0, 5),
 )
 counts = st.integers(0, 4)
 members = st.lists(
@@ -91,6 +92,7 @@ records = st.one_of(
         counts,
     ),
     st.builds(
-        lambda n: signed(Record(UID, RecordKind.TOPOLOGY, "", 1, n, {"gateways": []})), counts
+        lambda n: signed(Record(UID, RecordKind.LEASE, "", 1, n, {"at": 1.0, "lasts_s": 60.0})),
+        counts,
     ),
 )

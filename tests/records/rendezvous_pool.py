@@ -10,13 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fogft.model import names
 from fogft.model.credentials import CredentialPaths
+from fogft.model.plain import to_plain
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.pool.credentials.authority import Role
 from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind
 from fogft.records.roster import SlotState, admission, admission_content, located
+from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.ports import free_port
 
@@ -30,7 +31,7 @@ class Rendezvous:
         self, authority: Authority, name: str, *, files: CredentialPaths | None = None,
         endpoint: str = "", prefix: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        common_name = names.rendezvous_certificate_name(POOL_UID, name)
+        common_name = certificate_names.rendezvous(POOL_UID, name)
         files = files or authority.issue(common_name, Role.RENDEZVOUS)
         self.folder = authority.folder / f"rendezvous-{name}"
         self.folder.mkdir(exist_ok=True)
@@ -111,7 +112,7 @@ class Party:
 
     def announce(self, slot: int, generation: int, endpoint: str) -> None:
         """Speak as a replica: say where it is."""
-        content = SlotState(endpoint=endpoint).to_content()
+        content = to_plain(SlotState(endpoint=endpoint))
         self.client.publish(RecordKind.SLOT, str(slot), generation, content)
 
     def orders(self) -> dict[tuple[str, str], tuple[int, int]]:
@@ -119,4 +120,4 @@ class Party:
 
 
 def manager_files(authority: Authority) -> CredentialPaths:
-    return authority.issue(names.manager_certificate_name(POOL_UID), Role.MANAGER)
+    return authority.issue(certificate_names.manager(POOL_UID), Role.MANAGER)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Membership
 from fogft.pool.credentials.authority import Role
@@ -19,6 +18,7 @@ from fogft.records import cache as record_cache
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
 from fogft.records.roster import admission_content
 from fogft.records.signing import Signer
+from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.ports import free_port
 from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
@@ -269,7 +269,7 @@ def test_what_a_certificate_signed_outlives_it_in_the_cache_only(
 ):
     """A manager dead for a year stops no robot that knew it, and tells nobody anything new."""
     cache, place = tmp_path / "records.json", rendezvous()
-    name = names.manager_certificate_name(POOL_UID)
+    name = certificate_names.manager(POOL_UID)
     expired = authority.issue(name, Role.MANAGER, days=-0.5)
     content = admission_content(Membership("p", POOL_UID, 1, 1, ()))
     record = Record(POOL_UID, RecordKind.ADMISSION, "", 1, 1, content)

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.model import names
+from fogft.model import plain
 from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Membership
 from fogft.pool.credentials.authority import Role
@@ -34,6 +34,7 @@ from fogft.records.record import (
 from fogft.records.roster import SlotState, admission_content
 from fogft.records.server import PURPOSE, binding_of
 from fogft.records.signing import Signer
+from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.records import fuzz_records
 from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
@@ -144,11 +145,11 @@ def test_random_bytes_before_and_after_tls(scene):
     ("message", "event"),
     [
         (struct.pack(">I", 2**32 - 1), "greeting_malformed"),
-        (frames.frame({"type": "greeting", "v": 2}), "greeting_version"),
-        (frames.frame({"type": "greeting", "v": 1, "certificate": "zz", "signature": "00"}),
+        (frames.frame({"type": "greeting", "v": 3}), "greeting_version"),
+        (frames.frame({"type": "greeting", "v": 2, "certificate": "zz", "signature": "00"}),
          "greeting_malformed"),
         (frames.frame({"type": "records", "records": []}), "greeting_malformed"),
-        (frames.frame({"type": "greeting", "v": 1, "certificate": "00", "signature": "00"}) * 2,
+        (frames.frame({"type": "greeting", "v": 2, "certificate": "00", "signature": "00"}) * 2,
          "greeting_malformed"),
     ],
 )  # fmt: skip
@@ -170,16 +171,16 @@ def _stranger(authority: Authority, folder: Path) -> CredentialPaths:
 
 
 def _expired(authority: Authority, folder: Path) -> CredentialPaths:
-    name = names.robot_certificate_name(POOL_UID, "old")
+    name = certificate_names.robot(POOL_UID, "old")
     return authority.issue(name, Role.ROBOT, days=-0.5)
 
 
 def _rendezvous(authority: Authority, folder: Path) -> CredentialPaths:
-    return authority.issue(names.rendezvous_certificate_name(POOL_UID, "x"), Role.RENDEZVOUS)
+    return authority.issue(certificate_names.rendezvous(POOL_UID, "x"), Role.RENDEZVOUS)
 
 
 def _of_another_pool(authority: Authority, folder: Path) -> CredentialPaths:
-    return authority.issue(names.robot_certificate_name("f" * 16, "r"), Role.ROBOT)
+    return authority.issue(certificate_names.robot("f" * 16, "r"), Role.ROBOT)
 
 
 @pytest.mark.parametrize(
@@ -225,7 +226,7 @@ def test_a_member_may_write_nothing_but_its_own(scene):
     """A stolen replica's key: it tries another slot, another generation, the manager's records."""
     thief = scene.authority.replica(0, 1)
     admission = admission_content(Membership("p", POOL_UID, 9, 9, ()))
-    slot = SlotState(endpoint="6.6.6.6:6").to_content()
+    slot = plain.to_plain(SlotState(endpoint="6.6.6.6:6"))
     forged = [
         Record(POOL_UID, RecordKind.SLOT, "1", 1, 9, slot),
         Record(POOL_UID, RecordKind.SLOT, "0", 2, 9, slot),
@@ -252,7 +253,7 @@ def test_replayed_and_damaged_records_change_nothing(scene):
             (replace(newer, body=newer.body.replace(b'"sequence":4', b'"sequence":9')),
              "refused_forged"),
             (replace(newer, body=newer.body[:-5]), "refused_malformed"),
-            (replace(newer, body=newer.body.replace(b'"v":1', b'"v":3')), "refused_version"),
+            (replace(newer, body=newer.body.replace(b'"v":2', b'"v":3')), "refused_version"),
             (replace(newer, signature=bytes(70)), "refused_forged"),
             (replace(newer, certificate=os.urandom(700)), "refused_malformed"),
             (_signed(manager, stranger), "refused_pool"),
@@ -347,7 +348,7 @@ def test_a_caller_survives_whatever_answers(authority):
             writer.close()
 
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        own = authority.issue(names.rendezvous_certificate_name(POOL_UID, "n"), Role.RENDEZVOUS)
+        own = authority.issue(certificate_names.rendezvous(POOL_UID, "n"), Role.RENDEZVOUS)
         context.load_cert_chain(own.certificate, own.key)
         for tls in (None, context):
             server = await asyncio.start_server(talk, "127.0.0.1", 0, ssl=tls)
@@ -409,7 +410,7 @@ def test_what_is_framed_is_read_however_it_is_cut(parts):
 def test_large_sets_travel_in_small_frames(authority):
     manager = manager_files(authority)
     all = [
-        _signed(manager, Record(POOL_UID, RecordKind.TOPOLOGY, "", 1, n, {"x": "y" * 40_000}))
+        _signed(manager, Record(POOL_UID, RecordKind.ADMISSION, "", 1, n, {"x": "y" * 40_000}))
         for n in range(9)
     ]
     unframer, found = frames.Unframer(), []

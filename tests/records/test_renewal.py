@@ -10,12 +10,12 @@ import pytest
 
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState
 from fogft.pool.credentials.authority import Role
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
 from fogft.records.signing import Signer
+from tests import certificate_names
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -60,7 +60,7 @@ class Caller(threading.Thread):
 
 
 def _revoke(replica: ReplicaProcess, generation: int) -> None:
-    replica.ask(revoke=[names.robot_certificate_name(POOL_UID, "ada", generation)])
+    replica.ask(revoke=[certificate_names.robot(POOL_UID, "ada", generation)])
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.2])
@@ -132,7 +132,7 @@ def test_a_revoked_robot_is_shut_out_and_told_why_while_another_goes_on(
     replica = start_replica()
     eve, ada = dial(replica.endpoint, robot="eve"), dial(replica.endpoint, robot="ada")
     wait_for(lambda: eve.usable and ada.usable)
-    replica.ask(revoke=[names.robot_certificate_name(POOL_UID, "eve")])
+    replica.ask(revoke=[certificate_names.robot(POOL_UID, "eve")])
     eve.offer(SERVICE, request_id(1), b"x", 20.0)
     wait_for(lambda: owner.of(1) and not eve.usable)
     assert owner.of(1)[0].payload is None
@@ -166,12 +166,12 @@ def test_a_robot_passes_the_managers_revocation_on_and_no_other(
     try:
         ada = dialer.dial(peer(replica.endpoint), keys(0), owner)
         wait_for(lambda: ada.usable and eve.usable)
-        bad = names.robot_certificate_name(POOL_UID, "eve")
+        bad = certificate_names.robot(POOL_UID, "eve")
         for number, signer in enumerate((authority.robot("mallory"), authority.replica(1)), 1):
             dialer.tell([_revocation(signer, bad)])
             wait_for(lambda number=number: replica.count("records_refused") == number)  # type: ignore[misc]
         assert replica.count("not_admitted") == 0
-        manager = authority.issue(names.manager_certificate_name(POOL_UID), Role.MANAGER)
+        manager = authority.issue(certificate_names.manager(POOL_UID), Role.MANAGER)
         dialer.tell([_revocation(manager, bad)])
         wait_for(lambda: eve.status().detail == "our certificate is revoked")
         assert ada.usable

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from fogft.child import tied
-from fogft.model import names
 from fogft.model.replica import Member, ReplicaId
+from tests import certificate_names
 from tests.link.namespaces import Namespaces, inside
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import POOL_UID
@@ -144,7 +144,7 @@ class World(GatewayPool):
         """Whether a robot reports every replica ready, every way to them, and its present name."""
         wanted = {(m.id.slot, m.id.generation) for m in self.machines}
         seen = {(li["slot"], li["generation"]) for li in report["links"] if li["ready"]}
-        own = names.robot_certificate_name(POOL_UID, name, self.generations[name])
+        own = certificate_names.robot(POOL_UID, name, self.generations[name])
         if seen != wanted or report["certificate"] != own:
             return False
         if name == "bob":

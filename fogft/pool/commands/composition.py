@@ -10,8 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fogft.errors import CloudError
-from fogft.pool.folder import known_pools
+from fogft.errors import CloudError, PoolNotFound
 from fogft.pool.folder.paths import PoolPaths, home
 
 if TYPE_CHECKING:
@@ -26,7 +25,11 @@ CLOUDS = (LOCAL, SKY)
 
 def pools() -> list[str]:
     """Return the names of the pools on this machine, sorted."""
-    return known_pools.names(home())
+    try:
+        folders = list((home() / "pools").iterdir())
+    except FileNotFoundError:
+        return []
+    return sorted(one.name for one in folders if PoolPaths(one).identity.exists())
 
 
 def paths_of(name: str | None = None) -> PoolPaths:
@@ -35,7 +38,16 @@ def paths_of(name: str | None = None) -> PoolPaths:
     Raises:
         PoolNotFound: There is no such pool, none, or more than one to choose from.
     """
-    return PoolPaths.of(known_pools.meant(home(), name))
+    known = pools()
+    listed = ", ".join(f"`{pool}`" for pool in known)
+    if name is None and len(known) > 1:
+        raise PoolNotFound(f"there are {len(known)} pools: {listed}", "say which one you mean")
+    if name is not None and name not in known:
+        hint = f"there are: {listed}" if known else "start one with `fogft up FILE`"
+        raise PoolNotFound(f"there is no pool `{name}`", hint)
+    if not known:
+        raise PoolNotFound("no pools on this machine", "start one with `fogft up FILE`")
+    return PoolPaths.of(name or known[0])
 
 
 def store_of(name: str | None = None) -> PoolStore:

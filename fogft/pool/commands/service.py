@@ -195,7 +195,7 @@ def install(where: Services, units: Sequence[Unit], env_file: Path) -> list[str]
 def yield_to(paths: PoolPaths) -> None:
     """End the manager and the standby that systemd did not start: its own take their places."""
     for lock in (paths.manager_lock, paths.standby_lock):
-        process_control.end_holder(lock, suspected_pid=None)
+        process_control.end_holder(lock)
 
 
 def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:

@@ -14,7 +14,6 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from fogft import __version__, disk, logfile
@@ -27,26 +26,11 @@ from fogft.planning import lifetime
 from fogft.pool.commands.composition import make_store
 from fogft.pool.commands.preview import Order
 from fogft.pool.credentials import authority
-from fogft.pool.folder.lease import read_pid
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
 from fogft.pool.manager import process_control
 
 MANAGER_LIMIT_S = 20.0
-
-
-@dataclass(frozen=True)
-class Written:
-    """What `write` did.
-
-    Attributes:
-        created: The pool is new.
-        changed: Its file is not the one that was applied before.
-    """
-
-    identity: Identity
-    created: bool
-    changed: bool
 
 
 def start(order: Order) -> bool:
@@ -61,15 +45,8 @@ def start(order: Order) -> bool:
     return start_manager(store)
 
 
-def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: str) -> Written:
+def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: str) -> Identity:
     """Create a pool, or apply a changed file to it.
-
-    Args:
-        store: Of the pool named `spec.name`.
-        spec: The file, read and judged.
-        source: The file's text.
-        file: Its absolute path.
-        cloud: Where the pool runs.
 
     Raises:
         SpecError: A pool of this name was started from another file, or runs elsewhere.
@@ -95,10 +72,10 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
         store.write_intent(lifetime.revived(before, after, begun_at, time.time()))
         if old_source != source:
             disk.write_whole(paths.spec, source)
-        return Written(identity, created=False, changed=old_source != source)
+        return identity
 
 
-def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Written:
+def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Identity:
     paths = store.paths
     uid = secrets.token_hex(8)
     shutil.rmtree(paths.credentials, ignore_errors=True)  # of an `up` that was cut short
@@ -113,7 +90,7 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
     store.write_intent(Intent())
     identity = Identity(spec.name, uid, cloud, str(file), time.time())
     write_identity(paths, identity)
-    return Written(identity, created=True, changed=True)
+    return identity
 
 
 def _check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> None:
@@ -151,13 +128,13 @@ def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None =
     if disk.is_locked(paths.manager_lock):
         if manager_version(paths) in ("", __version__):
             return False
-        process_control.end_holder(paths.manager_lock, suspected_pid=read_pid(paths))
+        process_control.end_holder(paths.manager_lock)
     name = paths.folder.name
     words = command(name) if command else [sys.executable, "-m", "fogft", "manager", name]
     child = detached(words, paths.manager_log)
     end = time.monotonic() + MANAGER_LIMIT_S
     while time.monotonic() < end:
-        if read_pid(paths) == child.pid:
+        if process_control.lock_holder(paths.manager_lock) == child.pid:
             return True
         if child.poll() is not None:
             if disk.is_locked(paths.manager_lock):  # another `up` was faster

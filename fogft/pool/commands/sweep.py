@@ -18,8 +18,7 @@ from fogft import disk
 from fogft.cloud.port import Auditing, Cloud
 from fogft.errors import CloudError, FogftError, PoolNotFound
 from fogft.model.replica import Machine
-from fogft.pool.commands.composition import LOCAL, SKY, make_cloud
-from fogft.pool.folder import known_pools
+from fogft.pool.commands.composition import LOCAL, SKY, make_cloud, pools
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import read_identity
 
@@ -75,10 +74,10 @@ def swept(name: str, cloud: Cloud) -> Swept:
     if not isinstance(cloud, Auditing):
         raise FogftError(f"cloud `{name}` cannot be swept")
     audit = cloud.audit()
-    pools = _pools()  # after the audit: a pool made meanwhile is known by then
+    known = _pools()  # after the audit: a pool made meanwhile is known by then
     found = []
     for machine in audit.machines:
-        pool, managed = pools.get(machine.id.pool_uid, ("", False))
+        pool, managed = known.get(machine.id.pool_uid, ("", False))
         if not managed:
             why = f"pool `{pool}` has no manager" if pool else f"no pool of this uid in `{home()}`"
             found.append(Unowned(machine, why, bool(pool)))
@@ -134,7 +133,7 @@ def _pools() -> dict[str, tuple[str, bool]]:
         StateError: A pool's identity cannot be read: its machines would look like nobody's.
     """
     found = {}
-    for name in known_pools.names(home()):
+    for name in pools():
         paths = PoolPaths.of(name)
         try:
             uid = read_identity(paths).uid

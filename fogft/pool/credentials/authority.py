@@ -93,7 +93,7 @@ def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS
 
     Args:
         folder: Holds the CA.
-        common_name: From `names.robot_certificate_name` or `replica_certificate_name`.
+        common_name: Of a `Holder`.
         role: What the holder may do.
         days: How long it is valid from now; never beyond the CA's own end.
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.errors import CredentialError
 from fogft.model.credentials import CredentialPaths, Holder, Role
-from fogft.model.plain import stored
+from fogft.model.plain import stored, to_plain
 from fogft.records.client import RendezvousClient
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import DialIn, SlotState
@@ -110,8 +110,8 @@ def claim(
 
 
 def _content(role: Role, token: str) -> dict[str, object]:
-    said = SlotState().to_content() if role is Role.REPLICA else DialIn().to_content()
-    return {**said, _KEY: token}
+    said = SlotState() if role is Role.REPLICA else DialIn()
+    return {**to_plain(said), _KEY: token}
 
 
 def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record | None:

@@ -1,4 +1,4 @@
-"""The manager's office: one holder a pool, an epoch for each, a beat while it works.
+"""The manager's lease: one holder a pool, an epoch for each, a beat while it works.
 
 The lock keeps two managers of one folder apart; the epoch, which goes into every
 membership, fences off what an earlier one may still write; the beat tells the proxies
@@ -9,7 +9,6 @@ Owns: `manager.lock` and `lease.json`.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 from fogft import disk
@@ -21,7 +20,6 @@ from fogft.pool.folder.paths import PoolPaths
 @dataclass(frozen=True)
 class _Held:
     epoch: Count = 0
-    pid: Count | None = None
     beat: Count = 0
 
 
@@ -36,18 +34,17 @@ class Lease:
 
     @classmethod
     def take(cls, paths: PoolPaths, *, at_least: int = 0) -> Lease:
-        """Take office under an epoch above all earlier ones, and above `at_least`.
+        """Take the lease under an epoch above all earlier ones, and above `at_least`.
 
         Raises:
-            PoolBusy: Another manager is in office.
+            PoolBusy: Another manager has it.
             StateError: The lease cannot be written.
         """
         lock = disk.Lock(paths.manager_lock)
         if not lock.acquire(wait=False):
-            raise PoolBusy(
-                f"pool `{paths.folder.name}` has a manager already"
-                + (f" (pid {pid})" if (pid := read_pid(paths)) else "")
-            )
+            said = paths.manager_lock.read_text()
+            who = f" (pid {said})" if said.isdecimal() else ""
+            raise PoolBusy(f"pool `{paths.folder.name}` has a manager already{who}")
         lease = cls(paths, lock, max(_read(paths).epoch, at_least) + 1)
         lease._write()
         return lease
@@ -56,7 +53,7 @@ class Lease:
         """Show that the manager works.
 
         Raises:
-            PoolBusy: A later manager is in office: this one must stop at once.
+            PoolBusy: A later manager has it: this one must stop at once.
             StateError: The lease cannot be written.
         """
         if _read(self._paths).epoch > self.epoch:
@@ -65,17 +62,12 @@ class Lease:
         self._write()
 
     def _write(self) -> None:
-        held = _Held(self.epoch, os.getpid(), self._beat)
+        held = _Held(self.epoch, self._beat)
         disk.write_json(self._paths.lease, to_plain(held), durable=self._beat == 0)
 
     def release(self) -> None:
-        """Leave office. Repeatable."""
+        """Give the lease back. Repeatable."""
         self._lock.release()
-
-
-def read_pid(paths: PoolPaths) -> int | None:
-    """Return the process id of the manager last in office, if it is known."""
-    return _read(paths).pid
 
 
 def _read(paths: PoolPaths) -> _Held:

@@ -27,6 +27,16 @@ def latency_file() -> Path:
     return home() / "latency.json"
 
 
+class _File:
+    """A file in the folder of `PoolPaths`."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, paths: PoolPaths, _owner: object) -> Path:
+        return paths.folder / self._name
+
+
 @dataclass(frozen=True)
 class PoolPaths:
     """The files of one pool; each has one writer.
@@ -44,100 +54,50 @@ class PoolPaths:
         """Return the paths of a pool by name, under `home()` unless told."""
         return cls((root or home()) / "pools" / name)
 
-    @property
-    def identity(self) -> Path:
-        """``{name, uid, cloud, file, created_at}``: written once, at the first `up`."""
-        return self.folder / "pool.json"
-
-    @property
-    def spec(self) -> Path:
-        """The pool file as last applied, byte for byte."""
-        return self.folder / "spec.yaml"
-
-    @property
-    def good_spec(self) -> Path:
-        """The last pool file with which the pool was wholly ready, byte for byte."""
-        return self.folder / "good.yaml"
-
-    @property
-    def trial(self) -> Path:
-        """``{file, began_at, fault}``: what became of the file applied last."""
-        return self.folder / "trial.json"
-
-    @property
-    def intent(self) -> Path:
-        """What the user asked for besides the file (`fogft.pool.intent`)."""
-        return self.folder / "intent.json"
-
-    @property
-    def intent_lock(self) -> Path:
-        """Held while `identity`, `spec` or `intent` is changed."""
-        return self.folder / "intent.lock"
-
-    @property
-    def manager_lock(self) -> Path:
-        """Held by the manager as long as it lives."""
-        return self.folder / "manager.lock"
-
-    @property
-    def lease(self) -> Path:
-        """``{epoch, pid, beat}``: the active manager; `beat` grows while it works."""
-        return self.folder / "lease.json"
-
-    @property
-    def status(self) -> Path:
-        """The manager's last observation (`fogft.pool.manager.status`)."""
-        return self.folder / "status.json"
-
-    @property
-    def membership(self) -> Path:
-        """The membership that the client proxy follows, and its cache."""
-        return self.folder / "membership.json"
-
-    @property
-    def discovered(self) -> Path:
-        """Services that replicas told of, where the pool file lists none."""
-        return self.folder / "discovered.json"
-
-    @property
-    def records(self) -> Path:
-        """Records that the client proxy learned from a rendezvous."""
-        return self.folder / "records.json"
-
-    @property
-    def manager_records(self) -> Path:
-        """Records that the manager published or learned."""
-        return self.folder / "manager-records.json"
-
-    @property
-    def announcements(self) -> Path:
-        """What the manager has signed for all replicas; the client proxy passes it on to them."""
-        return self.folder / "announcements.json"
-
-    @property
-    def history(self) -> Path:
-        """One JSON object a line: launches, ends, refusals; the generations used."""
-        return self.folder / "history.jsonl"
-
-    @property
-    def costs(self) -> Path:
-        """What all pools of this user have cost, a file each, which stays when one has ended."""
-        return self.folder.parent.parent / "costs"
-
-    @property
-    def credentials(self) -> Path:
-        """Folder of the pool's CA and its certificates."""
-        return self.folder / "credentials"
-
-    @property
-    def proxy_config(self) -> Path:
-        """The client proxy's configuration."""
-        return self.folder / "proxy.yaml"
-
-    @property
-    def proxy_lock(self) -> Path:
-        """Held by the client proxy as long as it lives."""
-        return self.folder / "proxy.lock"
+    identity = _File("pool.json")
+    """``{name, uid, cloud, file, created_at}``: written once, at the first `up`."""
+    spec = _File("spec.yaml")
+    """The pool file as last applied, byte for byte."""
+    good_spec = _File("good.yaml")
+    """The last pool file with which the pool was wholly ready, byte for byte."""
+    trial = _File("trial.json")
+    """``{file, began_at, fault}``: what became of the file applied last."""
+    intent = _File("intent.json")
+    """What the user asked for besides the file (`fogft.pool.intent`)."""
+    intent_lock = _File("intent.lock")
+    """Held while `identity`, `spec` or `intent` is changed."""
+    manager_lock = _File("manager.lock")
+    """Held by the manager as long as it lives."""
+    lease = _File("lease.json")
+    """``{epoch, beat}``: the active manager; `beat` grows while it works."""
+    status = _File("status.json")
+    """The manager's last observation (`fogft.pool.manager.status`)."""
+    membership = _File("membership.json")
+    """The membership that the client proxy follows, and its cache."""
+    discovered = _File("discovered.json")
+    """Services that replicas told of, where the pool file lists none."""
+    records = _File("records.json")
+    """Records that the client proxy learned from a rendezvous."""
+    manager_records = _File("manager-records.json")
+    """Records that the manager published or learned."""
+    announcements = _File("announcements.json")
+    """What the manager has signed for all replicas; the client proxy passes it on to them."""
+    history = _File("history.jsonl")
+    """One JSON object a line: launches, ends, refusals; the generations used."""
+    credentials = _File("credentials")
+    """Folder of the pool's CA and its certificates."""
+    proxy_config = _File("proxy.yaml")
+    """The client proxy's configuration."""
+    proxy_lock = _File("proxy.lock")
+    """Held by the client proxy as long as it lives."""
+    manager_start = _File("manager.json")
+    """``{command, folder}``: how to start a killed manager; gone when it ended well."""
+    proxy_status = _File("proxy-status.json")
+    """What the client proxy reports: links and counters."""
+    manager_log = _File("manager.log")
+    """The manager's log."""
+    proxy_log = _File("proxy.log")
+    """The client proxy's log."""
 
     @property
     def standby_lock(self) -> Path:
@@ -145,21 +105,6 @@ class PoolPaths:
         return disk.standby_lock(self.proxy_lock)
 
     @property
-    def manager_start(self) -> Path:
-        """``{command, folder}``: how to start a killed manager; gone when it ended well."""
-        return self.folder / "manager.json"
-
-    @property
-    def proxy_status(self) -> Path:
-        """What the client proxy reports: links and counters."""
-        return self.folder / "proxy-status.json"
-
-    @property
-    def manager_log(self) -> Path:
-        """The manager's log."""
-        return self.folder / "manager.log"
-
-    @property
-    def proxy_log(self) -> Path:
-        """The client proxy's log."""
-        return self.folder / "proxy.log"
+    def costs(self) -> Path:
+        """What all pools of this user have cost, a file each, which stays when one has ended."""
+        return self.folder.parent.parent / "costs"

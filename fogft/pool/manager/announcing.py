@@ -14,8 +14,7 @@ import datetime
 from typing import Any
 
 from fogft.errors import CredentialError
-from fogft.model import names
-from fogft.model.credentials import CredentialPaths, holder_of
+from fogft.model.credentials import CredentialPaths, manager_of
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Membership
@@ -145,8 +144,8 @@ class ManagerRecords:
         except CredentialError:
             good = False  # there is none yet, or it is damaged
         if not good:
-            holder = holder_of(names.manager_certificate_name(self._pool_uid))
-            issued = Ledger(self._paths.credentials).issue(holder, days=CERTIFICATE_DAYS)
+            holder, ledger = manager_of(self._pool_uid), Ledger(self._paths.credentials)
+            issued = ledger.issue(holder, days=CERTIFICATE_DAYS)
             authority.write(issued, self._paths.credentials, _STEM)
         self._certified_at = now
 

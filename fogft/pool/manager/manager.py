@@ -223,7 +223,7 @@ class Manager:
         def done(what: str) -> None:
             log.info("ended pool=%s what=%r", self._identity.name, what)
 
-        shutdown.end_client_proxy(self._paths, self._identity.uid, done)
+        shutdown.end_client_proxy(self._paths, done)
         teardown.end_machines(
             self._cloud,
             self._identity.uid,

@@ -44,20 +44,16 @@ def lock_holder(lock: Path) -> int | None:
     return said if disk.is_locked(lock) else None
 
 
-def end_holder(lock: Path, *, suspected_pid: int | None, patience_s: float = 10.0) -> int | None:
+def end_holder(lock: Path, *, patience_s: float = 10.0) -> int | None:
     """End the process that holds a lock: SIGTERM, then SIGKILL. Return its pid; None for nobody.
 
     Returns when it is gone, not only its lock: a process lets go of what it holds, and may
     hang only then.
 
     Args:
-        lock: The file.
-        suspected_pid: Who is said to hold it, where the kernel's list does not tell.
         patience_s: How long to wait after each signal.
     """
-    if not disk.is_locked(lock):
-        return None
-    pid = lock_holder(lock) or suspected_pid
+    pid = lock_holder(lock)
     if pid is None or pid == os.getpid():
         return None
     with _opened(pid) as process:

@@ -19,10 +19,9 @@ from fogft import disk
 from fogft.cloud.port import Cloud
 from fogft.errors import FogftError, PoolNotFound, StateError
 from fogft.model.intent import Intent
-from fogft.pool.folder import lease
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, PoolStore
-from fogft.pool.manager import process_control, proxy_report, teardown
+from fogft.pool.manager import process_control, teardown
 
 LIMIT_S = 600.0
 
@@ -61,13 +60,13 @@ def end(
             identity = store.identity()
         except PoolNotFound:
             return ended  # another `down` was faster
-        _end_process(done, "manager", paths.manager_lock, lease.read_pid(paths))
+        _end_process(done, "manager", paths.manager_lock)
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             store.write_intent(replace(_intent(store), stopping=True))
-        end_client_proxy(paths, identity.uid, done)
+        end_client_proxy(paths, done)
         # The client proxy may have started one since.
-        _end_process(done, "manager", paths.manager_lock, lease.read_pid(paths))
+        _end_process(done, "manager", paths.manager_lock)
         teardown.end_machines(
             cloud_of(identity),
             identity.uid,
@@ -82,16 +81,14 @@ def end(
     return ended
 
 
-def end_client_proxy(paths: PoolPaths, uid: str, done: Callable[[str], None]) -> None:
+def end_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> None:
     """End a pool's client proxy, and the one in line behind it, which would take over. Repeatable.
 
     Raises:
         FogftError: It does not end.
     """
-    _end_process(lambda _: None, "standby client proxy", paths.standby_lock, None)
-    report = proxy_report.read(paths.proxy_status, uid)
-    pid = report.pid if report is not None else None
-    _end_process(done, "client proxy", paths.proxy_lock, pid)
+    _end_process(lambda _: None, "standby client proxy", paths.standby_lock)
+    _end_process(done, "client proxy", paths.proxy_lock)
 
 
 def _intent(store: PoolStore) -> Intent:
@@ -101,10 +98,8 @@ def _intent(store: PoolStore) -> Intent:
         return Intent()
 
 
-def _end_process(
-    done: Callable[[str], None], what: str, lock: Path, suspected_pid: int | None
-) -> None:
-    pid = process_control.end_holder(lock, suspected_pid=suspected_pid)
+def _end_process(done: Callable[[str], None], what: str, lock: Path) -> None:
+    pid = process_control.end_holder(lock)
     if disk.is_locked(lock):
         raise FogftError(
             f"the {what} of `{lock.parent.name}` does not end",

@@ -173,9 +173,7 @@ def _loop(
     while time.monotonic() < until and not stop.wait(_IDLE_TICK_S if proxy.idle else _TICK_S):
         proxy.run_once()
         memory.look()
-        known = presence.look(
-            proxy.ready, draining=proxy.draining, in_flight=proxy.responder.in_flight
-        )
+        known = presence.look(proxy.ready, draining=proxy.draining)
         proxy.revoke(known.revoked)
         proxy.renew(known.of(RecordKind.LEASE))
         if proxy.lease_is_over:

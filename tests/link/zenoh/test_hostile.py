@@ -20,6 +20,7 @@ from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState
+from tests import certificate_names
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -146,7 +147,7 @@ def test_the_links_of_a_revoked_robot_are_ended_whatever_it_does(
     settings = config.robot_settings(peer(replica.endpoint), authority.robot("eve"), LinkSettings())
     session = zenoh.open(config.to_zenoh(settings))
     try:
-        replica.ask(revoke=[names.robot_certificate_name(POOL_UID, "eve")])
+        replica.ask(revoke=[certificate_names.robot(POOL_UID, "eve")])
         wait_for(lambda: replica.count("revoked_links") > 1)  # Zenoh comes back by itself
     finally:
         session.close()

@@ -17,6 +17,7 @@ from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState
 from fogft.pool.credentials import authority as credentials
 from fogft.pool.credentials.authority import Role
+from tests import certificate_names
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -153,7 +154,7 @@ def test_a_robot_out_of_its_time_is_told_whose_clock_it_is(
     """The replica refuses it; by our own clock we see why."""
     replica = start_replica()
     monkeypatch.setattr(credentials, "BACKDATE", -begin * datetime.timedelta(days=1))
-    name = names.robot_certificate_name(POOL_UID, "robot")
+    name = certificate_names.robot(POOL_UID, "robot")
     link = dial(replica.endpoint, files=authority.issue(name, Role.ROBOT, days=end))
     _refused(link, words)
     assert "this machine's clock says" in link.status().detail

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from fogft import disk
 from fogft.errors import PoolNotFound, SpecError
 from fogft.model import intent as intents
 from fogft.model.names import POOL_UID_PATTERN
@@ -15,23 +16,23 @@ from tests.pool.scene import Scene
 
 def test_a_new_pool_has_all_it_needs_and_is_private(scene: Scene) -> None:
     """Identity, file, intent and CA, in a folder that only its user can enter."""
-    written = scene.write()
-    assert (written.created, written.changed) == (True, True)
-    assert POOL_UID_PATTERN.fullmatch(written.identity.uid)
+    identity = scene.write()
+    assert POOL_UID_PATTERN.fullmatch(identity.uid)
     assert scene.paths.folder.stat().st_mode & 0o777 == 0o700
     assert scene.paths.spec.read_text() == scene.file.read_text()
     for path in (scene.paths.identity, scene.paths.spec, scene.paths.credentials / "ca.key"):
         assert path.stat().st_mode & 0o777 == 0o600
     name = authority.describe(scene.paths.credentials / "ca.crt").common_name
-    assert name == f"fogft.{written.identity.uid}"
+    assert name == f"fogft.{identity.uid}"
 
 
 def test_the_same_file_again_changes_nothing(scene: Scene) -> None:
     """`up` is repeatable: same uid, same CA."""
     first = scene.write()
     ca = (scene.paths.credentials / "ca.crt").read_bytes()
-    second = scene.write()
-    assert second == startup.Written(first.identity, created=False, changed=False)
+    spec = disk.version(scene.paths.spec)
+    assert scene.write() == first
+    assert disk.version(scene.paths.spec) == spec
     assert (scene.paths.credentials / "ca.crt").read_bytes() == ca
 
 
@@ -40,7 +41,8 @@ def test_a_changed_file_is_applied_and_keeps_the_scale(scene: Scene) -> None:
     scene.write(replicas=2)
     store = scene.store
     store.write_intent(intents.scale(store.intent(), store.spec(), 1))
-    assert scene.write(replicas=2, timeout_s=9.0).changed
+    scene.write(replicas=2, timeout_s=9.0)
+    assert store.spec().services[0].timeout_s == 9.0
     assert store.intent().wanted(store.spec()) == 3
     scene.write(replicas=4)
     assert store.intent().wanted(store.spec()) == 4
@@ -84,8 +86,7 @@ def test_an_up_cut_short_is_an_up_that_never_was(scene: Scene) -> None:
     with pytest.raises(PoolNotFound):
         scene.store.identity()
     second = scene.write()
-    assert second.created
-    assert second.identity.uid != first.identity.uid
+    assert second.uid != first.uid
     name = authority.describe(scene.paths.credentials / "ca.crt").common_name
-    assert name == f"fogft.{second.identity.uid}"
+    assert name == f"fogft.{second.uid}"
     assert not scene.paths.history.exists()

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from fogft.errors import CredentialError
-from fogft.model import names
 from fogft.model.replica import ReplicaId
 from fogft.pool.credentials import authority as credentials
 from fogft.pool.credentials.authority import Role
+from tests import certificate_names
 
 UID = "0123456789abcdef"
 REPLICA = ReplicaId(UID, 3, 7).certificate_name
-ROBOT = names.robot_certificate_name(UID, "ada")
+ROBOT = certificate_names.robot(UID, "ada")
 HOUR = datetime.timedelta(hours=1)
 
 

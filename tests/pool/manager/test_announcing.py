@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from fogft.model import names
 from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.membership import Found, members_of
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, Placement, ReplicaId
@@ -24,6 +23,7 @@ from fogft.records.record_set import RecordSet
 from fogft.records.roster import ServingLease, admission, lease
 from fogft.records.server import RendezvousServer
 from fogft.records.signing import Verifier
+from tests import certificate_names
 from tests.link.wire_pool import wait_for
 
 UID = "0123456789abcdef"
@@ -34,7 +34,7 @@ class Place:
     """A rendezvous in a thread."""
 
     def __init__(self, folder: Path) -> None:
-        name = names.rendezvous_certificate_name(UID, "a")
+        name = certificate_names.rendezvous(UID, "a")
         authority.write(authority.issue(folder, name, role=Role.RENDEZVOUS), folder, "rendezvous")
         files = CredentialPaths(
             folder / "ca.crt", folder / "rendezvous.crt", folder / "rendezvous.key"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from fogft import disk
 from fogft.model import intent
-from fogft.pool.folder import lease
 from tests.needs import needs
 from tests.pool.scene import Scene
 
@@ -50,7 +50,7 @@ def scaled_by(scene: Scene, more: int) -> None:
 
 
 def beats(scene: Scene) -> int | None:
-    return scene.paths.lease.stat().st_mtime_ns if lease.read_pid(scene.paths) else None
+    return scene.paths.lease.stat().st_mtime_ns if disk.read_json(scene.paths.lease) else None
 
 
 def test_a_full_disk_ends_nothing_and_is_waited_out(small: Scene) -> None:

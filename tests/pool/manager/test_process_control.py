@@ -107,8 +107,7 @@ def test_the_holder_is_ended(lock: Path, holders: list[subprocess.Popen[bytes]],
     pid = hold(lock, holders, kind)
     if kind == "stopped":
         os.kill(pid, signal.SIGSTOP)
-    wrong = os.getppid()
-    ended = process_control.end_holder(lock, suspected_pid=wrong, patience_s=0.5)
+    ended = process_control.end_holder(lock, patience_s=0.5)
     assert ended == pid
     expected = signal.SIGTERM if kind in ("willing", "stopped") else signal.SIGKILL
     assert holders[0].wait(10) == -expected
@@ -116,8 +115,8 @@ def test_the_holder_is_ended(lock: Path, holders: list[subprocess.Popen[bytes]],
 
 def test_nobody_is_ended_where_nobody_holds_the_lock(lock: Path) -> None:
     """A stale process id in a file is never signalled."""
-    lock.touch()
-    assert process_control.end_holder(lock, suspected_pid=1) is None
+    lock.write_text("1")
+    assert process_control.end_holder(lock) is None
 
 
 class Proxy:

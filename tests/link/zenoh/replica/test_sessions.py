@@ -13,14 +13,14 @@ from fogft.link.zenoh.replica.sessions import (
     AuthenticatedSessions,
     NotAdmittedError,
 )
-from fogft.model import names
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
+from tests import certificate_names
 from tests.records.record_worlds import UID, signer, verify
 
 SELF = ReplicaId(UID, 0, 1).certificate_name
-ADA = names.robot_certificate_name(UID, "ada")
-EVE = names.robot_certificate_name(UID, "eve")
+ADA = certificate_names.robot(UID, "ada")
+EVE = certificate_names.robot(UID, "eve")
 
 
 def token(number: int) -> bytes:
@@ -52,7 +52,7 @@ def test_who_greeted_is_let_in_and_nobody_else(sessions: AuthenticatedSessions) 
 
 
 def test_a_gateway_may_ask_too(sessions: AuthenticatedSessions) -> None:
-    sessions.greet(greeting(1, names.gateway_certificate_name(UID, "edge"), "gateway"))
+    sessions.greet(greeting(1, certificate_names.gateway(UID, "edge"), "gateway"))
     assert sessions.admits(token(1))
 
 
@@ -60,11 +60,11 @@ def test_a_gateway_may_ask_too(sessions: AuthenticatedSessions) -> None:
     "said",
     [
         greeting(1, ReplicaId(UID, 1, 1).certificate_name, "replica"),
-        greeting(1, names.manager_certificate_name(UID), "manager"),
-        greeting(1, names.rendezvous_certificate_name(UID, "a"), "rendezvous"),
+        greeting(1, certificate_names.manager(UID), "manager"),
+        greeting(1, certificate_names.rendezvous(UID, "a"), "rendezvous"),
         greeting(1, ADA, "replica"),
         greeting(1, ReplicaId(UID, 1, 1).certificate_name, "robot"),
-        greeting(1, names.robot_certificate_name("f" * 16, "ada")),
+        greeting(1, certificate_names.robot("f" * 16, "ada")),
         greeting(1, "ada"),
         greeting(1, to=ReplicaId(UID, 1, 1).certificate_name),
         Greeting(token(1), greeting(2).certificate, greeting(2).signature),
@@ -96,7 +96,7 @@ def test_the_revoked_are_let_in_no_more(sessions: AuthenticatedSessions) -> None
     sessions.revoke([])  # nothing is ever taken back
     assert [sessions.admits(token(n)) for n in (1, 2, 3)] == [False, False, True]
     assert refusal(sessions, greeting(4, EVE)) == Refusal.REVOKED
-    sessions.greet(greeting(5, names.robot_certificate_name(UID, "eve", 2)))
+    sessions.greet(greeting(5, certificate_names.robot(UID, "eve", 2)))
 
 
 def test_a_token_cannot_be_taken_over(sessions: AuthenticatedSessions) -> None:
@@ -120,6 +120,6 @@ def test_one_holder_cannot_push_out_another(count: int) -> None:
 
 def test_what_is_remembered_is_bounded(sessions: AuthenticatedSessions) -> None:
     for number in range(HOLDERS_LIMIT + 5):
-        sessions.greet(greeting(number, names.robot_certificate_name(UID, f"r{number}")))
+        sessions.greet(greeting(number, certificate_names.robot(UID, f"r{number}")))
     assert len(sessions.names) == HOLDERS_LIMIT
     assert not sessions.admits(token(0))
