@@ -13,6 +13,7 @@ from typing import Any
 from fogft import disk
 from fogft.model.intent import Intent
 from fogft.model.plain import to_plain
+from fogft.model.reason import Cause, Reason
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, write_identity
 from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
@@ -74,6 +75,7 @@ STATUS = PoolStatus(
             REPLICA, slot=2, generation=3, phase="draining", link="suspect", rtt_s=1.25, won=7,
             age_s=93_600.0,
             detail="silent for 17 s, and so it is replaced by another one elsewhere",
+            reason=Reason(Cause.SILENT, seconds=17.0),
         ),
     ),
     services=(
@@ -107,6 +109,7 @@ def report(paths: PoolPaths, status: PoolStatus = STATUS, *, age_s: float = 0.2)
         "services": {service.name: service.counters for service in status.services},
         "uplink_suspected": status.uplink_suspected,
         "robot": status.topology.get("robot", ""),
+        "gateways": [{"generation": 1, **link} for link in status.topology.get("links", [])],
     }  # fmt: skip
     disk.write_json(paths.proxy_status, written)
 

@@ -52,12 +52,10 @@ def test_every_status_is_valid(world: World) -> None:
     seen = status.of_tick(
         tick,
         history=world.history,
-        report=None,
         recent=[Event(NOW, EventKind.FAILED, 0, 1, "c/r/a", FULL)],
         epoch=3,
         manager_pid=11,
-        proxy_alive=True,
-    )
+    ).joined(None, proxy_alive=True, links=world.observed.links)
     check(Seen(seen, None, manager_alive=True).to_json())
     again = status.from_json(json.loads(json.dumps(seen.to_json())))
     assert (again.reasons, again.events) == (seen.reasons, seen.events)

@@ -10,18 +10,16 @@ manager's last look. What nobody has looked at lately is unknown, never as it wa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fogft.model.replica import LinkReport, LinkState, Phase
+from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.manager.proxy_report import ProxyReport
-from fogft.pool.manager.status import PoolStatus, ReplicaStatus
+from fogft.pool.manager.status import PoolStatus
 
 STALE_AFTER_S = 15.0
 """A manager that has not looked for so long knows nothing of now."""
-_COMING = (Phase.PROVISIONING.value, Phase.STARTING.value)
-_Links = Mapping[tuple[int, int], LinkReport]
 
 
 @dataclass(frozen=True)
@@ -84,9 +82,9 @@ def current(
             None for what the report says.
     """
     fresh = report if proxy_alive and report is not None and report.fresh(now) else None
-    links = {(k.id.slot, k.id.generation): k for k in fresh.links} if fresh is not None else {}
+    links = fresh.links if fresh is not None else None
     if fresh is not None and heard_since is not None:
-        links = {key: _heard(k, fresh.written_at, heard_since) for key, k in links.items()}
+        links = tuple(_heard(k, fresh.written_at, heard_since) for k in fresh.links)
     age_s = max(0.0, now - status.observed_at) if status.observed_at else None
     seen = Seen(
         status,
@@ -95,31 +93,9 @@ def current(
         None if report is None else max(0.0, now - report.written_at),
         links_known=fresh is not None,
     )
-    counters = report.services if report is not None else {}
-    services = [
-        replace(
-            one,
-            ready_replicas=sum(_answers(k, one.name) for k in links.values()),
-            counters=counters.get(one.name, one.counters),
-        )
-        for one in status.services
-    ]
-    replicas = [_now(one, links, seen) for one in status.replicas]
-    found = replace(
-        status,
-        proxy_alive=proxy_alive,
-        proxy_version=report.version if report is not None and proxy_alive else "",
-        proxy_pid=report.pid if report is not None and proxy_alive else None,
-        uplink_suspected=fresh is not None and fresh.uplink_suspected,
-        replicas=replicas,
-        by_hand=[_now(one, links, seen) for one in status.by_hand],
-        services=services,
-        topics=[
-            one.seen(links.values(), report.topics if report is not None else {})
-            for one in status.topics
-        ],
-        ready=sum(_is_ready(one) for one in replicas),
-    )
+    found = status.joined(report, proxy_alive=proxy_alive, links=links, stale=seen.stale)
+    found = replace(found, uplink_suspected=fresh is not None and fresh.uplink_suspected)
+    services = found.services
     silent = [one.name for one in services if not one.ready_replicas]
     hangs = proxy_alive and fresh is None
     answers = None if hangs or not services else proxy_alive and not silent
@@ -131,43 +107,3 @@ def _heard(link: LinkReport, written_at: float, since: float) -> LinkReport:
     if link.state is LinkState.UP and heard_at < since:
         return replace(link, state=LinkState.SUSPECT, detail="it did not answer a probe in time")
     return link
-
-
-def _answers(link: LinkReport, service: str) -> bool:
-    return link.state is LinkState.UP and service in link.ready
-
-
-def _is_ready(one: ReplicaStatus) -> bool:
-    return one.known and one.phase == Phase.READY.value and one.link == LinkState.UP.value
-
-
-def _now(one: ReplicaStatus, links: _Links, seen: Seen) -> ReplicaStatus:
-    """Return a replica with what its link says now; without one, with what is left unknown."""
-    link = links.get((one.slot, one.generation))
-    if link is None:
-        known = not seen.stale and (seen.links_known or one.phase in _COMING)
-        return replace(
-            one, link="", rtt_s=None, silent_for_s=0.0, in_flight=0, known=known, lease_left_s=None
-        )
-    found = replace(
-        one,
-        link=link.state.value,
-        rtt_s=link.rtt_s,
-        silent_for_s=link.silent_for_s,
-        won=link.won,
-        in_flight=link.in_flight,
-        restarts=link.restarts,
-        strangers=link.strangers,
-        detail=one.detail or (link.detail if one.phase == Phase.READY.value else ""),
-        lease_left_s=link.lease_left_s,
-        version=link.version,
-    )
-    names = {service.name for service in seen.status.services}
-    if found.phase in _COMING and link.state is LinkState.UP and names and names <= link.ready:
-        return replace(found, phase=Phase.READY.value, detail="")  # sooner than the manager saw it
-    if not seen.stale:
-        return found
-    if link.state is not LinkState.UP or not link.ready:
-        return replace(found, known=False, detail=link.detail)
-    phase = Phase.DRAINING if link.draining else Phase.READY
-    return replace(found, phase=phase.value, detail=link.detail)

@@ -158,25 +158,14 @@ def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
     observed = Observed(now, machines, links)
     health = None if machines is None else judge(identity.uid, spec, observed, history)
     decided = Plan(wanted=intent.wanted(spec), health=health)
+    tick = Tick(identity, spec, intent, observed, decided, store.membership(), file=store.applied())
+    if health is not None:
+        update = describe(spec, store.good(), store.trial(), health, decided.wanted)
+        tick = tick._replace(update=update)
     found = status.of_tick(
-        Tick(
-            identity,
-            spec,
-            intent,
-            observed,
-            decided,
-            store.membership(),
-            file=store.applied(),
-            update=None
-            if health is None
-            else describe(spec, store.good(), store.trial(), health, decided.wanted),
-        ),
+        tick,
         history=history,
-        report=report,
         recent=events[-EVENTS_SHOWN:],
-        epoch=0,
-        manager_pid=0,
-        proxy_alive=disk.is_locked(paths.proxy_lock),
         notes=trouble,
     )
     return _current(paths, found, now)
@@ -187,20 +176,4 @@ def _unobserved(paths: PoolPaths) -> PoolStatus:
     from fogft.pool.folder.store import read_identity
 
     identity = read_identity(paths)
-    return PoolStatus(
-        pool=identity.name,
-        uid=identity.uid,
-        cloud=identity.cloud,
-        file=identity.file,
-        epoch=0,
-        manager_pid=0,
-        observed_at=0.0,
-        cloud_reachable=False,
-        stopping=False,
-        target=0,
-        ready=0,
-        uplink_suspected=False,
-        usd_per_hour=0.0,
-        proxy_pid=None,
-        proxy_alive=disk.is_locked(paths.proxy_lock),
-    )
+    return PoolStatus(identity.name, identity.uid, identity.cloud, identity.file)

@@ -291,11 +291,9 @@ class Manager:
         seen = status.of_tick(
             tick,
             history=self._store.history(),
-            report=report if fresh else None,
             recent=self._store.recent(),
             epoch=self._lease.epoch,
             manager_pid=os.getpid(),
-            proxy_alive=fresh,
             notes=notes,
             usd_to_date=self._costs.usd,
             credentials_end_at=ends_at,
@@ -304,6 +302,7 @@ class Manager:
             self._replicas = seen.replicas
         else:  # show what was seen last; `cloud_reachable` says how it is meant
             seen = replace(seen, replicas=self._replicas)
+        seen = seen.joined(report, proxy_alive=fresh, links=tick.observed.links)
         if ended:
             seen = replace(
                 seen, ended=ended, proxy_alive=False, proxy_pid=None, notes=[], reasons=[]

@@ -6,8 +6,8 @@ Not here: how it is shown (`fogft.cli`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from fogft import __version__
@@ -22,7 +22,6 @@ from fogft.reason_words import words
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.model.replica import Machine
-    from fogft.model.spec import PoolSpec
     from fogft.planning.observed.health import Assessment
     from fogft.planning.observed.history import Record
     from fogft.pool.manager.reconciler import Tick
@@ -72,22 +71,22 @@ class ReplicaStatus:
     slot: int
     generation: int
     phase: str = field(metadata={"words": tuple(phase.value for phase in Phase)})
-    verdict: str
-    location: str
-    instance: str
-    spot: bool
-    usd_per_hour: float
-    endpoint: str | None
-    link: str = field(metadata={"words": ("", *(state.value for state in LinkState))})
-    rtt_s: float | None
-    silent_for_s: float
-    won: int
-    in_flight: int
-    restarts: int
-    age_s: float | None
-    detail: str
+    verdict: str = "good"
+    location: str = "by hand"
+    instance: str = ""
+    spot: bool = False
+    usd_per_hour: float = 0.0
+    endpoint: str | None = None
+    link: str = field(default="", metadata={"words": ("", *(state.value for state in LinkState))})
+    rtt_s: float | None = None
+    silent_for_s: float = 0.0
+    won: int = 0
+    in_flight: int = 0
+    restarts: int = 0
+    age_s: float | None = None
+    detail: str = ""
     differs: bool = False
-    differing: Sequence[str] = ()
+    differing: tuple[str, ...] = ()
     reason: Reason | None = None
     known: bool = True
     has_served: bool = False
@@ -99,6 +98,48 @@ class ReplicaStatus:
     starting_s: float | None = None
     ready_after_s: float | None = None
 
+    def linked(
+        self, link: LinkReport | None, services: set[str], *, links_known: bool, stale: bool
+    ) -> ReplicaStatus:
+        """Return it with what its link says now; without one, with what is left unknown.
+
+        Args:
+            services: Names of all services: with these it is ready.
+            links_known: There is a fresh report of links.
+            stale: What the manager last saw says nothing of now.
+        """
+        if link is None:
+            return replace(
+                self,
+                link="",
+                rtt_s=None,
+                silent_for_s=0.0,
+                in_flight=0,
+                known=not stale and (links_known or self.phase in _COMING),
+                lease_left_s=None,
+                detail="it was not found yet" if self.age_s is None else self.detail,
+            )
+        is_up, is_known = link.state is LinkState.UP, not stale
+        phase = self.phase
+        if is_up and (link.ready if stale else services and services <= link.ready):
+            is_known = True
+            if stale or phase in _COMING:  # sooner than the manager saw it
+                phase = (Phase.DRAINING if link.draining else Phase.READY).value
+        is_judged = self.reason is not None or link.state is LinkState.CONNECTING
+        return replace(
+            self,
+            **{name: getattr(link, name) for name in _OF_LINK},
+            link=link.state.value,
+            phase=phase,
+            known=is_known,
+            detail=(is_judged and not stale and self.detail) or link.detail,
+        )
+
+
+_COMING = (Phase.PROVISIONING.value, Phase.STARTING.value)
+_OF_LINK = {one.name for one in fields(ReplicaStatus)} & {one.name for one in fields(LinkReport)}
+_OF_LINK -= {"detail"}
+
 
 @dataclass(frozen=True)
 class ServiceStatus:
@@ -106,7 +147,7 @@ class ServiceStatus:
 
     name: str
     type: str
-    ready_replicas: int
+    ready_replicas: int = 0
     counters: Counters = field(default_factory=dict)
 
 
@@ -126,16 +167,6 @@ class TopicStatus:
     origin: str = field(metadata={"words": tuple(origin.value for origin in Origin)})
     heard_by: Sequence[str] = ()
     counters: TopicCounted = field(default_factory=TopicCounted)
-
-    def seen(self, links: Iterable[LinkReport], counted: Mapping[str, TopicCounted]) -> TopicStatus:
-        """Return it as links and counters say it is now."""
-        key = PREFIX + self.name
-        ups = (one for one in links if one.state is LinkState.UP and key in one.ready)
-        return replace(
-            self,
-            heard_by=sorted(one.id.short for one in ups),
-            counters=counted.get(self.name, self.counters),
-        )
 
 
 @dataclass(frozen=True)
@@ -240,17 +271,17 @@ class PoolStatus:
     uid: str
     cloud: str
     file: str
-    epoch: int
-    manager_pid: int
-    observed_at: Moment
-    cloud_reachable: bool
-    stopping: bool
-    target: int
-    ready: int
-    uplink_suspected: bool
-    usd_per_hour: float
-    proxy_pid: int | None
-    proxy_alive: bool
+    epoch: int = 0
+    manager_pid: int = 0
+    observed_at: Moment = 0.0
+    cloud_reachable: bool = False
+    stopping: bool = False
+    target: int = 0
+    ready: int = 0
+    uplink_suspected: bool = False
+    usd_per_hour: float = 0.0
+    proxy_pid: int | None = None
+    proxy_alive: bool = False
     usd_to_date: float = 0.0
     credentials_end_at: float | None = None
     ended: str = ""
@@ -268,6 +299,63 @@ class PoolStatus:
     manager_version: str = ""
     proxy_version: str = ""
     version: int = VERSION
+
+    def joined(
+        self,
+        report: ProxyReport | None,
+        *,
+        proxy_alive: bool,
+        links: Sequence[LinkReport] | None,
+        stale: bool = False,
+    ) -> PoolStatus:
+        """Return it with what the client proxy knows.
+
+        Args:
+            report: Its last report, however old.
+            proxy_alive: Whether it runs now.
+            links: What is known of links now; None for nothing.
+            stale: What the manager last saw says nothing of now.
+        """
+        up = [link for link in links or () if link.state is LinkState.UP]
+        by_id = {(link.id.slot, link.id.generation): link for link in links or ()}
+        services, topics = (report.services, report.topics) if report is not None else ({}, {})
+        names, now = {one.name for one in self.services}, report if proxy_alive else None
+
+        def linked(one: ReplicaStatus) -> ReplicaStatus:
+            link = by_id.get((one.slot, one.generation))
+            return one.linked(link, names, links_known=links is not None, stale=stale)
+
+        replicas = [linked(one) for one in self.replicas]
+        topology = self.topology
+        if topology and now is not None and links is not None:
+            said = [to_plain(one) for one in now.gateways]
+            topology = {**topology, "robot": now.robot, "links": said}
+        return replace(
+            self,
+            proxy_alive=proxy_alive,
+            proxy_version=now.version if now is not None else "",
+            proxy_pid=now.pid if now is not None else None,
+            replicas=replicas,
+            by_hand=[linked(one) for one in self.by_hand],
+            ready=sum(one.known and one.phase == "ready" and one.link == "up" for one in replicas),
+            services=[
+                replace(
+                    one,
+                    ready_replicas=sum(one.name in link.ready for link in up),
+                    counters=services.get(one.name, one.counters),
+                )
+                for one in self.services
+            ],
+            topics=[
+                replace(
+                    one,
+                    heard_by=sorted(k.id.short for k in up if PREFIX + one.name in k.ready),
+                    counters=topics.get(one.name, one.counters),
+                )
+                for one in self.topics
+            ],
+            topology=topology,
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form."""
@@ -287,16 +375,14 @@ def of_tick(
     tick: Tick,
     *,
     history: History,
-    report: ProxyReport | None,
     recent: Sequence[Event],
-    epoch: int,
-    manager_pid: int,
-    proxy_alive: bool,
+    epoch: int = 0,
+    manager_pid: int = 0,
     notes: Sequence[Reason] = (),
     usd_to_date: float = 0.0,
     credentials_end_at: float | None = None,
 ) -> PoolStatus:
-    """Return the status after a tick."""
+    """Return the status after a tick, as far as the manager and the cloud know it."""
     from fogft.model.groups import FIRST_BY_HAND
 
     health, observed, plan = tick.plan.health, tick.observed, tick.plan
@@ -304,11 +390,9 @@ def of_tick(
     said = [*plan.notes, *_without_certificate(tick), *notes]
     leaving = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
     replicas = [_replica(one, leaving, history, observed.now) for one in judged]
-    links = {link.id: link for link in observed.links or ()}
     members = tick.membership.members if tick.membership is not None else ()
     by_hand = [member.id for member in members if member.id.slot >= FIRST_BY_HAND]
-    heard = [one.link for one in judged if one.link is not None]
-    heard += [links[id] for id in by_hand if id in links]
+    starting = Phase.STARTING.value
     return PoolStatus(
         pool=tick.identity.name,
         uid=tick.identity.uid,
@@ -325,49 +409,38 @@ def of_tick(
         usd_per_hour=sum(one.machine.usd_per_hour for one in judged),
         usd_to_date=usd_to_date,
         credentials_end_at=credentials_end_at,
-        proxy_pid=report.pid if report is not None and proxy_alive else None,
-        proxy_alive=proxy_alive,
         excluded=sorted(tick.intent.excluded),
         notes=[words(note) for note in said],
         reasons=said,
         replicas=replicas,
-        by_hand=[_started_by_hand(id, links.get(id), tick.spec) for id in by_hand],
-        services=_services(tick.spec, heard, report),
-        topics=[
-            TopicStatus(one.name, one.type, one.origin.value).seen(
-                heard, report.topics if report is not None else {}
-            )
-            for one in tick.spec.topics
-        ],
+        by_hand=[ReplicaStatus(one.slot, one.generation, starting) for one in by_hand],
+        services=[ServiceStatus(one.name, one.type) for one in tick.spec.proxied],
+        topics=[TopicStatus(one.name, one.type, one.origin.value) for one in tick.spec.topics],
         events=[event_status(event) for event in recent],
-        topology=_topology(tick, report if proxy_alive else None),
+        topology=_topology(tick),
         applied=tick.file,
         manager_version=__version__,
-        proxy_version=report.version if report is not None else "",
         update=_update(tick),
     )
 
 
 def _update(tick: Tick) -> UpdateStatus | None:
-    update = tick.update
-    if update is None:
+    one = tick.update
+    if one is None:
         return None
-    fault = update.fault
-    return UpdateStatus(update.state.value, update.done, update.of, words(fault), fault)
+    return UpdateStatus(one.state.value, one.done, one.of, words(one.fault), one.fault)
 
 
-def _topology(tick: Tick, report: ProxyReport | None) -> dict[str, Any]:
+def _topology(tick: Tick) -> dict[str, Any]:
     here = tick.membership.topology if tick.membership is not None else tick.spec.topology
     if not here:
         return {}
-    links = [to_plain(one) for one in report.gateways] if report is not None else []
-    robot = report.robot if report is not None else ""
     return {
-        "robot": robot,
+        "robot": "",
         "gateways": [vars(one) for one in here.gateways],
         "robots": here.robots,
         "through": here.through,
-        "links": links,
+        "links": [],
     }
 
 
@@ -388,8 +461,10 @@ def _replica(
     record = history.record(one.id.slot, one.id.generation)
     launched_at = record.launched_at if record is not None else machine.launched_at
     leaves = one.id in leaving and one.phase is not Phase.GONE
-    return replace(
-        _linked(one.id, Phase.DRAINING if leaves else one.phase, one.link),
+    return ReplicaStatus(
+        slot=one.id.slot,
+        generation=one.id.generation,
+        phase=(Phase.DRAINING if leaves else one.phase).value,
         verdict=one.verdict.value,
         location=machine.placement.location,
         instance=machine.placement.instance,
@@ -397,7 +472,7 @@ def _replica(
         usd_per_hour=machine.usd_per_hour,
         endpoint=machine.endpoint,
         age_s=max(0.0, now - launched_at),
-        detail=_detail(one),
+        detail=words(one.why) or machine.progress,
         reason=one.why,
         has_served=record is not None and record.first_ready_at is not None,
         **_phases(launched_at, machine, record),
@@ -417,68 +492,6 @@ def _phases(launched_at: float, machine: Machine, record: Record | None) -> dict
         "starting_s": between(machine.set_up_at, ready_at),
         "ready_after_s": between(launched_at, ready_at),
     }
-
-
-def _started_by_hand(id: ReplicaId, link: LinkReport | None, spec: PoolSpec) -> ReplicaStatus:
-    if link is None:
-        return replace(_linked(id, Phase.STARTING, None), detail="it was not found yet")
-    ready = link.state is LinkState.UP and {s.name for s in spec.services} <= link.ready
-    phase = Phase.DRAINING if link.draining else Phase.READY if ready else Phase.STARTING
-    return _linked(id, phase, link)
-
-
-def _linked(id: ReplicaId, phase: Phase, link: LinkReport | None) -> ReplicaStatus:
-    """Return what a link says of a replica of which no cloud says anything."""
-    known = link or LinkReport(id, LinkState.CONNECTING)
-    return ReplicaStatus(
-        slot=id.slot,
-        generation=id.generation,
-        phase=phase.value,
-        verdict="good",
-        location="by hand",
-        instance="",
-        spot=False,
-        usd_per_hour=0.0,
-        endpoint=None,
-        link=link.state.value if link is not None else "",
-        rtt_s=known.rtt_s,
-        silent_for_s=known.silent_for_s,
-        won=known.won,
-        in_flight=known.in_flight,
-        restarts=known.restarts,
-        strangers=known.strangers,
-        age_s=None,
-        detail=known.detail,
-        differs=known.differs,
-        differing=list(known.differing),
-        lease_left_s=known.lease_left_s,
-        version=known.version,
-    )
-
-
-def _detail(one: Assessment) -> str:
-    """Return what is worth knowing of a replica: what is wrong, else what is being done."""
-    link, progress = one.link, one.machine.progress
-    if one.why is not None:
-        return words(one.why)
-    if progress and (link is None or link.state is LinkState.CONNECTING):
-        return progress
-    return link.detail if link is not None else ""
-
-
-def _services(
-    spec: PoolSpec, links: Sequence[LinkReport], report: ProxyReport | None
-) -> list[ServiceStatus]:
-    counters = report.services if report is not None else {}
-    return [
-        ServiceStatus(
-            name=service.name,
-            type=service.type,
-            ready_replicas=sum(service.name in link.ready for link in links),
-            counters=counters.get(service.name, {}),
-        )
-        for service in spec.proxied
-    ]
 
 
 def event_status(event: Event) -> EventStatus:

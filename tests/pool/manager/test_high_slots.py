@@ -128,10 +128,8 @@ def seen() -> status.PoolStatus:
     admitted = Membership("pool", UID, 1, 1, tuple(Member(id, "") for id in listed))
     tick = Tick(IDENTITY, wanted, world.intent, world.observed, world.plan(), admitted)
     report = proxy_report.ProxyReport(7, NOW)
-    return status.of_tick(
-        tick, history=world.history, report=report, recent=[], epoch=1, manager_pid=1,
-        proxy_alive=True,
-    )  # fmt: skip
+    found = status.of_tick(tick, history=world.history, recent=[], epoch=1, manager_pid=1)
+    return found.joined(report, proxy_alive=True, links=world.observed.links)
 
 
 def test_status_shows_replicas_by_hand_beside_the_managers(

@@ -61,9 +61,7 @@ def test_the_phases_of_a_launch_are_told_as_far_as_they_are_known() -> None:
         decided = plan(UID, spec(), Intent(), observed, history)
         identity = Identity("pool", UID, "sky", "/pool.yaml", NOW)
         tick = Tick(identity, spec(), Intent(), observed, decided, None)
-        seen = status.of_tick(
-            tick, history=history, report=None, recent=[], epoch=1, manager_pid=1, proxy_alive=True
-        )
+        seen = status.of_tick(tick, history=history, recent=[], epoch=1, manager_pid=1)
         [one] = seen.replicas
         assert (one.provisioning_s, one.setup_s, one.starting_s, one.ready_after_s) == told
 
@@ -114,16 +112,16 @@ def tick_of(world: World) -> Tick:
 
 
 def status_of(world: World, **others: Any) -> status.PoolStatus:
-    return status.of_tick(
+    seen = status.of_tick(
         tick_of(world),
         history=world.history,
-        report=proxy_report.parse(REPORT, UID),
         recent=[Event(NOW, EventKind.LAUNCH, 0, 1, "c/r/a", Reason(Cause.NEW_SLOT))],
         epoch=3,
         manager_pid=11,
-        proxy_alive=True,
         **others,
     )
+    report = proxy_report.parse(REPORT, UID)
+    return seen.joined(report, proxy_alive=True, links=world.observed.links)
 
 
 def test_status_says_what_was_seen_and_survives_json() -> None:
