@@ -3,6 +3,9 @@
 An answer goes through `read` first, which looks into its bytes and may be slow: no lock is held.
 Bytes that are no response are refused there, before they count. Then `judge` says what it means.
 
+Replicas of actions and of stateful services must have more than single requests: goals,
+cancellations, an order. What decides for those says what else is to be sent, too.
+
 Owns: the interface of every decision; the first success, and the first that is ok.
 Not here: votes (`fogft.requests.votes`), actions (`fogft.proxy.robot.actions`), stateful services
 (`fogft.proxy.robot.service_order`); which requests await an answer (`first_response`).
@@ -10,9 +13,9 @@ Not here: votes (`fogft.requests.votes`), actions (`fogft.proxy.robot.actions`),
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from fogft.model.refusal import Refusal
 from fogft.requests.first_response import Pending
@@ -34,29 +37,54 @@ class Means(Enum):
 Judgement = Means | Refusal  # a refusal: as if the replica had refused the request
 
 
-class Decide(Protocol):
-    """Says what answers mean. All but `read` is called under the dispatcher's lock.
+class Send(NamedTuple):
+    """Something to be sent to a replica.
 
     Attributes:
-        accepts: Whether a response is a success; None where every one is.
-        flagged: Replicas whose answers do not count any more.
+        id: Of the attempt.
+        timeout_s: How long it is good for.
+        is_copy: It is a copy of a caller's request, and counted as one.
     """
 
-    accepts: Accepts | None
+    replica: int
+    id: bytes
+    payload: bytes
+    timeout_s: float
+    is_copy: bool = False
 
-    @property
-    def flagged(self) -> Collection[int]:
-        """Replicas whose answers do not count any more."""
+
+class Decide:
+    """Says what answers mean: the first response is the answer; with `accepts`, the first ok one.
+
+    All but `read` is called under the dispatcher's lock. What differs is overridden.
+
+    Args:
+        accepts: Whether a response is a success; None where every one is.
+
+    Attributes:
+        flagged: Replicas whose answers do not count any more.
+        replicates: Replicas must have more than single requests: `request_of`, `reach`, `take` and
+            `declined` are asked.
+        sends_requests: Requests leave by `take` too, in its order, and are not chosen for.
+    """
+
+    flagged: Collection[int] = ()
+    replicates = False
+    sends_requests = False
+
+    def __init__(self, accepts: Accepts | None = None) -> None:
+        self.accepts = accepts
 
     def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
         """Note a new request, and which replicas are able to answer it."""
 
     def read(self, payload: bytes) -> Any:
-        """Look into an answer.
+        """Look into an answer; here, whether it is ok.
 
         Raises:
             RosError: It is no response of this type.
         """
+        return self.accepts is None or self.accepts(payload)
 
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
@@ -70,6 +98,7 @@ class Decide(Protocol):
             reading: What `read` returned.
             pending: The request, while it awaits its answer.
         """
+        return Means.SUCCESS if reading else Means.REJECTION
 
     def refused(
         self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
@@ -81,44 +110,45 @@ class Decide(Protocol):
 
     def hears_out(self, request: bytes) -> bool:
         """Whether replicas go on working on a request that has ended."""
-
-    def report(self) -> dict[str, Any]:
-        """Return what people should know."""
-
-
-class FirstSuccess:
-    """The first response is the answer; with `accepts`, the first that is ok."""
-
-    flagged: Collection[int] = ()
-
-    def __init__(self, accepts: Accepts | None = None) -> None:
-        self.accepts = accepts
-
-    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
-        """Nothing need be noted."""
-
-    def read(self, payload: bytes) -> bool:
-        """Return whether it is ok."""
-        return self.accepts is None or self.accepts(payload)
-
-    def judge(
-        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
-    ) -> Judgement:
-        """Return whether it is a success."""
-        return Means.SUCCESS if reading else Means.REJECTION
-
-    def refused(
-        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
-    ) -> None:
-        """Nothing need be noted."""
-
-    def closed(self, request: bytes, pending: Pending[Any]) -> None:
-        """Nothing need be noted."""
-
-    def hears_out(self, request: bytes) -> bool:
-        """Nobody goes on: the others' answers are of no use."""
         return False
 
     def report(self) -> dict[str, Any]:
-        """Return nothing."""
+        """Return what people should know."""
         return {}
+
+    # -- what replicas must have ----------------------------------------------------------
+
+    @property
+    def ready(self) -> bool:
+        """Whether a request that is taken now can be answered, where `sends_requests`."""
+        return True
+
+    def request_of(self, id: bytes) -> bytes | None:
+        """Return the request that an attempt is about; None for one that is about none."""
+        return id
+
+    def reach(
+        self,
+        come: Collection[int],
+        now: float,
+        versions: Mapping[int, str],
+        leaving: Collection[int],
+    ) -> None:
+        """Note which replicas can be sent to.
+
+        Args:
+            come: Those that could not be before.
+            now: Seconds.
+            versions: All of them, and what each runs.
+            leaving: Those that are to go soon.
+        """
+
+    def take(self, now: float, timeout_s: float) -> Sequence[Send]:
+        """Return what is to be sent now, in this order; requests have `timeout_s`."""
+        return ()
+
+    def declined(self, id: bytes, replica: int, now: float) -> None:
+        """A replica's link did not take an attempt."""
+
+    def close(self) -> None:
+        """The service is not proxied any more."""

@@ -12,7 +12,7 @@ from fogft.model.choices import FallbackSpec
 from fogft.model.refusal import Refusal
 from fogft.requests.alarms import ALARM_S, FALSE_ALARMS, LATELY_S
 from fogft.requests.choose import All
-from fogft.requests.decide import FirstSuccess, Means
+from fogft.requests.decide import Decide, Means
 from fogft.requests.fallback import FallbackTimer
 from fogft.requests.first_response import Verdict
 from fogft.requests.pending import PendingRequests
@@ -26,7 +26,7 @@ class Item:
     payload: bytes
 
 
-class Spy(FirstSuccess):
+class Spy(Decide):
     """Notes what it is told; only `OK` is a success."""
 
     def __init__(self) -> None:

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-import operator
-
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.votes import LIMIT, Ballot, Votes
+from fogft.requests.first_response import Pending
+from fogft.requests.votes import LIMIT, Ballot, Quorum
 
 
-def within(tolerance: float):
-    return lambda a, b: abs(a - b) <= tolerance
+class Within:
+    """Numbers that agree where they are no further apart."""
+
+    def __init__(self, tolerance: float = 0.0) -> None:
+        self.tolerance = tolerance
+
+    def read(self, payload: bytes) -> float:
+        return float(payload)
+
+    def agree(self, one: float, other: float) -> bool:
+        return abs(one - other) <= self.tolerance
 
 
-def ballot(replica: int, value: float) -> Ballot[float]:
-    return Ballot(replica, value, f"{replica}:{value}".encode())
+def of(quorum: int, **kept: int) -> Quorum:
+    return Quorum(quorum, Within(), **kept)
+
+
+def ballot(replica: int, value: float) -> Ballot:
+    return Ballot(replica, value)
 
 
 @given(
@@ -24,18 +36,16 @@ def ballot(replica: int, value: float) -> Ballot[float]:
     st.sampled_from([0, 1]),
 )
 def test_an_answer_has_a_quorum_behind_it_and_there_is_one_at_most(quorum, cast, tolerance):
-    votes: Votes[float] = Votes(quorum, within(tolerance))
+    votes = Quorum(quorum, Within(tolerance))
     first: dict[int, int] = {}
     answers = []
     for replica, value in cast:
         first.setdefault(replica, value)
-        answer = votes.vote(b"r", ballot(replica, value))
-        if answer is not None:
+        if votes.vote(b"r", ballot(replica, value)):
             answers.append(value)
             assert sum(abs(v - value) <= tolerance for v in first.values()) >= quorum
-            assert answer == ballot(replica, value).payload
     assert len(answers) <= 1
-    assert votes.is_final(b"r") == bool(answers)
+    assert votes.hears_out(b"r") == bool(answers)
     if not answers:
         values = list(first.values())
         assert all(
@@ -47,21 +57,20 @@ def test_an_answer_has_a_quorum_behind_it_and_there_is_one_at_most(quorum, cast,
 @given(st.lists(st.permutations(range(5)), min_size=1, max_size=30), st.data())
 def test_the_honest_win_and_are_never_flagged_while_fewer_than_k_lie(orders, data):
     """Five replicas, a quorum of three, two liars, any order of arrival, any lies."""
-    votes: Votes[float] = Votes(3, operator.eq)
+    votes = of(3)
     for number, order in enumerate(orders):
         request = number.to_bytes(2, "big")
         for replica in order:
             value = 7.0 if replica < 3 else data.draw(st.sampled_from([7.0, 8.0, 9.0]))
-            answer = votes.vote(request, ballot(replica, value))
-            if answer is not None:
-                assert answer.endswith(b":7.0")
-        assert votes.is_final(request)
+            if votes.vote(request, ballot(replica, value)):
+                assert value == 7.0
+        assert votes.hears_out(request)
     assert votes.flagged <= {3, 4}
 
 
 @given(st.permutations([0, 1, 2]))
 def test_a_liar_is_flagged_after_a_few_requests_however_slow_it_is(order):
-    votes: Votes[float] = Votes(2, operator.eq)
+    votes = of(2)
     for number in range(LIMIT):
         assert 2 not in votes.flagged
         for replica in order:
@@ -72,33 +81,33 @@ def test_a_liar_is_flagged_after_a_few_requests_however_slow_it_is(order):
 
 def test_a_flagged_ballot_does_not_count():
     """One that is flagged cannot give a wrong answer its majority."""
-    votes: Votes[float] = Votes(2, operator.eq)
+    votes = of(2)
     votes.flagged.add(2)
-    assert votes.vote(b"r", ballot(2, 9.0)) is None
-    assert votes.vote(b"r", ballot(1, 9.0)) is None
-    assert votes.vote(b"r", ballot(0, 9.0)) == b"0:9.0"
+    assert votes.vote(b"r", ballot(2, 9.0)) is False
+    assert votes.vote(b"r", ballot(1, 9.0)) is False
+    assert votes.vote(b"r", ballot(0, 9.0)) is True
 
 
 def test_without_agreement_nobody_is_blamed():
-    votes: Votes[float] = Votes(2, operator.eq)
+    votes = of(2)
     for number in range(50):
         votes.vote(bytes([number]), ballot(0, 1.0))
         votes.vote(bytes([number]), ballot(1, 2.0))
-        votes.close(bytes([number]))
+        votes.closed(bytes([number]), Pending(0.0, None))
     assert not votes.flagged
     assert not votes.disagreed
     assert not votes.undecided
 
 
 def test_a_copy_is_no_second_vote():
-    votes: Votes[float] = Votes(2, operator.eq)
-    assert votes.vote(b"r", ballot(0, 1.0)) is None
-    assert votes.vote(b"r", ballot(0, 1.0)) is None
+    votes = of(2)
+    assert votes.vote(b"r", ballot(0, 1.0)) is False
+    assert votes.vote(b"r", ballot(0, 1.0)) is False
 
 
 def test_a_seldom_error_flags_nobody():
     """Two of twenty are forgiven: cosmic rays are no reason to replace a machine."""
-    votes: Votes[float] = Votes(2, operator.eq)
+    votes = of(2)
     for number in range(200):
         request = number.to_bytes(2, "big")
         for replica in (0, 1, 2):
@@ -109,7 +118,7 @@ def test_a_seldom_error_flags_nobody():
 
 
 def test_final_answers_are_kept_for_a_while_only():
-    votes: Votes[float] = Votes(1, operator.eq, kept=10)
+    votes = of(1, kept=10)
     for number in range(100):
         votes.vote(bytes([number]), ballot(0, 1.0))
-    assert sum(votes.is_final(bytes([n])) for n in range(100)) == 10
+    assert sum(votes.hears_out(bytes([n])) for n in range(100)) == 10

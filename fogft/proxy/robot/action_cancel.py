@@ -17,8 +17,7 @@ from typing import Any
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.spec import Part
-from fogft.proxy.robot.replication import Send
-from fogft.requests.decide import Accepts, Judgement, Means
+from fogft.requests.decide import Decide, Judgement, Send
 from fogft.requests.first_response import Pending
 from fogft.topics import goals
 from fogft.topics.goals import Goals
@@ -65,18 +64,16 @@ class Action:
         self.wake()
 
 
-class CancelPart:
+class CancelPart(Decide):
     """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile.
 
     What a replica cancels is begun on none that comes later.
     """
 
-    sends_requests = False
-    ready = True
-    flagged: Collection[int] = ()
+    replicates = True
 
     def __init__(self, action: Action) -> None:
-        self.accepts: Accepts | None = partial(goals.is_success, Part.CANCEL)
+        super().__init__(partial(goals.is_success, Part.CANCEL))
         self._action = action
         self._replicas: Collection[int] = ()
         self._sent: OrderedDict[bytes, tuple[bytes, float]] = OrderedDict()  # goal, until when
@@ -92,29 +89,21 @@ class CancelPart:
         while len(self._sent) > _CANCELS_KEPT:
             self._sent.popitem(last=False)
 
-    def read(self, payload: bytes) -> bool:
-        """Return whether something is cancelled."""
-        return goals.is_success(Part.CANCEL, payload)
-
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
         """Note what a replica has cancelled."""
-        if not reading:
-            return Means.REJECTION
-        with self._action.lock:
-            for goal in goals.cancelled(payload):
-                self._action.goals.cancelled(goal)
-        return Means.SUCCESS
+        if reading:
+            with self._action.lock:
+                for goal in goals.cancelled(payload):
+                    self._action.goals.cancelled(goal)
+        return super().judge(id, replica, payload, reading, pending)
 
     def refused(
         self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
     ) -> None:
         """A replica has not heard it."""
         self.declined(id, replica, self._action.clock())
-
-    def closed(self, request: bytes, pending: Pending[Any]) -> None:
-        """Replicas are told all the same."""
 
     def hears_out(self, request: bytes) -> bool:
         """All replicas shall be told, whoever was first."""
@@ -125,10 +114,6 @@ class CancelPart:
         return {"to_cancel": len(self._action.to_cancel)}
 
     # -- what replicas must have ----------------------------------------------------------
-
-    def request_of(self, id: bytes) -> bytes:
-        """Every attempt has the id of its request, or one that no request has."""
-        return id
 
     def reach(
         self,
@@ -163,6 +148,3 @@ class CancelPart:
                 self._action.to_cancel.append(
                     _ToCancel(goal, replica, now + _CANCEL_AGAIN_S, until)
                 )
-
-    def close(self) -> None:
-        """Nothing is held."""

@@ -24,8 +24,7 @@ from fogft.model.refusal import Effect, Refusal
 from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.action_cancel import Action, CancelPart
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.proxy.robot.replication import Send
-from fogft.requests.decide import Accepts, Judgement, Means
+from fogft.requests.decide import Decide, Judgement, Means, Send
 from fogft.requests.first_response import Pending
 from fogft.topics import goals
 from fogft.topics.goals import Had
@@ -33,15 +32,13 @@ from fogft.topics.goals import Had
 log = logging.getLogger(__name__)
 
 
-class _GoalPart:
+class _GoalPart(Decide):
     """`send_goal`: until a goal has its result, each replica is given it that does not have it."""
 
-    sends_requests = False
-    ready = True
-    flagged: Collection[int] = ()
+    replicates = True
 
     def __init__(self, action: Action, name: str) -> None:
-        self.accepts: Accepts | None = partial(goals.is_success, Part.GOAL)
+        super().__init__(partial(goals.is_success, Part.GOAL))
         self._action = action
         self._name = name
 
@@ -50,16 +47,12 @@ class _GoalPart:
         with self._action.lock:
             self._action.goals.made(pending.item.payload, request, able, pending.deadline)
 
-    def read(self, payload: bytes) -> bool:
-        """Return whether it was accepted."""
-        return goals.is_success(Part.GOAL, payload)
-
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
         """Remember who has the goal: before its client can know, and ask for the result."""
         self._took(id, replica, accepts=reading)
-        return Means.SUCCESS if reading else Means.REJECTION
+        return super().judge(id, replica, payload, reading, pending)
 
     def _took(self, id: bytes, replica: int, *, accepts: bool) -> None:
         action, now = self._action, self._action.clock()
@@ -95,10 +88,6 @@ class _GoalPart:
         return {"goals": self._action.goals.kept}
 
     # -- what replicas must have ----------------------------------------------------------
-
-    def request_of(self, id: bytes) -> bytes:
-        """Every attempt has the id of its request, or one that no request has."""
-        return id
 
     def reach(
         self,
@@ -140,7 +129,7 @@ class _GoalPart:
             self._action.goals.clear()
 
 
-class _ResultPart:
+class _ResultPart(Decide):
     """`get_result`: the first replica that succeeds; the others are told to cancel the goal.
 
     Where a replica does not know the goal, it may be about to be given it, or has lost it: it is
@@ -148,10 +137,8 @@ class _ResultPart:
     of it: then that is its result.
     """
 
-    flagged: Collection[int] = ()
-
     def __init__(self, action: Action) -> None:
-        self.accepts: Accepts | None = partial(goals.is_success, Part.RESULT)
+        super().__init__(partial(goals.is_success, Part.RESULT))
         self._action = action
 
     def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
@@ -159,16 +146,12 @@ class _ResultPart:
         with self._action.lock:
             self._action.goals.awaited(goals.goal_of(pending.item.payload))
 
-    def read(self, payload: bytes) -> bool:
-        """Return whether the goal has succeeded."""
-        return goals.is_success(Part.RESULT, payload)
-
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
         """Take a result."""
         if pending is None:
-            return Means.SUCCESS if reading else Means.REJECTION
+            return super().judge(id, replica, payload, reading, pending)
         action, goal = self._action, goals.goal_of(pending.item.payload)
         now, unknown = action.clock(), goals.is_unknown(payload)
         with action.lock:
@@ -197,14 +180,6 @@ class _ResultPart:
         with self._action.lock:
             self._action.goals.ended(goals.goal_of(pending.item.payload))
 
-    def hears_out(self, request: bytes) -> bool:
-        """The others are told to cancel the goal instead."""
-        return False
-
-    def report(self) -> dict[str, Any]:
-        """Return nothing."""
-        return {}
-
 
 class Actions:
     """Makes the dispatchers of actions, and has those of one action share what they must."""
@@ -225,11 +200,9 @@ class Actions:
         action = self._actions.setdefault(name, Action(self._clock, wake))
         make = partial(Dispatcher, spec, respond, wake=wake, clock=self._clock, fault_of=fault_of)
         if spec.part is Part.GOAL:
-            goal = _GoalPart(action, spec.name)
-            return make(decide=goal, replication=goal)
+            return make(decide=_GoalPart(action, spec.name))
         if spec.part is Part.CANCEL:
-            cancel = CancelPart(action)
-            return make(decide=cancel, replication=cancel)
+            return make(decide=CancelPart(action))
         result = make(decide=_ResultPart(action))
         action.began = lambda goal, replica: result.began_anew(replica, partial(_is_about, goal))
         return result

@@ -4,9 +4,8 @@ All requests live one life: registered, sent, answered, delivered; or the deadli
 caller takes it back. What differs between services is put in:
 
 * *choose* (`requests.choose`): which replicas are asked first, which next, and when;
-* *decide* (`requests.decide`): what an answer means;
-* *deliver* (`delivery`): how the end reaches the caller;
-* *replicate* (`replication`): what else replicas of actions and stateful services must have.
+* *decide* (`requests.decide`): what an answer means, and what else replicas must have;
+* *deliver* (`delivery`): how the end reaches the caller.
 
 `submit` is called by the thread that takes ROS requests and never blocks. Answers come from the
 links' threads, which may not send: that is left to the next `tick`, which `wake` brings about.
@@ -34,11 +33,10 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.delivery import Delivery, Respond
-from fogft.proxy.robot.replication import Replication
 from fogft.proxy.robot.request import Ledger, Request
 from fogft.proxy.robot.sending import Sender, key_of
 from fogft.requests.auto import policy
-from fogft.requests.decide import Accepts, Decide, FirstSuccess, Means
+from fogft.requests.decide import Accepts, Decide, Means
 from fogft.requests.first_response import Verdict
 from fogft.requests.load import NEVER
 from fogft.requests.pending import PendingRequests
@@ -59,7 +57,6 @@ class Dispatcher:
         spec: The service and its policy.
         respond: Sends a response to a caller. Any thread.
         decide: What answers mean; the first success unless given.
-        replication: What else replicas must have.
         fault_of: Returns what is wrong with the bytes of a response; empty for nothing. One that
             is malformed is a failure of its replica, and another answer is awaited.
         ok_of: Returns, for a name of a boolean response field, whether a response is a success;
@@ -81,7 +78,6 @@ class Dispatcher:
         respond: Respond,
         *,
         decide: Decide | None = None,
-        replication: Replication | None = None,
         fault_of: Callable[[bytes], str] = lambda payload: "",
         ok_of: Callable[[str], Accepts] | None = None,
         empty_response: bytes | None = None,
@@ -100,11 +96,11 @@ class Dispatcher:
         self._clock = clock
         self.max_pending_bytes = max_pending_bytes
         self.max_pending = max_pending
-        self._decide = FirstSuccess() if decide is None else decide
-        self._replication = replication
+        self._decide = Decide() if decide is None else decide
+        self._replication = self._decide if self._decide.replicates else None
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
-        self._busy_until = NEVER if replication is not None else -NEVER
+        self._busy_until = NEVER if self._decide.replicates else -NEVER
         self._requests: PendingRequests[Request] = PendingRequests(
             policy(spec),
             self._decide,
@@ -114,7 +110,7 @@ class Dispatcher:
         self._ledger = Ledger(spec, self._requests, clock)
         self._lock = self._ledger.lock
         self.outcomes = self._ledger.outcomes
-        self._sender = Sender(self._ledger, replication)
+        self._sender = Sender(self._ledger)
         self._delivery = Delivery(self._ledger, respond, empty_response, self._sender.forget)
 
     @property
@@ -130,10 +126,7 @@ class Dispatcher:
     @property
     def able(self) -> bool:
         """Whether a request that comes now can be answered."""
-        order = self._replication
-        if order is not None and order.sends_requests:
-            return order.ready
-        return bool(self._sender.able)
+        return self._decide.ready if self._decide.sends_requests else bool(self._sender.able)
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to whom the policy chooses."""
@@ -404,8 +397,7 @@ class Dispatcher:
     def close(self) -> None:
         """Let go of what is held outside."""
         with self._lock:
-            if self._replication is not None:
-                self._replication.close()
+            self._decide.close()
 
     def disagrees(self, replica: int) -> bool:
         """Whether a replica's answers have differed, or were malformed, repeatedly."""

@@ -224,7 +224,7 @@ def make_dispatcher(
     if spec.state is not None:
         mark = marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}"
         order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake)
-        return make(decide=order, replication=order, max_pending_bytes=_STATEFUL_BYTES)
+        return make(decide=order, max_pending_bytes=_STATEFUL_BYTES)
     if id_of is not None:
         make = functools.partial(make, id_of=id_of)
     ok_of = functools.partial(messages.bool_field, spec.type)

@@ -14,7 +14,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from fogft.link.port import Link
 from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
-from fogft.proxy.robot.replication import Replication
 from fogft.proxy.robot.request import Ledger
 from fogft.requests.load import NEVER, Handling
 
@@ -24,7 +23,6 @@ class Sender:
 
     Args:
         ledger: The service's requests.
-        replication: What else replicas must have.
 
     Attributes:
         links: Those that may be asked, by replica.
@@ -32,9 +30,10 @@ class Sender:
         next_look: When the policy wants to be asked, as `offer_more` found it.
     """
 
-    def __init__(self, ledger: Ledger, replication: Replication | None) -> None:
+    def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
-        self._replication = replication
+        decide = ledger.requests.decide
+        self._replication = decide if decide.replicates else None
         self._sending = threading.Lock()  # what replicas must have leaves in its order
         self._in_burst = False
         self._hanging: set[int] = set()

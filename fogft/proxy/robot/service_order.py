@@ -19,8 +19,7 @@ from fogft.model.refusal import Refusal
 from fogft.ordering.orders import Op, OrderError, OrderId, decode, encode
 from fogft.ordering.sequencer import Handover, Sequencer
 from fogft.proxy.order_mark import OrderMark
-from fogft.proxy.robot.replication import Send
-from fogft.requests.decide import Accepts, Judgement, Means
+from fogft.requests.decide import Decide, Judgement, Means, Send
 from fogft.requests.first_response import Pending
 
 log = logging.getLogger(__name__)
@@ -29,10 +28,8 @@ log = logging.getLogger(__name__)
 _ATTEMPT_S = 60.0
 
 
-class ServiceOrder:
+class ServiceOrder(Decide):
     """Numbers requests, and says what to send to whom and when an answer counts.
-
-    See `requests.decide.Decide` and `replication.Replication`.
 
     Args:
         name: The service's.
@@ -41,8 +38,7 @@ class ServiceOrder:
         clock: Monotonic seconds.
     """
 
-    sends_requests = True
-    flagged: Collection[int] = ()
+    replicates = sends_requests = True
 
     def __init__(
         self,
@@ -52,7 +48,7 @@ class ServiceOrder:
         wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.accepts: Accepts | None = None
+        super().__init__()
         self._name = name
         self._mark = mark
         self._wake = wake
@@ -126,9 +122,6 @@ class ServiceOrder:
         if op not in (Op.APPLY, Op.RECALL):
             return None
         return self._requests.get(number, b"") if epoch == self._term.epoch else b""
-
-    def read(self, payload: bytes) -> None:
-        """Every answer counts alike."""
 
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None

@@ -78,7 +78,6 @@ class Scene:
             self.spec,
             lambda handle, payload: self.responses.append((handle, payload)),
             decide=order,
-            replication=order,
             empty_response=b"empty",
             clock=self.clock,
         )
