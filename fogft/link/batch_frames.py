@@ -45,7 +45,6 @@ def encode_requests(
 
     Args:
         requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
-        origin: From `frame.origin`.
         seen: The stamp of the last answer that the connection has seen.
     """
     parts = []

@@ -33,9 +33,6 @@ _SHARE_OF_NEW = 0.3
 class Compression:
     """Compresses the payloads of one service on one connection. Used by one thread.
 
-    Args:
-        clock: Seconds, for how long compressing takes.
-
     Attributes:
         ratio: Compressed against plain size, as last seen; None before the first trial.
         saved_bytes: What was not sent.

@@ -30,9 +30,7 @@ class Counters:
         """Count an event and log it, the more often it happens the more seldom.
 
         Args:
-            event: Under which name it is counted.
             message: The line, with a place for each of `values`; the count is added to it.
-            values: What happened.
         """
         count = self.add(event)
         if worth_logging(count):

@@ -18,11 +18,7 @@ _FRAME_BYTES = 256  # what travels with a payload: key, header, encryption
 
 
 class Credit:
-    """A credit of bytes for one peer: used by sending, regained by what the peer acknowledges.
-
-    Args:
-        limit: Bytes that may be on the way.
-    """
+    """A credit of bytes for one peer: used by sending, regained by what the peer acknowledges."""
 
     def __init__(self, limit: int = CREDIT_BYTES) -> None:
         self._limit = limit

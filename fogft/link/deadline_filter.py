@@ -14,24 +14,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterable
-from typing import Protocol
 
 from fogft.link.compression import Compression
+from fogft.link.window import OpenAttempt
 from fogft.log_limits import worth_logging
 
 log = logging.getLogger(__name__)
-
-
-class Sized(Protocol):
-    """What must be known of an attempt."""
-
-    @property
-    def service(self) -> str:
-        """Name of the service."""
-
-    @property
-    def size(self) -> int:
-        """Bytes of its payload."""
 
 
 class DeadlineFilter:
@@ -63,15 +51,14 @@ class DeadlineFilter:
 
     def may_arrive(
         self,
-        attempt: Sized,
+        attempt: OpenAttempt,
         remaining_s: float,
         now: float,
-        before: Callable[[str], Iterable[Sized]] = lambda service: (),
+        before: Callable[[str], Iterable[OpenAttempt]] = lambda service: (),
     ) -> bool:
         """Whether an attempt may arrive while there is time, for all that is known.
 
         Args:
-            remaining_s: The time that it has.
             before: Returns what leaves before a request to a service.
         """
         rate = self._carries(now)
@@ -80,7 +67,7 @@ class DeadlineFilter:
         size = self._left(now, rate) + sum(
             map(self._on_the_way, (attempt, *before(attempt.service)))
         )
-        if enough(size, rate, remaining_s):
+        if size <= rate * remaining_s:
             return True
         self.declined += 1
         if worth_logging(self.declined):
@@ -90,15 +77,10 @@ class DeadlineFilter:
             )  # fmt: skip
         return False
 
-    def _on_the_way(self, attempt: Sized) -> float:
+    def _on_the_way(self, attempt: OpenAttempt) -> float:
         """Return how many bytes an attempt will be at least; 0 where that is not known."""
         compression = self._packs(attempt.service)
         if compression is None:
             return attempt.size
         ratio = compression.ratio
         return 0.0 if ratio is None else attempt.size * min(1.0, ratio)
-
-
-def enough(size_bytes: float, bytes_per_s: float, remaining_s: float) -> bool:
-    """Whether so many bytes leave in the time that remains."""
-    return size_bytes <= bytes_per_s * remaining_s

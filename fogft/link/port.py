@@ -328,9 +328,6 @@ class Listener(Protocol):
         """Begin to listen. Callbacks come from the wire's threads and must not block.
 
         Args:
-            services: Service name -> key.
-            on_request: Takes a request.
-            on_probe: Answers a probe.
             on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
                 block for a moment, which holds up nothing but probes.
         """

@@ -39,8 +39,6 @@ class Throughput:
         """Take what was acknowledged since the last look.
 
         Args:
-            moved: So many bytes.
-            lasted_s: In so many seconds.
             queued: Whether more than that waited the whole time.
         """
         self._still_s += lasted_s
@@ -162,11 +160,7 @@ class SocketProgress:
         self._rate = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
 
     def left_bytes(self, now: float, bytes_per_s: float) -> float:
-        """Return what of the outstanding bytes will not have arrived yet.
-
-        Args:
-            bytes_per_s: At which they leave.
-        """
+        """Return what of the outstanding bytes will not have arrived yet."""
         outstanding = self._last.outstanding if self._last is not None else 0
         return max(0.0, outstanding - bytes_per_s * (now - self._last_at))
 

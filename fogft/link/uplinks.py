@@ -269,9 +269,6 @@ class _Events:
 class UplinkDialer:
     """Makes links that use several uplinks; see `port.Dialer`.
 
-    Args:
-        inner: Makes the link of one uplink.
-
     Attributes:
         interfaces: Names of network interfaces, the preferred one first; none for whatever the
             routes say.

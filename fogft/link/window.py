@@ -1,8 +1,8 @@
-"""A link's open attempts, bounded by number and by bytes. No clock, no Zenoh.
+"""What a connection keeps of attempts: those open, unanswered, or about to leave together.
 
-An attempt is in here from the moment it is accepted until it has ended; whoever removes it
+An attempt is in its window from the moment it is accepted until it has ended; whoever removes it
 reports its end, so that each end is reported once. The offering thread, the sender thread
-and Zenoh's threads meet here: each step holds one short lock.
+and Zenoh's threads meet here: each step holds one short lock. No clock, no Zenoh.
 
 Owns: which attempts are open, and whether there is room. Not here: sending, deadlines.
 """
@@ -10,7 +10,10 @@ Owns: which attempts are open, and whether there is room. Not here: sending, dea
 from __future__ import annotations
 
 import threading
-from typing import Generic, Protocol, TypeVar
+from dataclasses import dataclass
+
+from fogft.link import batch_frames
+from fogft.requests.load import Handling
 
 # 512 small attempts cost less than 1 MB (here and in Zenoh); the bytes are what
 # a slow replica can make us hold.
@@ -18,26 +21,33 @@ ATTEMPTS_LIMIT = 512
 BYTES_LIMIT = 64 << 20
 
 
-class Attempt(Protocol):
-    """What the window must know of an attempt."""
+@dataclass(slots=True, eq=False)
+class OpenAttempt:
+    """A request on its way through one connection.
 
-    @property
-    def request_id(self) -> bytes:
-        """Whose attempt it is."""
+    Attributes:
+        payload: None once it was sent, or is not wanted.
+        size: Bytes of its payload.
+        offered: When, and until when it is of use, in monotonic seconds.
+        mark: What the connection had sent once this was sent (`credit`).
+        reads_packed: The answer may be compressed.
+    """
 
-    @property
-    def size(self) -> int:
-        """Bytes that it holds, or makes the replica hold, until it ends."""
+    service: str
+    request_id: bytes
+    payload: bytes | None
+    size: int
+    offered: float
+    deadline: float
+    handling: Handling = Handling.NORMAL
+    mark: int = 0
+    reads_packed: bool = False
 
 
-A = TypeVar("A", bound=Attempt)
-
-
-class LinkWindow(Generic[A]):
+class LinkWindow:
     """The attempts open on one connection.
 
     Args:
-        limit: The most attempts at once.
         limit_bytes: The most bytes at once; a larger single attempt still gets in alone.
     """
 
@@ -45,7 +55,7 @@ class LinkWindow(Generic[A]):
         self._limit = limit
         self._limit_bytes = limit_bytes
         self._lock = threading.Lock()
-        self._open: dict[bytes, A] = {}
+        self._open: dict[bytes, OpenAttempt] = {}
         self._bytes = 0
         self._closed = False
         self._declined = False
@@ -58,7 +68,7 @@ class LinkWindow(Generic[A]):
         """Bytes of all open attempts."""
         return self._bytes
 
-    def admit(self, attempt: A) -> bool:
+    def admit(self, attempt: OpenAttempt) -> bool:
         """Take an attempt in; False when full, closed, or its request is open already."""
         size = attempt.size
         with self._lock:
@@ -72,16 +82,16 @@ class LinkWindow(Generic[A]):
             self._bytes += size
             return True
 
-    def attempts(self) -> list[A]:
+    def attempts(self) -> list[OpenAttempt]:
         """Return what is open now, oldest first."""
         with self._lock:
             return list(self._open.values())
 
-    def holds(self, attempt: A) -> bool:
+    def holds(self, attempt: OpenAttempt) -> bool:
         """Whether this attempt, and not a later one of its request, is open."""
         return self._open.get(attempt.request_id) is attempt
 
-    def remove(self, attempt: A) -> bool:
+    def remove(self, attempt: OpenAttempt) -> bool:
         """End an attempt; False when it has ended before."""
         with self._lock:
             if self._open.get(attempt.request_id) is not attempt:
@@ -90,7 +100,7 @@ class LinkWindow(Generic[A]):
             self._bytes -= attempt.size
             return True
 
-    def forget(self, request_id: bytes) -> A | None:
+    def forget(self, request_id: bytes) -> OpenAttempt | None:
         """End the attempt of a request, whichever it is, and return it if there was one."""
         with self._lock:
             attempt = self._open.pop(request_id, None)
@@ -110,7 +120,7 @@ class LinkWindow(Generic[A]):
                 return True
             return False
 
-    def close(self) -> list[A]:
+    def close(self) -> list[OpenAttempt]:
         """Let nothing more in, and return what was open: it has ended."""
         with self._lock:
             self._closed = True
@@ -118,3 +128,76 @@ class LinkWindow(Generic[A]):
             self._open.clear()
             self._bytes = 0
             return ended
+
+
+# The window holds 512; a replica that never answers what was forgotten holds no more than this.
+UNANSWERED_LIMIT = 8192
+
+
+class Unanswered:
+    """The requests sent on one connection and not answered yet, by id."""
+
+    def __init__(self, limit: int = UNANSWERED_LIMIT) -> None:
+        self._limit = limit
+        self._attempts: dict[bytes, OpenAttempt] = {}
+        self._lock = threading.Lock()
+        self._sent = 0
+        self._answered = 0  # counted by one thread, Zenoh's
+
+    @property
+    def owed(self) -> int:
+        """How many more requests were sent than answers came, those to unknown ids included."""
+        return self._sent - self._answered
+
+    def __len__(self) -> int:
+        return len(self._attempts)
+
+    def add(self, attempt: OpenAttempt) -> None:
+        """Note an attempt that is about to be sent; it takes the place of one of its request."""
+        with self._lock:
+            self._sent += 1
+        self._attempts[attempt.request_id] = attempt
+        if len(self._attempts) > self._limit:
+            for id in list(self._attempts)[: self._limit // 8]:
+                self._attempts.pop(id, None)
+
+    def answered(self, request_id: bytes) -> OpenAttempt | None:
+        """Return whom an answer is for, once; None if nobody awaits it."""
+        self._answered += 1
+        return self._attempts.pop(request_id, None)
+
+
+class BatchBuffer:
+    """Small attempts of one service that wait to leave in one message. Any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._attempts: list[OpenAttempt] = []
+        self._bytes = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._attempts)
+
+    def add(self, attempt: OpenAttempt) -> list[OpenAttempt]:
+        """Hold a small attempt; return those that leave now because it does not fit to them."""
+        with self._lock:
+            full = (
+                len(self._attempts) >= batch_frames.LIMIT
+                or self._bytes + attempt.size > batch_frames.BYTES_LIMIT
+                or (self._attempts and self._attempts[0].service != attempt.service)
+            )
+            leaving = self._take() if full else []
+            self._attempts.append(attempt)
+            self._bytes += attempt.size
+            return leaving
+
+    def take(self) -> list[OpenAttempt]:
+        """Return all that is held, in order."""
+        if not self._attempts:  # the usual case, without the lock
+            return []
+        with self._lock:
+            return self._take()
+
+    def _take(self) -> list[OpenAttempt]:
+        taken, self._attempts, self._bytes = self._attempts, [], 0
+        return taken

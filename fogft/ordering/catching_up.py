@@ -24,11 +24,8 @@ class CatchingUp:
     """A term's log, and how far each replica has come in it.
 
     Args:
-        epoch: The term.
         counts: Whether a replica's state may be given to others, and its answer to a caller.
         handed_over: Whether the term begins with what replicas of another version left.
-        log_entries: Requests kept at most.
-        log_bytes: Their bytes at most.
     """
 
     def __init__(

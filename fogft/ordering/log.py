@@ -23,7 +23,6 @@ class OrderedLog:
 
     Args:
         start: The number after which it begins: all before is part of a state.
-        entries_limit: The most entries; one more is refused.
         bytes_limit: Their bytes together; a larger single entry still gets in alone.
     """
 

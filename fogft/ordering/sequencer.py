@@ -51,8 +51,6 @@ class Sequencer:
         mark: The position of the last answer that was returned, in whatever term.
         holder: The version that returned it; None where nobody knows.
         begin: What the term begins from, where a version takes over from another.
-        log_entries: Requests kept at most.
-        log_bytes: Their bytes at most.
 
     Attributes:
         active: Whose answers count.
@@ -150,10 +148,7 @@ class Sequencer:
         """Set which replicas can be sent to; new ones are claimed at once.
 
         Args:
-            replicas: Them.
-            now: In seconds.
             versions: What each runs; all the same unless told.
-            leaving: Those that are to go soon.
         """
         wanted = set(replicas)
         self._versions, self._leaving = versions or {}, frozenset(leaving)

@@ -1,4 +1,6 @@
 """The processes that requests pass through, and their configuration.
 
+Clocks, and moments called `now`, are monotonic seconds here and in all that is below.
+
 Not here: who decides (`fogft.requests`, `fogft.ordering`), links (`fogft.link`).
 """

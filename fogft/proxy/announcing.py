@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Protocol
 
 from fogft.link.dial_out.replica import DialOut
 from fogft.model.plain import to_plain
@@ -24,25 +23,10 @@ log = logging.getLogger(__name__)
 _NOTHING = Known()
 
 
-class Records(Protocol):
-    """What is needed of a record client."""
-
-    @property
-    def known(self) -> Known:
-        """What is known now."""
-
-    def publish(
-        self, kind: RecordKind, subject: str, generation: int, content: dict[str, object]
-    ) -> None:
-        """Say something of our own."""
-
-
 class Announcer:
     """Keeps one replica's record true.
 
     Args:
-        id: Which replica.
-        records: Where it is published.
         endpoint: ``host:port`` as it was told; empty if it was not.
         port: The port that it listens at.
         dials_out: It cannot be reached.
@@ -51,7 +35,7 @@ class Announcer:
     def __init__(
         self,
         id: ReplicaId,
-        records: Records,
+        records: RendezvousClient,
         *,
         endpoint: str,
         port: int,
@@ -86,7 +70,6 @@ class Presence:
     """A replica at the rendezvous and at the doors of those it has to dial.
 
     Args:
-        config: The server proxy's.
         listening: ``host:port`` of its own listener.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,6 @@ from fogft.model.proxy_config import ClientProxyConfig, ServerProxyConfig
 from fogft.poolfile import config_file
 
 DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
-
-
-@dataclass(frozen=True)
-class GatewayConfig:
-    """All that `fogft gateway` needs to know: a client proxy's, and where robots reach it.
-
-    Attributes:
-        listen: ``host:port``.
-    """
-
-    client: ClientProxyConfig
-    listen: str
 
 
 def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
@@ -39,14 +27,14 @@ def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
 
 def read_gateway(
     path: Path, listen: str | None = None, metrics: str | None = None
-) -> GatewayConfig:
+) -> ClientProxyConfig:
     """Read a gateway's configuration; `listen` and `metrics` replace what it says.
 
     Raises:
         StateError: It cannot be read, or a key is missing or of the wrong type.
     """
     config = read_client(path, metrics)
-    return GatewayConfig(config, listen or config.listen or DEFAULT_GATEWAY_LISTEN)
+    return replace(config, listen=listen or config.listen or DEFAULT_GATEWAY_LISTEN)
 
 
 def read_server(path: Path, **override: Any) -> ServerProxyConfig:

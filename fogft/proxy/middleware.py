@@ -102,10 +102,7 @@ def join(
     """Make a node.
 
     Args:
-        speaks: How.
-        name: The node's name.
         domain_id: The ROS domain; None for what the environment says.
-        early: What `join_early` returned.
         told: Returns the definitions of types as replicas tell them.
         noticed: Called, from any thread, when a type may be known that was not.
         environ: Where the variables of ROS and Zenoh are, for Zenoh.

@@ -29,7 +29,6 @@ class OrderMark:
 
     Args:
         path: Where it lies; made if it is not there, with its folder.
-        pool_uid: Whose it is.
 
     Raises:
         StateError: It cannot be used, or belongs to another pool.

@@ -1,4 +1,6 @@
 """What becomes of one request: hedging, the first success, votes, fallback, admission. Pure.
 
+Moments called `now` are seconds on one monotonic clock, the caller's.
+
 Not here: sending (`fogft.proxy.robot`).
 """

@@ -109,12 +109,7 @@ class AdmissionQueue(Generic[T]):
             heapq.heapify(queue.heap)
 
     def evict(self, robot: str, deadline: float) -> T | None:
-        """Take out what must go for a newcomer to fit in; None if the newcomer itself must.
-
-        Args:
-            robot: Whose request came.
-            deadline: Its deadline.
-        """
+        """Take out what must go for a newcomer to fit in; None if the newcomer itself must."""
         most = max(self._robots.values(), key=lambda queue: queue.waiting, default=None)
         own = self._robots.get(robot)
         if most is None:

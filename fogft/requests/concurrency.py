@@ -64,8 +64,6 @@ class ConcurrencyLimit:
 
         Args:
             level: How many were at work when it began, itself included.
-            took_s: How long it took, in seconds.
-            now: Seconds.
         """
         weight = 1.0 if self._mean_s is None else _WEIGHT
         self._mean_s = (self._mean_s or 0.0) * (1 - weight) + weight * took_s

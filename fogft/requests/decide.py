@@ -92,9 +92,6 @@ class Decide:
         """Return what an answer means.
 
         Args:
-            id: Of the attempt.
-            replica: Who answered.
-            payload: The answer.
             reading: What `read` returned.
             pending: The request, while it awaits its answer.
         """
@@ -138,9 +135,7 @@ class Decide:
 
         Args:
             come: Those that could not be before.
-            now: Seconds.
             versions: All of them, and what each runs.
-            leaving: Those that are to go soon.
         """
 
     def take(self, now: float, timeout_s: float) -> Sequence[Send]:

@@ -108,11 +108,6 @@ class FirstResponse(Generic[T]):
         """Enter a request, with the replicas that are about to be asked.
 
         Args:
-            request: Its id.
-            deadline: On the caller's clock, seconds.
-            item: What the caller keeps with it.
-            replicas: Who is about to be asked.
-            now: On the caller's clock, seconds.
             complete: Whether these are all that there are: until something happens to it, the
                 request need not be looked at again.
 
@@ -174,9 +169,6 @@ class FirstResponse(Generic[T]):
         """Note a failed attempt. The replica is left alone for a moment, longer each time.
 
         Args:
-            request: The request.
-            replica: Whose attempt ended.
-            now: On the caller's clock, seconds.
             counts: Whether it counts towards the limit of attempts. A lost link does
                 not: the replica may never have seen the request.
             bar: Never ask this replica for this request again.

@@ -24,7 +24,6 @@ class Latencies:
     """Recent latencies of one replica's answers to one service.
 
     Args:
-        half_life: After so many samples one weighs half.
         half_life_s: After so much time one weighs half, in seconds.
     """
 

@@ -79,9 +79,7 @@ class Demand:
         """Return how many replicas would do, where those that there are do not; else 0.
 
         Args:
-            able: How many there are.
             service_s: What a replica takes for a request, divided by how many it has at once.
-            now: Seconds.
         """
         work = self._lately(now) / _DEMAND_OVER_S * service_s
         return math.ceil(work / _FULL) if work > _TOO_FULL * max(1, able) else 0
@@ -149,7 +147,6 @@ class ReplicaLoad:
         which nothing is known: it is tried.
 
         Args:
-            now: Seconds.
             typical_s: The service time of most replicas. One that is not four times as slow or
                 as quick is taken for equal: where times vary, a few answers say no more.
         """

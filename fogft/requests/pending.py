@@ -198,13 +198,9 @@ class PendingRequests(Generic[T]):
         """Take an answer.
 
         Args:
-            id: Of the attempt.
             request: What it is about; None for no request.
-            replica: Who answered.
-            payload: Its bytes.
             reading: What `Decide.read` makes of them.
             load: What the replica has to do, if it says so.
-            now: Seconds.
 
         Returns:
             What it means; the request that it answers, None where it comes too late or is no

@@ -46,8 +46,6 @@ class Quorum(Decide):
     tells a wrong one.
 
     Args:
-        quorum: How many must agree.
-        comparison: What agreeing means.
         newly_flagged: Called with a replica that has disagreed once too often, and how often.
         kept: Final answers kept to judge late ballots by.
 

@@ -77,10 +77,7 @@ class Server:
     part of the key.
 
     Args:
-        session: The Zenoh session.
         token: How it is told, without a hash.
-        on_request: Gets the serialised request and a handle.
-        fault: Says why bytes are no response.
         probes: Asks the clients' nodes whether they take what they got.
     """
 
@@ -195,10 +192,8 @@ class Client:
     """A client of a service (`fogft.ros.port.RosClient`).
 
     Args:
-        session: The Zenoh session.
         token: How it is told, without a hash.
         servers: Returns the type hash of each server that is there now.
-        fault: Says why bytes are no request.
     """
 
     def __init__(

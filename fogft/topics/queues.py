@@ -19,7 +19,6 @@ class Ring:
     """The last messages that a replica's nodes published.
 
     Args:
-        depth: How many are kept.
         latched: Whether a robot that has none yet gets what is kept.
         kept_bytes: Their bytes together, at most; the newest is kept in any case.
     """
@@ -67,7 +66,6 @@ class Outbox:
 
     Args:
         depth: Messages that wait at most; the oldest go first.
-        window: Messages under way at once.
         kept_bytes: Bytes of those that wait, at most; the newest is kept in any case.
     """
 

@@ -47,11 +47,7 @@ class Leader:
 
 
 class Selection:
-    """Decides message by message.
-
-    Args:
-        select: By what.
-    """
+    """Decides message by message."""
 
     def __init__(self, select: Select) -> None:
         self._select = select

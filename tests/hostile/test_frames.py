@@ -19,7 +19,7 @@ from fogft.link import batch_frames, frame, probe_frames
 from fogft.link.frame import NO_LOAD
 from fogft.link.port import Answer, Probe
 from fogft.link.zenoh import settings as config
-from fogft.link.zenoh.robot.attempt import read_reply
+from fogft.link.zenoh.robot.connection import read_reply
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names

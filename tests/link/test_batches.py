@@ -15,11 +15,11 @@ from fogft.errors import FrameError
 from fogft.link import batch_frames, frame
 from fogft.link.frame import NO_LOAD, NO_STAMP
 from fogft.link.port import Incoming, Probe, ProbeAnswer
+from fogft.link.window import BatchBuffer, OpenAttempt
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueue
-from fogft.link.zenoh.robot.attempt import BatchBuffer, OpenAttempt
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal

@@ -36,7 +36,6 @@ class DialOut:
 
     Args:
         local: ``host:port`` of this replica's own listener.
-        sign: Proves who we are.
     """
 
     def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:

@@ -60,7 +60,6 @@ class DialIn:
     Args:
         listen: ``host:port``; port 0 for any that is free.
         pool_uid: Replicas of other pools are turned away.
-        verify: Tells who signed a greeting.
         revoked: Common names that are turned away.
 
     Raises:

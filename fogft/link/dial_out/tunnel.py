@@ -25,8 +25,6 @@ def receive(link: socket.socket, limit_bytes: int, within_s: float) -> dict[str,
 
     Args:
         link: The connection. It is left with what remains of the time as its time-out.
-        limit_bytes: The longest that it may be.
-        within_s: How long it may take, in seconds.
 
     Raises:
         OSError: It did not come in time, or the connection broke.

@@ -2,6 +2,9 @@
 
 Asks the endpoint again with plain TCP and TLS. Called after a failure only, never on the
 way to an answer; `fogft doctor` may call it too.
+
+A certificate begins 24 hours before it was made. So one that is "not yet valid" was made by
+a clock a day ahead of the one that judges it, and TLS's word for it helps nobody.
 """
 
 from __future__ import annotations
@@ -10,10 +13,10 @@ import contextlib
 import datetime
 import socket
 import ssl
+from dataclasses import dataclass
 
 from fogft.errors import CredentialError
 from fogft.link.port import Peer
-from fogft.link.zenoh.validity import judged_here, judged_there, validity_of
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import host_and_port
 
@@ -34,7 +37,6 @@ def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
     """Return in words why `peer` cannot be reached, as far as TCP and TLS can tell.
 
     Args:
-        credentials: Our side.
         timeout_s: The most that each of its steps may take.
     """
     try:
@@ -136,3 +138,61 @@ def _tls_words(error: ssl.SSLError) -> str:
         if alert in text:
             return words
     return f"TLS fails: {error.reason or error}"
+
+
+@dataclass(frozen=True)
+class Validity:
+    """When a certificate is good. Times in UTC."""
+
+    begins: datetime.datetime
+    ends: datetime.datetime
+
+
+def validity_of(certificate: bytes) -> Validity | None:
+    """Return when a certificate (PEM or DER) is good; None where it cannot be read."""
+    from cryptography import x509
+
+    try:
+        load = (
+            x509.load_pem_x509_certificate
+            if certificate.lstrip().startswith(b"-----")
+            else x509.load_der_x509_certificate
+        )
+        read = load(certificate)
+    except Exception:  # the parser may raise anything on hostile bytes
+        return None
+    return Validity(read.not_valid_before_utc, read.not_valid_after_utc)
+
+
+def judged_here(validity: Validity, now: datetime.datetime) -> str:
+    """Return why we refuse a replica's certificate: ``now`` is this machine's clock."""
+    if now < validity.begins:
+        return (
+            f"it is not yet valid: it begins at {_utc(validity.begins)}, and this machine's clock "
+            f"says {_utc(now)}. Set this machine's clock, or the manager's, which made it"
+        )
+    if now >= validity.ends:
+        return (
+            f"it expired at {_utc(validity.ends)}, and this machine's clock says {_utc(now)}. If "
+            "that is right, replace the replica"
+        )
+    return ""
+
+
+def judged_there(validity: Validity, now: datetime.datetime) -> str:
+    """Return why a replica refuses our certificate for its time."""
+    if now < validity.begins or now >= validity.ends:
+        which = "has not begun" if now < validity.begins else "has expired"
+        return (
+            f"our certificate {which} (good from {_utc(validity.begins)} to {_utc(validity.ends)}, "
+            f"this machine's clock says {_utc(now)})"
+        )
+    return (
+        f"the replica's clock is wrong: it holds our certificate to be out of its time, which is "
+        f"good from {_utc(validity.begins)} to {_utc(validity.ends)}; this machine's clock says "
+        f"{_utc(now)}"
+    )
+
+
+def _utc(time: datetime.datetime) -> str:
+    return f"{time:%Y-%m-%d %H:%M} UTC"

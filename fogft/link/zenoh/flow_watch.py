@@ -21,34 +21,20 @@ _QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
 class FlowWatch:
     """Watches one connection's socket. For one thread, but for `end_when_safe`.
 
-    Args:
-        own: The address of its own end.
-        peer: The address of the other end.
+    Attributes:
+        progress: What was measured with the last look.
     """
 
     def __init__(self, own: Address, peer: Address) -> None:
         self._socket = OwnSocket(own, peer)
-        self._progress = SocketProgress()
+        self.progress = SocketProgress()
         self._kept_short = False
-
-    @property
-    def bytes_per_s(self) -> float | None:
-        """How fast it drains, once that was seen."""
-        return self._progress.bytes_per_s
 
     @property
     def thin(self) -> bool:
         """Whether it was seen to drain slowly."""
-        rate = self._progress.bytes_per_s
+        rate = self.progress.bytes_per_s
         return rate is not None and rate < THIN_BYTES_PER_S
-
-    def carries_bytes_per_s(self, now: float) -> float | None:
-        """What it was lately seen to carry; None where that is not known."""
-        return self._progress.throughput.bytes_per_s(now)
-
-    def left_bytes(self, now: float, bytes_per_s: float) -> float:
-        """What is still on its way in the kernel; see `SocketProgress.left_bytes`."""
-        return self._progress.left_bytes(now, bytes_per_s)
 
     def look(self, now: float, sending_for_s: float = 0.0) -> float:
         """Look once; return for how many of the last seconds large things moved."""
@@ -59,15 +45,11 @@ class FlowWatch:
             flow = sockets.flow(connection)
             if flow is None:
                 return 0.0
-            moved_s = self._progress.look(flow, now, sending_for_s)
+            moved_s = self.progress.look(flow, now, sending_for_s)
             if self.thin and not self._kept_short:
                 sockets.keep_short(connection)
                 self._kept_short = True
         return moved_s
-
-    def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
-        """Whether a queue stands still, as of the last look; see `SocketProgress.stalled`."""
-        return self._progress.stalled(now, shortest_s=shortest_s, longest_s=longest_s)
 
     def end_when_safe(
         self, sending: Callable[[], bool], asked: Callable[[], bool], within_s: float

@@ -91,12 +91,7 @@ def _listens(connection: socket.socket, port: int) -> bool:
 
 
 class OwnSocket:
-    """One connection of this process. It is looked up anew each time and held by nobody here.
-
-    Args:
-        own: The address of its own end.
-        peer: The address of the other end.
-    """
+    """One connection of this process. It is looked up anew each time and held by nobody here."""
 
     def __init__(self, own: Address, peer: Address) -> None:
         self._own = own

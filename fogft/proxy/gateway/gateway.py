@@ -19,11 +19,12 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 
 from fogft.errors import RosError
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
+from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.ros.port import OnBurst, RosClient
 
 log = logging.getLogger(__name__)
@@ -31,16 +32,6 @@ log = logging.getLogger(__name__)
 # As long as a link takes to come back by itself, and no longer.
 UNREADY_S = 0.5
 _COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
-
-
-class Forward(Protocol):
-    """What is needed of a service's dispatcher."""
-
-    def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
-        """Take a request with its id; whether it was taken."""
-
-    def cancel(self, request: bytes) -> None:
-        """End a request that is no longer wanted."""
 
 
 class Forwarded:
@@ -63,7 +54,6 @@ class Forwarder:
         held: Requests under way at once; more are refused as overloaded.
         of_one: The same for one robot: nobody takes all the room.
         kept_bytes: Answers kept for copies that come later, in bytes together.
-        clock: Monotonic seconds.
 
     Attributes:
         joined: Copies of requests that were known.
@@ -83,7 +73,7 @@ class Forwarder:
         self._kept_limit = kept_bytes
         self._clock = clock
         self._lock = threading.Lock()
-        self._dispatchers: dict[str, Forward] = {}
+        self._dispatchers: dict[str, Dispatcher] = {}
         self._ready: frozenset[str] = frozenset()
         self._unready_since: dict[str, float] = {}
         self._open: dict[bytes, Forwarded] = {}
@@ -99,7 +89,7 @@ class Forwarder:
         """Begin to pass on: on a thread of its own, since the wire's threads must not send."""
         threading.Thread(target=self._pass_on, name="fogft-forward", daemon=True).start()
 
-    def use(self, service: str, dispatcher: Forward) -> None:
+    def use(self, service: str, dispatcher: Dispatcher) -> None:
         """Set the dispatcher of a service."""
         self._dispatchers[service] = dispatcher
 

@@ -25,11 +25,12 @@ from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.model import names
 from fogft.model.credentials import Holder, Role, holder_of
+from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.type_definition import RESPONSE
 from fogft.process import Watchdog, notify, start_log, stop_on_signal
-from fogft.proxy.config import GatewayConfig, read_gateway
+from fogft.proxy.config import read_gateway
 from fogft.proxy.gateway.gateway import Forwarder, NoRos, numbers
 from fogft.proxy.middleware import fault_of
 from fogft.proxy.robot.client import ClientProxy
@@ -47,7 +48,6 @@ def run(config_path: Path, *, listen: str | None = None, metrics: str | None = N
     """Run until a signal ends it.
 
     Args:
-        config_path: A `gateway.yaml`.
         listen: ``host:port`` instead of the file's.
         metrics: ``host:port`` to answer Prometheus at, instead of the file's.
 
@@ -58,9 +58,9 @@ def run(config_path: Path, *, listen: str | None = None, metrics: str | None = N
     start_log()
     stop = stop_on_signal()
     config = read_gateway(config_path, listen, metrics)
-    lock = disk.Lock(config.client.lock)
+    lock = disk.Lock(config.lock)
     if not lock.acquire(wait=False):
-        name, pool = config.client.robot, config.client.pool
+        name, pool = config.robot, config.pool
         raise PoolBusy(f"gateway `{name}` of pool `{pool}` runs already")
     gateway = _Gateway(config)
     try:
@@ -68,37 +68,34 @@ def run(config_path: Path, *, listen: str | None = None, metrics: str | None = N
     finally:
         gateway.close()
         lock.release()
-        log.info("gateway_stopped gateway=%s", config.client.robot)
+        log.info("gateway_stopped gateway=%s", config.robot)
 
 
 class _Gateway:
     """The parts of a gateway, and its loop."""
 
-    def __init__(self, config: GatewayConfig) -> None:
+    def __init__(self, config: ClientProxyConfig) -> None:
         from fogft.link.zenoh.handshakes import HandshakeLog
 
         self._handshakes = HandshakeLog()
         self._config = config
-        client = config.client
         self._incarnation = secrets.token_hex(8)
         self._draining = False
         self._forwarder = Forwarder()
-        dialer = make_dialer(client)
-        self._proxy = ClientProxy(client.pool_uid, NoRos(), dialer, self._make_dispatcher)
-        self._services = tuple(_passed_on(service) for service in client.services)
+        dialer = make_dialer(config)
+        self._proxy = ClientProxy(config.pool_uid, NoRos(), dialer, self._make_dispatcher)
+        self._services = tuple(_passed_on(service) for service in config.services)
         self._proxy.serve(self._services)
-        self._following = Following(client)
+        self._following = Following(config)
         self._revoked: frozenset[str] = frozenset()
         self._listener: Listener | None = None
         self._holder = self._own_holder()
-        self._certificate = Watched(client.credentials.certificate)
+        self._certificate = Watched(config.credentials.certificate)
         self._certificate.changed()
-        self._scrape = Scrape(
-            lambda: proxies.of_gateway(self._told()), {"pool": config.client.pool}
-        )
+        self._scrape = Scrape(lambda: proxies.of_gateway(self._told()), {"pool": config.pool})
 
     def _own_holder(self) -> Holder:
-        ours = self._config.client.credentials
+        ours = self._config.credentials
         holder = holder_of(common_name(Signer(ours.certificate, ours.key).certificate))
         if holder.role is not Role.GATEWAY:
             raise CredentialError(
@@ -125,10 +122,10 @@ class _Gateway:
     def _listen(self) -> None:
         from fogft.link.zenoh.replica.listener import ZenohListener
 
-        uid, slot = self._config.client.pool_uid, names.gateway_slot(self._holder.name)
+        uid, slot = self._config.pool_uid, names.gateway_slot(self._holder.name)
         listener = ZenohListener(
             self._config.listen,
-            self._config.client.credentials,
+            self._config.credentials,
             ReplicaId(uid, slot, self._holder.generation),
             handshakes=self._handshakes,
             certificate_name=self._holder.common_name,
@@ -161,14 +158,14 @@ class _Gateway:
         """Pass requests on until told to stop."""
         self._forwarder.start()
         self._listen()
-        self._scrape.at(self._config.client.metrics)
+        self._scrape.at(self._config.metrics)
         reported, watchdog = time.monotonic(), Watchdog()
         notify("READY=1")
         while not stop.is_set():
             watchdog.work()
             self._proxy.run_once()
             self._forwarder.tick(self._proxy.ready)
-            try_step(self._follow, self._config.client.membership)
+            try_step(self._follow, self._config.membership)
             if self._certificate.changed():
                 self._renew()
             if time.monotonic() - reported > _REPORT_EVERY_S:
@@ -215,7 +212,7 @@ class _Gateway:
             **self._told(),
             **self._following.report(),
         }
-        status = self._config.client.status
+        status = self._config.status
         try_step(functools.partial(disk.write_json, status, report, durable=False), status)
 
     def close(self) -> None:

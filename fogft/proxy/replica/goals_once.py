@@ -80,11 +80,8 @@ class GoalsOnce:
     """Passes on the goals that are new.
 
     Args:
-        services: The `send_goal` services.
-        is_ready: Whether a service can answer now.
         outstanding: Goals that an action server is given at once.
         accepted_kept: Accepted goals that are known at once, for each; the oldest go first.
-        clock: Monotonic seconds.
     """
 
     def __init__(

@@ -27,8 +27,6 @@ class Offering:
 
     Args:
         services: Those of the configuration; none to find them out.
-        define: Returns a type's definition here.
-        clock: Monotonic seconds.
     """
 
     def __init__(
@@ -50,7 +48,6 @@ class Offering:
         """Look at the graph; return services that are new here, to be taken up.
 
         Args:
-            node: The replica's node.
             complete: All services answer: where they are listed there is nothing to look for.
         """
         now = self._clock()

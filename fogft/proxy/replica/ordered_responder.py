@@ -14,7 +14,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
@@ -24,48 +24,31 @@ from fogft.ordering.orders import Op, OrderError
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
 from fogft.ros.port import RosClient
 
+if TYPE_CHECKING:
+    from fogft.ros.state_bytes import StateBytes
+
 log = logging.getLogger(__name__)
 
 _SNAPSHOT_LIMIT_S = 30.0
 
 
-class StateBytes(Protocol):
-    """How a state travels through the two services of the pool file."""
-
-    def snapshot_request(self) -> bytes:
-        """Return the serialised request of the snapshot service."""
-
-    def read_snapshot(self, response: bytes) -> bytes:
-        """Return the state in a response of the snapshot service. Raises RosError."""
-
-    def restore_request(self, state: bytes) -> bytes:
-        """Return the serialised request that restores a state. Raises RosError."""
-
-    def check_restored(self, response: bytes) -> None:
-        """Raise RosError where a response of the restore service says that it failed."""
-
-
-class Clients:
+class Clients(NamedTuple):
     """The three local services: the one itself, its snapshot and its restore."""
 
-    def __init__(self, service: RosClient, snapshot: RosClient, restore: RosClient) -> None:
-        self.service = service
-        self.snapshot = snapshot
-        self.restore = restore
+    service: RosClient
+    snapshot: RosClient
+    restore: RosClient
 
     def available(self) -> bool:
         """Whether discovery has found all three."""
-        all_three = (self.service, self.snapshot, self.restore)
-        return all(client.available() for client in all_three)
+        return all(client.available() for client in self)
 
 
 class OrderedResponder:
     """Applies the requests of one stateful service, in their order.
 
     Args:
-        name: The service's name.
         state: How its state travels.
-        clock: Monotonic seconds.
     """
 
     def __init__(
@@ -195,11 +178,7 @@ class OrderedResponder:
         self._perform(effects)
 
     def tick(self, alive: bool) -> None:
-        """Look for the services, and try again what ROS did not take. Call at about 10 Hz.
-
-        Args:
-            alive: Whether the user's command lives.
-        """
+        """Look for the services, and try again what ROS did not take. Call at about 10 Hz."""
         with self._lock:
             clients = self._clients
             self._machine.serving = alive and clients is not None and clients.available()

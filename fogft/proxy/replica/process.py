@@ -54,7 +54,6 @@ def run(
     """Run until a signal ends it, or until the manager's lease is over.
 
     Args:
-        config_path: A `replica.yaml`.
         listen: ``host:port`` instead of the file's.
         domain_id: ROS domain instead of the file's.
         workdir: Folder in which `run` starts, instead of the file's.

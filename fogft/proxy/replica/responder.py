@@ -39,7 +39,6 @@ class Responder:
     """Hands requests to the local services and gives each copy its answer.
 
     Args:
-        is_ready: Whether a service can answer now.
         max_in_flight: Requests held at once; more are refused as overloaded, from whom has
             most waiting.
         held_bytes: Their bytes together; more are refused as overloaded.
@@ -48,7 +47,6 @@ class Responder:
         latest: Services of which the newest request goes first.
         passing: Whether a service's answer holds for the moment only: a copy is run anew.
         kept_bytes, kept_ids: As for `KnownRequests`.
-        clock: Monotonic seconds.
 
     Attributes:
         ran, ran_s: Requests passed on, and the time until their responses together.

@@ -17,7 +17,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable, Iterable
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from fogft import __version__
 from fogft.cloud.notice_formats import Notice, NoticeKind
@@ -33,7 +33,7 @@ from fogft.model.type_definition import Definition
 from fogft.proxy.replica.goals_once import GoalsOnce, for_the_moment
 from fogft.proxy.replica.interruption import CANCEL_TYPE
 from fogft.proxy.replica.offering import Offering
-from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder, StateBytes
+from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.replica.responder import Responder
 from fogft.proxy.replica.service_queue import limits_of
 from fogft.proxy.replica.serving_lease import HeldLease
@@ -41,6 +41,9 @@ from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
 from fogft.records.record import Record
 from fogft.ros.port import RosClient, RosNode, RosTopics
+
+if TYPE_CHECKING:
+    from fogft.ros.state_bytes import StateBytes
 
 log = logging.getLogger(__name__)
 
@@ -51,16 +54,12 @@ class ServerProxy:
     """Answers for one replica.
 
     Args:
-        id: Which replica this is.
         services: What it answers; none for whatever the command offers.
         listener: Its end of the wire; `serve` is called here.
         make_node: Joins ROS; called again after each death of the command.
-        supervisor: The user's command.
         make_state: Says how the state of a stateful service travels.
         define: Returns the definition of a service type here, for the robot to compare.
         topics: What passes besides services; then nodes publish and subscribe, too.
-        max_in_flight: Requests held at once.
-        clock: Monotonic seconds.
     """
 
     def __init__(

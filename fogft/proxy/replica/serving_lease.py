@@ -21,9 +21,6 @@ class HeldLease:
     It ends no later than it would if every lease had come at the moment it was signed, so nobody
     gains by holding leases back to show them one after another. A manager's clock that is set back
     shortens none: it only makes new leases useless until the old one is over.
-
-    Args:
-        clock: Monotonic seconds.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:

@@ -29,9 +29,7 @@ class Supervisor:
 
     Args:
         command: A shell command; ``exec`` in it saves a process.
-        workdir: Where it runs.
-        environ: Its whole environment.
-        clock: Monotonic seconds.
+        environ: All that it inherits.
         backoff_s: Second and longest wait between a death and the next start; the first start
             after a death is at once. A run longer than the longest wait resets it, and so does a
             death while requests were at work.

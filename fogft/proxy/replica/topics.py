@@ -92,12 +92,7 @@ class _Outgoing:
 
 
 class TopicsOnReplica:
-    """The topics of one replica.
-
-    Args:
-        topics: What passes.
-        clock: Monotonic seconds.
-    """
+    """The topics of one replica."""
 
     def __init__(
         self, topics: Iterable[TopicSpec], clock: Callable[[], float] = time.monotonic

@@ -49,12 +49,9 @@ class ClientProxy:
 
     Args:
         pool_uid: The pool's uid, part of every key.
-        node: The robot's side of ROS.
-        dialer: Makes links.
         make_dispatcher: Makes the dispatcher of a service, given how to respond.
         define: Returns the definition of a service type here; None to compare none.
         merge: Makes one status of an action of what its replicas say.
-        clock: Monotonic seconds.
     """
 
     def __init__(

@@ -33,7 +33,6 @@ class Delivery:
     """How one service's requests end.
 
     Args:
-        ledger: The service's requests.
         respond: Sends a response to the caller of a handle. Any thread.
         empty_response: The serialised default response, for ``on_timeout: empty``.
         forget: Tells these replicas that a request is no longer wanted.

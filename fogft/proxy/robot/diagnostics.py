@@ -36,7 +36,6 @@ class Diagnosis:
     """Turns reports into statuses.
 
     Args:
-        pool: The pool's name.
         robot: The robot's; it is the hardware that the pool's and the services' statuses name.
     """
 
@@ -46,12 +45,7 @@ class Diagnosis:
         self._before: deque[tuple[float, dict[str, dict[str, int]]]] = deque()
 
     def of(self, report: Mapping[str, Any], now: float) -> list[Status]:
-        """Return the statuses of a report.
-
-        Args:
-            report: Of the client proxy.
-            now: Monotonic seconds.
-        """
+        """Return the statuses of a report."""
         services: Mapping[str, Mapping[str, Any]] = report["services"]
         links = report["links"]
         lately = self._lately(services, now)

@@ -9,34 +9,24 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from fogft.model.spec import ServiceSpec
 from fogft.poolfile.policy_parameters import FieldCheck, Policies
 from fogft.proxy.robot.diagnostics import Diagnosis
-from fogft.ros.port import Status
+
+if TYPE_CHECKING:
+    from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
 
 _DIAGNOSE_EVERY_S = 1.0
 
 
-class Visible(Protocol):
-    """What is needed of the visible node; see `fogft.ros.visible`."""
-
-    def diagnose(self, statuses: list[Status]) -> None:
-        """Publish statuses."""
-
-    def show(self, values: Mapping[str, Any]) -> None:
-        """Have these parameters, and no others."""
-
-
 class SeenFromRos:
     """The proxied services and the pool, as ROS's tools see them.
 
     Args:
-        pool: The pool's name.
-        robot: The robot's name.
         make_visible: Makes the visible node, given who judges parameters; returns None where
             there is none, and then nothing is shown or set.
         check_field: Says why a type's response has no boolean field of that name.
@@ -46,7 +36,7 @@ class SeenFromRos:
         self,
         pool: str,
         robot: str,
-        make_visible: Callable[[Callable[[Mapping[str, Any]], str]], Visible | None],
+        make_visible: Callable[[Callable[[Mapping[str, Any]], str]], VisibleNode | None],
         check_field: FieldCheck,
     ) -> None:
         self._policies = Policies(check_field)
@@ -87,12 +77,7 @@ class SeenFromRos:
         return ""
 
     def diagnose(self, report: Callable[[], Mapping[str, Any]], now: float) -> None:
-        """Publish the statuses of a report, once a second.
-
-        Args:
-            report: Makes the client proxy's report.
-            now: Monotonic seconds.
-        """
+        """Publish the statuses of a report, once a second."""
         if self._visible is not None and now >= self._diagnosed + _DIAGNOSE_EVERY_S:
             self._diagnosed = now
             self._visible.diagnose(self._diagnosis.of(report(), now))

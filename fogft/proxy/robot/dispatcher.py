@@ -54,7 +54,6 @@ class Dispatcher:
     """The requests of one service, from the caller's request to the caller's response.
 
     Args:
-        spec: The service and its policy.
         respond: Sends a response to a caller. Any thread.
         decide: What answers mean; the first success unless given.
         fault_of: Returns what is wrong with the bytes of a response; empty for nothing. One that
@@ -63,7 +62,6 @@ class Dispatcher:
             asked where the spec names an `ok_field`.
         empty_response: The serialised default response, for ``on_timeout: empty``.
         wake: Has `tick` called soon. Any thread.
-        clock: Monotonic seconds.
         max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
         id_of: Gives a caller's request its id, by service and handle.
 
@@ -320,7 +318,6 @@ class Dispatcher:
         """Follow another policy from now on; requests under way keep their deadlines.
 
         Args:
-            spec: The policy.
             fallback: The client of its fallback service, if it has one.
 
         Raises:
@@ -351,7 +348,6 @@ class Dispatcher:
         Args:
             links: Those whose replica is ready; where replicas are brought to readiness, all.
             versions: What each replica of the pool runs.
-            leaving: The replicas that are to go soon.
             hanging: Those that say that the service answers nothing of what it has.
         """
         self._sender.route(links, versions, leaving, hanging)
@@ -360,7 +356,6 @@ class Dispatcher:
         """Have a replica asked again: it has begun anew what some requests are about.
 
         Args:
-            replica: Which.
             about: Whether the bytes of a request are about it.
         """
         with self._lock:

@@ -34,9 +34,6 @@ log = logging.getLogger(__name__)
 class Following:
     """The membership of one pool as a client proxy sees it.
 
-    Args:
-        config: The client proxy's.
-
     Raises:
         WireError: The door's port cannot be had.
         CredentialError: The credentials cannot be used.

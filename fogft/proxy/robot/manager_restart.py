@@ -29,7 +29,6 @@ class ManagerRestart:
     Args:
         folder: The pool's. Without a manager's file in it nothing is ever started.
         environ: The environment for it: what our own was before ROS was prepared in it.
-        clock: Monotonic seconds.
     """
 
     def __init__(

@@ -32,7 +32,6 @@ from fogft.process import Watchdog, notify, start_log, stop_on_signal
 from fogft.proxy import middleware, start
 from fogft.proxy.config import read_client
 from fogft.proxy.order_mark import OrderMark
-from fogft.proxy.robot import handover
 from fogft.proxy.robot import standby as in_line
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy
@@ -63,7 +62,6 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     """Run until a signal ends it.
 
     Args:
-        config_path: A `proxy.yaml`.
         metrics: ``host:port`` to answer Prometheus at, instead of the file's.
         standby: Where one runs already, wait until it ends, and take its place at once.
 
@@ -106,7 +104,7 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
         pool_uid=config.pool_uid,
         actions=Actions(),
         speaks=config.rmw,
-        id_of=handover.request_ids(config.credentials.key),
+        id_of=in_line.request_ids(config.credentials.key),
     )
     dialer = make_dialer(config)
     proxy = ClientProxy(
@@ -129,7 +127,7 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
         _loop(config_path, config, parts, stop)
         if stop.is_set():
             release = functools.partial(_release, parts, config, lock)
-            handover.hand_over(config, proxy, parts.callers, release)
+            in_line.hand_over(config, proxy, parts.callers, release)
     finally:
         managing.close()
         scrape.close()
@@ -198,12 +196,9 @@ def make_dispatcher(
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
 
     Args:
-        spec: The service.
         respond: Sends a response to the caller of a handle.
         wake: Has the dispatcher's `tick` called soon.
         marks: Folder of the stateful services' marks.
-        pool_uid: Whose marks they are.
-        actions: Makes those of actions.
         speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
         id_of: Gives a request its id, by service and handle; a random one unless given.
 

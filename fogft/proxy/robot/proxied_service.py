@@ -1,6 +1,10 @@
 """One service on the robot: its dispatcher, and its ROS server while it is offered.
 
-Owns: offering and withdrawing it. Not here: when (`fogft.requests.advertising`).
+`wait_for_service` in the robot's code is true exactly while it is. A service that is withdrawn
+loses what is sent to it meanwhile, so it is not withdrawn for a moment's silence, nor under a
+request that may still be answered.
+
+Owns: offering and withdrawing it. Not here: its requests (`dispatcher`).
 """
 
 from __future__ import annotations
@@ -11,14 +15,41 @@ from collections.abc import Collection, Sequence
 from fogft.errors import RosError
 from fogft.link.port import Link
 from fogft.model.replica import ReplicaId
-from fogft.model.spec import Part, ServiceSpec
+from fogft.model.spec import Advertise, Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.requests.advertising import Advertising
 from fogft.ros.port import RosClient, RosNode, RosServer
 
 log = logging.getLogger(__name__)
 
 _LOOK_EVERY_S = 2.0  # whether clients are on a middleware that understands ours
+
+
+# Longer than the command of a lone replica takes to be started again.
+HOLD_S = 3.0
+
+
+class Advertising:
+    """Whether one service is to be offered, as its replicas come and go."""
+
+    def __init__(self) -> None:
+        self._offered = False
+        self._unable_since: float | None = None
+
+    def wanted(self, spec: ServiceSpec, *, able: bool, waiting: int, now: float) -> bool:
+        """Return whether it is to be offered now.
+
+        Args:
+            spec: Its policy and its `timeout_s`.
+        """
+        at_once = spec.fallback is not None and spec.fallback.while_none_ready
+        if able or at_once or spec.advertised is Advertise.ALWAYS:
+            self._offered, self._unable_since = True, None
+        elif self._offered and spec.advertised is Advertise.WHILE_READY:
+            if self._unable_since is None:
+                self._unable_since = now
+            limit_s = HOLD_S + (spec.timeout_s if waiting else 0.0)
+            self._offered = now < self._unable_since + limit_s
+        return self._offered
 
 
 class ProxiedService:
@@ -62,7 +93,6 @@ class ProxiedService:
 
         Args:
             links: Those whose replicas have the service's type as we have it.
-            leaving: The replicas that are to go soon.
         """
         if self.spec.state is not None:  # replicas are brought to readiness by what is sent
             return [link for link in links if link.usable]

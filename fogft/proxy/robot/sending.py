@@ -21,9 +21,6 @@ from fogft.requests.load import NEVER, Handling
 class Sender:
     """Sends one service's requests.
 
-    Args:
-        ledger: The service's requests.
-
     Attributes:
         links: Those that may be asked, by replica.
         able: The replicas that the policy may choose.

@@ -29,14 +29,7 @@ _ATTEMPT_S = 60.0
 
 
 class ServiceOrder(Decide):
-    """Numbers requests, and says what to send to whom and when an answer counts.
-
-    Args:
-        name: The service's.
-        mark: What survives this process.
-        wake: Has what is due sent soon.
-        clock: Monotonic seconds.
-    """
+    """Numbers requests, and says what to send to whom and when an answer counts."""
 
     replicates = sends_requests = True
 

@@ -1,10 +1,15 @@
-"""The next client proxy, in line behind the one that works.
+"""The next client proxy, in line behind the one that works, and how that one hands over to it.
 
-It has loaded everything and its DDS participant is known, but it offers nothing and no node of it
-is seen. It waits for the lock: the kernel gives it in the instant in which the holder ends,
-whatever ends it.
+The standby has loaded everything and its DDS participant is known, but it offers nothing and no
+node of it is seen. It waits for the lock: the kernel gives it in the instant in which the holder
+ends, whatever ends it.
 
-Owns: the place in line. Not here: a client proxy's work (`process`).
+A holder that is told to end lets the standby take over while it still serves. For half a second
+both serve: each request goes to both, under one id, so that a replica runs it once and the caller
+gets one answer. Then the first takes no more, and finishes what it has taken. What only one may
+serve, stateful services and actions, is not shared: there the first stops first.
+
+Owns: the place in line, and that order. Not here: a client proxy's work (`process`).
 """
 
 from __future__ import annotations
@@ -24,6 +29,15 @@ from fogft.records.signing import Signer
 
 if TYPE_CHECKING:
     from fogft.ros.participant.joining import EarlyJoin
+import hashlib
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fogft.errors import StateError
+from fogft.model.names import REQUEST_ID_BYTES
+from fogft.proxy.robot.client import ClientProxy
 
 log = logging.getLogger(__name__)
 
@@ -86,3 +100,82 @@ def _taken(lock: disk.Lock) -> threading.Event:
 
     threading.Thread(target=take, name="standby", daemon=True).start()
     return taken
+
+
+BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
+KNOWN_AFTER_S = 0.5  # once it offers them and knows the callers: until they know its services
+FINISH_LIMIT_S = 60.0
+_PACED_S = 0.5  # until responses that are spread for their client are out
+
+
+def request_ids(key: Path) -> Callable[[str, Any], bytes]:
+    """Return what gives requests their ids: both proxies of a robot give a request the same.
+
+    Others cannot guess it: the robot's private key is part of it. A request without an id of ROS's
+    own gets a random one.
+    """
+    try:
+        secret = hashlib.sha256(key.read_bytes()).digest()
+    except OSError:  # who needs the key will say so
+        secret = os.urandom(32)
+
+    def id_of(service: str, handle: Any) -> bytes:
+        if not isinstance(handle, bytes):
+            return os.urandom(REQUEST_ID_BYTES)
+        told = service.encode() + b"\0" + handle
+        return hashlib.blake2b(told, key=secret, digest_size=REQUEST_ID_BYTES).digest()
+
+    return id_of
+
+
+def hand_over(
+    config: ClientProxyConfig,
+    proxy: ClientProxy,
+    callers: Callable[[], Mapping[str, int]],
+    release: Callable[[], None],
+) -> None:
+    """Let the standby take over, if there is one; return when nothing is left to do.
+
+    Args:
+        config: This proxy's. Replicas that dial in have one door, so with it nothing is shared.
+        callers: Counts who may call each service that we offer.
+        release: Gives up the lock, and all else that the standby needs for itself.
+    """
+    try:
+        if config.dial_in or not disk.is_locked(disk.standby_lock(config.lock)):
+            return
+    except OSError as error:
+        log.error("handover_failed reason=%r", str(error))
+        return
+    log.info("handover_began pool=%s", config.pool)
+    proxy.take_no_more(shared=False)
+    _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting(shared=False) == 0)
+    release()
+    if _run(proxy, BEGIN_LIMIT_S, lambda: _takes(config.status, callers())):
+        _run(proxy, KNOWN_AFTER_S, lambda: False)
+    proxy.take_no_more(shared=True)
+    if _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting(shared=True) == 0):
+        _run(proxy, _PACED_S, lambda: False)
+    log.info("handover_ended pool=%s", config.pool)
+
+
+def _run(proxy: ClientProxy, limit_s: float, done: Callable[[], bool]) -> bool:
+    end, watchdog = time.monotonic() + limit_s, Watchdog()
+    while not (over := done()) and time.monotonic() < end:
+        proxy.run_once()
+        watchdog.work()
+    return over
+
+
+def _takes(report: Path, callers: Mapping[str, int]) -> bool:
+    """Whether another proxy offers all of these services, to as many callers at least."""
+    try:
+        told = disk.read_json(report)
+    except StateError:
+        return False
+    if not isinstance(told, dict) or told.get("pid") == os.getpid():
+        return False
+    theirs = told.get("callers")
+    if not isinstance(theirs, dict):
+        return False
+    return all(theirs.get(name, -1) >= count for name, count in callers.items())

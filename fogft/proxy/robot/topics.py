@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from fogft.errors import FrameError, RosError
 from fogft.link.port import Answer, Link
@@ -34,11 +34,8 @@ _LOOK_EVERY_S = 2.0  # whether publishers are heard, and how often they publish
 _UNCONFIRMED_LIMIT = 4096
 
 
-class Merge(Protocol):
-    """Makes one message of what several replicas say."""
-
-    def __call__(self, said: Mapping[int, bytes]) -> bytes | None:
-        """Return it, or None where there is nothing to say (replica -> its last message)."""
+# Makes one message of what several replicas said last; None where there is nothing to say.
+Merge = Callable[[Mapping[int, bytes]], bytes | None]
 
 
 class _Way:
@@ -247,7 +244,6 @@ class TopicsOnRobot:
     Args:
         wake: Has `tick` called soon. Any thread.
         merge: Makes one status of an action of what its replicas say.
-        clock: Monotonic seconds.
     """
 
     def __init__(

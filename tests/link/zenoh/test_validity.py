@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.zenoh.validity import Validity, judged_here, judged_there, validity_of
+from fogft.link.zenoh.diagnosis import Validity, judged_here, judged_there, validity_of
 from fogft.pool.credentials import authority
 
 DAY = datetime.timedelta(days=1)

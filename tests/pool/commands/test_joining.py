@@ -113,9 +113,9 @@ def test_a_gateway_joins_too(store: PoolStore, tmp_path: Path) -> None:
     joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
     assert (joined.command, joined.holder.role) == ("gateway", Role.GATEWAY)
     config = read_gateway(joined.config)
-    assert (config.client.robot, config.listen) == ("edge", "0.0.0.0:7470")
-    assert from_dict(json.loads(config.client.membership.read_text())) == MEMBERSHIP
-    said = authority.describe(config.client.credentials.certificate)
+    assert (config.robot, config.listen) == ("edge", "0.0.0.0:7470")
+    assert from_dict(json.loads(config.membership.read_text())) == MEMBERSHIP
+    said = authority.describe(config.credentials.certificate)
     assert said.common_name == f"gateway.edge.1.{UID}"
 
 

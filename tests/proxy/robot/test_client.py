@@ -14,7 +14,7 @@ from fogft.model.spec import HedgingMode, Part, ServiceSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.requests.advertising import HOLD_S
+from fogft.proxy.robot.proxied_service import HOLD_S
 from tests.proxy.fakes import UID, Clock, FakeDialer, FakeNode
 
 SET_BOOL = "std_srvs/srv/SetBool"

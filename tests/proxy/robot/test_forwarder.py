@@ -10,7 +10,7 @@ from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.proxy.gateway.gateway import UNREADY_S, Forwarder
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.proxy.robot.link_reports import best_of, seen_through
+from fogft.proxy.robot.links import best_of, seen_through
 from tests.proxy.fakes import UID, Clock, FakeIncoming, FakeLink
 
 READY = frozenset({"/s"})

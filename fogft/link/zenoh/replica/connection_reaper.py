@@ -45,7 +45,6 @@ class ConnectionReaper:
         links: Returns the peers' addresses of authenticated links, with their common names.
         revoked: Returns the names whose links are to be ended.
         counters: Counts ``unauthenticated``, ``revoked_links`` and ``stuck_links`` ended.
-        also: Called with each look.
         stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.
 
     Attributes:

@@ -39,12 +39,8 @@ class ControlQueries:
     """Answers the queries of robots.
 
     Args:
-        sessions: Who was let in.
         records: What the pool has signed, as far as it is known here.
         streams: Where each connection's answers go.
-        queues: End queries.
-        work: The thread that answers.
-        counters: Count what came.
     """
 
     def __init__(

@@ -44,7 +44,6 @@ class Door:
 
         Args:
             linked: Whose links are authenticated.
-            now: Monotonic seconds.
         """
         self._first_seen = {peer: self._first_seen.get(peer, now) for peer in strangers}
         known = {host for host, _ in linked}
@@ -76,7 +75,6 @@ def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
 
     Args:
         strangers: When each was first seen.
-        now: The same clock.
     """
     by_age = sorted(strangers, key=lambda peer: strangers[peer])
     surplus = set(by_age[: max(0, len(by_age) - STRANGERS_LIMIT)])

@@ -70,11 +70,7 @@ class QueryEnd:
 
 
 class Unended:
-    """What one thread has yet to end.
-
-    Args:
-        turns: Tells when a query may be ended.
-    """
+    """What one thread has yet to end."""
 
     def __init__(self, turns: QueryTurns) -> None:
         self._turns = turns

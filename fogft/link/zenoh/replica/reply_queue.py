@@ -143,7 +143,6 @@ class ReplyQueues:
 
     Args:
         counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
-        turns: Tells when a query may be ended.
         idle_s: A thread that had nothing to send for so long ends.
     """
 
@@ -165,8 +164,6 @@ class ReplyQueues:
 
         Args:
             token: The robot's connection: replies of one never wait for another's.
-            robot: Its name, for people.
-            reply: What to send.
             more: Others will soon follow, to leave in one message with it.
         """
         may_send = not more and reply.small and not threads.is_this()

@@ -168,7 +168,6 @@ class Streams:
     """The open queries for answers, by the token of their connection.
 
     Args:
-        limit: Beyond it the oldest are let go.
         slow: Whether the holder of a certificate is known to read slowly.
     """
 

@@ -26,12 +26,7 @@ _MAY_ASK = frozenset({Role.ROBOT, Role.GATEWAY})
 
 
 class NotAdmittedError(Exception):
-    """A connection is not admitted.
-
-    Args:
-        refusal: What is answered.
-        detail: The reason for people.
-    """
+    """A connection is not admitted."""
 
     def __init__(self, refusal: Refusal, detail: str) -> None:
         super().__init__(detail)

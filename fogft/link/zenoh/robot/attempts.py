@@ -24,9 +24,14 @@ from fogft.link.deadline_filter import DeadlineFilter
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
 from fogft.link.port import Answer
 from fogft.link.send_options import SendOptions
-from fogft.link.window import ATTEMPTS_LIMIT, LinkWindow
+from fogft.link.window import (
+    ATTEMPTS_LIMIT,
+    BatchBuffer,
+    LinkWindow,
+    OpenAttempt,
+    Unanswered,
+)
 from fogft.link.zenoh.flow_watch import FlowWatch
-from fogft.link.zenoh.robot.attempt import BatchBuffer, OpenAttempt, Unanswered
 from fogft.link.zenoh.robot.send_queue import SendQueue
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.link.zenoh.unpacking import Unpacker
@@ -90,14 +95,11 @@ class Attempts:
     """The attempts of one connection.
 
     Args:
-        services: What may be asked for.
         origin: What the headers of all its requests say (`frame.origin`).
         options: How the services' payloads are sent.
         gate: Shared with the robot's other connections.
         cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
-        tell: The link's callbacks.
         ended: What the sender thread does last.
-        name: Of that thread.
 
     Attributes:
         window: Those that are open.
@@ -129,7 +131,7 @@ class Attempts:
         self._room = tell.room
         self._on_large = tell.large
         self._ended = ended
-        self.window: LinkWindow[OpenAttempt] = LinkWindow()
+        self.window = LinkWindow()
         self.packs = False
         self.packs_answers = False
         self.watched = False
@@ -144,9 +146,12 @@ class Attempts:
         self._credit = Credit()
         self._queue = SendQueue(options.latest)
         self._compressions = {name: Compression() for name in self._services - options.plain}
-        self._flow = outlet.flow
+        self._flow, self._progress = outlet.flow, outlet.flow.progress
         self._deadline = DeadlineFilter(
-            options.timed, self._flow.carries_bytes_per_s, self._left_bytes, self._compression
+            options.timed,
+            self._progress.throughput.bytes_per_s,
+            self._left_bytes,
+            self._compression,
         )
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -237,7 +242,7 @@ class Attempts:
         """Return what was sent and has not arrived: in the kernel, and in Zenoh above it."""
         since, held = self._held_by_zenoh
         left = max(0.0, held - bytes_per_s * (now - since))
-        return left + self._flow.left_bytes(now, bytes_per_s)
+        return left + self._progress.left_bytes(now, bytes_per_s)
 
     def _compression(self, service: str) -> Compression | None:
         return self._compressions.get(service) if self.packs else None
@@ -352,7 +357,7 @@ class Attempts:
         compression = self._compression(attempt.service)
         packed = None
         if compression is not None:
-            packed = compression.pack(payload, self._flow.bytes_per_s)
+            packed = compression.pack(payload, self._progress.bytes_per_s)
         may_pack = compression is not None and self._flow.thin
         reads_packed = compression is not None and self.packs_answers
         attempt.reads_packed = may_pack or reads_packed

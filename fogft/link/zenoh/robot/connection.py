@@ -23,13 +23,12 @@ import zenoh
 from zenoh import handlers
 
 from fogft.errors import FrameError, WireError
-from fogft.link import frame
+from fogft.link import batch_frames, frame
 from fogft.link.cancellations import Cancellations
-from fogft.link.port import Peer
+from fogft.link.port import Answer, Peer
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.flow_watch import FlowWatch
-from fogft.link.zenoh.robot.attempt import read_reply
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.sockets import address
@@ -59,13 +58,6 @@ _TELL_RECORDS_TIMEOUT_S = 5.0
 
 class Connection:
     """An open session whose peer was found to be the right one.
-
-    Args:
-        config: Zenoh's configuration of the session.
-        peer: Whom it must reach.
-        keys: Service name -> key.
-        shared: What all links of the robot share.
-        tell: The link's callbacks.
 
     Attributes:
         attempts: The requests open on it.
@@ -301,3 +293,26 @@ class Connection:
     def join(self, timeout_s: float) -> None:
         """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
         self.attempts.join(timeout_s)
+
+
+def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer], bool]:
+    """Return a reply's stamp, what it answers to each request, and whether the payload is packed.
+
+    Raises:
+        FrameError: It does not say to which.
+    """
+    ok = reply.ok
+    if ok is None:
+        err = reply.err
+        content = b"" if err is None else err.payload.to_bytes()
+        stamp, id, said, load = frame.decode_refusal(content)
+        kind, detail = refusal.read(said)
+        return stamp, (Answer(id, refusal=kind, detail=detail, load=load),), False
+    attachment = ok.attachment
+    if attachment is None:
+        raise FrameError("an answer without a header")
+    header, payload = attachment.to_bytes(), ok.payload.to_bytes()
+    if batch_frames.is_batch(header):
+        return *batch_frames.decode_answers(header, payload), False
+    stamp, id, load, packed = frame.decode_answer(header)
+    return stamp, (Answer(id, payload, load=load),), packed

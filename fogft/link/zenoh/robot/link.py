@@ -330,7 +330,7 @@ class ZenohLink:
         moved_s = connection.look(now)
         self._probing.excuse(moved_s, now)
         longest_s, shortest_s = self._suspect_after_s, self._shared.settings.stall_after_s
-        if connection.flow.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
+        if connection.flow.progress.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
             connection.lost_because = "it takes nothing more of what is sent"
         return not connection.lost_because
 

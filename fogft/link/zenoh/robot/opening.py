@@ -19,11 +19,7 @@ _NEARLY = 0.9  # of a time-out, as it is measured
 
 
 class Opening:
-    """The tries to open one link's connection. Used by one thread.
-
-    Args:
-        settings: How long a try may take.
-    """
+    """The tries to open one link's connection. Used by one thread."""
 
     def __init__(self, peer: Peer, settings: LinkSettings) -> None:
         self._peer = peer
@@ -47,12 +43,7 @@ class Opening:
         self._was_open = True
 
     def failed(self, took_s: float, now: float, credentials: CredentialPaths) -> str:
-        """A try was not; return why, or nothing where that was looked for lately.
-
-        Args:
-            took_s: How long it took.
-            credentials: Our side.
-        """
+        """A try was not; return why, or nothing where that was looked for lately."""
         self._timed_out = self._timed_out + 1 if took_s >= self.timeout_s * _NEARLY else 0
         interface = self._peer.interface
         if interface and interface not in {name for _, name in socket.if_nameindex()}:

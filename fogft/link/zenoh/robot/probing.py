@@ -70,7 +70,6 @@ class Probing:
     """Probes to one replica. For the link's thread; any may read the attributes.
 
     Args:
-        peer: Who must answer.
         came: Called, from any thread, when an answer came.
 
     Attributes:

@@ -15,7 +15,7 @@ from collections.abc import Collection
 from itertools import count
 from queue import SimpleQueue
 
-from fogft.link.zenoh.robot.attempt import OpenAttempt
+from fogft.link.window import OpenAttempt
 
 Waiting = list[tuple[float, int, OpenAttempt]]
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from fogft.link import frame
 from fogft.link.port import Incoming, Probe, ProbeAnswer
+from fogft.link.window import OpenAttempt, Unanswered
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.replica.reply_streams import CREDIT_LIMIT, Streams
-from fogft.link.zenoh.robot.attempt import OpenAttempt, Unanswered
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.model.replica import ReplicaId
 from tests.link.wire_pool import (

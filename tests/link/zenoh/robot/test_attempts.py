@@ -16,6 +16,7 @@ from fogft.link.cancellations import Cancellations
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
 from fogft.link.port import Answer
 from fogft.link.send_options import DEFAULT_OPTIONS
+from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import unpacking
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.model.refusal import Refusal
@@ -28,10 +29,9 @@ class Flow:
     """A fast link of which nothing is known."""
 
     thin = False
-    bytes_per_s = None
 
-    def carries_bytes_per_s(self, now: float) -> None:
-        return None
+    def __init__(self) -> None:
+        self.progress = SocketProgress()
 
 
 class Outlet:

@@ -7,7 +7,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.zenoh.robot.attempt import OpenAttempt
+from fogft.link.window import OpenAttempt
 from fogft.link.zenoh.robot.send_queue import SendQueue
 
 

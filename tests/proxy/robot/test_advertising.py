@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.model.choices import FallbackSpec
 from fogft.model.spec import Advertise, OnTimeout, ServiceSpec
-from fogft.requests.advertising import HOLD_S, Advertising
+from fogft.proxy.robot.proxied_service import HOLD_S, Advertising
 
 SPEC = ServiceSpec("/s", "a/srv/A", timeout_s=10.0)
 steps = st.lists(st.tuples(st.booleans(), st.integers(0, 2), st.floats(0, 20)), max_size=40)
