@@ -3,7 +3,7 @@
 A message costs both ends far more than the few bytes in it, so what leaves a connection at the
 same moment leaves together. Like `frame`, a decoder returns a value or raises `FrameError`.
 
-Owns: the bytes. Not here: what is sent together (`attempt`, `reply_queue`).
+Owns: the bytes. Not here: what is sent together (`window`, `reply_queue`).
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from fogft.model.spec import HedgingMode, Part, ServiceSpec
-from fogft.requests.choose import All, Choose, Failover
-from fogft.requests.load import NEVER, Demand, Load, ReplicaLoad
+from fogft.requests.choose import All, Choose, Failover, Learning
+from fogft.requests.load import Demand, Load
 
 BUDGET_CAPACITY = 10.0
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
@@ -113,7 +113,7 @@ class Spares:
             self.share = max(FEWEST_SPARES, self.share * _CUT)
 
 
-class Auto(Choose):
+class Auto(Learning):
     """The policy `auto`; see `choose.Choose`.
 
     Args:
@@ -121,11 +121,10 @@ class Auto(Choose):
     """
 
     def __init__(self, budget: float = 0.1) -> None:
-        self.look_at = NEVER
+        super().__init__()
         self._budget = TokenBucket(budget, BUDGET_CAPACITY)
         self._spares = Spares()
         self._demand = Demand()
-        self._replicas: dict[int, ReplicaLoad] = {}
         # When a spare was first, by the copy that it beat, until that has ended.
         self._beaten: dict[tuple[bytes, int], float] = {}
         self.hedges = 0
@@ -212,12 +211,6 @@ class Auto(Choose):
             self.news = True  # what else it has goes to another, too
         return known.doubted
 
-    def _of(self, replica: int) -> ReplicaLoad:
-        known = self._replicas.get(replica)
-        if known is None:
-            known = self._replicas[replica] = ReplicaLoad()
-        return known
-
     def _look(self, at: float) -> None:
         self.look_at = min(self.look_at, at)
 
@@ -237,8 +230,7 @@ class Auto(Choose):
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
-        """Learn from the winner; the others stop, and are learned from when they end."""
-        self._of(replica).answered(request, load, now)
+        """Learn, too, whether a spare copy has won."""
         if self._spares.open.pop((request, replica), None) is not None:
             for other in open:
                 if not self.is_spare(request, other):
@@ -273,13 +265,9 @@ class Auto(Choose):
             if expired:
                 known.doubt(begun, now)
 
-    def hangs(self, replica: int) -> None:
-        """Doubt it: what it has goes to others at once."""
-        self._of(replica).doubted = self.news = True
-
     def forget(self, replica: int) -> None:
         """Forget what was on the way there."""
-        self._of(replica).forget()
+        super().forget(replica)
         for copies in (self._spares.open, self._beaten):
             for key in [key for key in copies if key[1] == replica]:
                 del copies[key]

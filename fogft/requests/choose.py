@@ -101,7 +101,35 @@ class All(Choose):
         return candidates
 
 
-class Failover(Choose):
+class Learning(Choose):
+    """A policy that learns how busy each replica is, by what it answers."""
+
+    def __init__(self) -> None:
+        self._replicas: dict[int, ReplicaLoad] = {}
+
+    def _of(self, replica: int) -> ReplicaLoad:
+        known = self._replicas.get(replica)
+        if known is None:
+            known = self._replicas[replica] = ReplicaLoad()
+        return known
+
+    def answered(
+        self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
+    ) -> Iterable[int]:
+        """Learn from the winner; the others stop, and are learned from when they end."""
+        self._of(replica).answered(request, load, now)
+        return super().answered(request, open, replica, load, now)
+
+    def hangs(self, replica: int) -> None:
+        """Doubt it: what it has goes to others at once."""
+        self._of(replica).doubted = self.news = True
+
+    def forget(self, replica: int) -> None:
+        """Forget what was on the way there."""
+        self._of(replica).forget()
+
+
+class Failover(Learning):
     """One replica gets every request. Another one takes its place when it fails.
 
     It fails when it is no longer able to answer (suspected, not ready, drained), when an
@@ -111,9 +139,9 @@ class Failover(Choose):
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self._current: int | None = None
         self._failed = False  # the present one has: the next choice is another, if there is one
-        self._loads: dict[int, ReplicaLoad] = {}
         self.switched = 0
         self.hedges = 0
 
@@ -160,22 +188,9 @@ class Failover(Choose):
         self.switched += old is not None
         return (self._current,)
 
-    def _of(self, replica: int) -> ReplicaLoad:
-        known = self._loads.get(replica)
-        if known is None:
-            known = self._loads[replica] = ReplicaLoad()
-        return known
-
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
         """Stay: a full window is no failure."""
         self._of(replica).dropped(request)
-
-    def answered(
-        self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
-    ) -> Iterable[int]:
-        """Return the others: a failed one may still work on it."""
-        self._of(replica).answered(request, load, now)
-        return super().answered(request, open, replica, load, now)
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Move on from a replica that failed."""
@@ -199,13 +214,9 @@ class Failover(Choose):
 
     def hangs(self, replica: int) -> None:
         """Move on from it, with all that it has."""
-        self._of(replica).doubted = self.news = True
+        super().hangs(replica)
         if replica == self._current:
             self._failed = True
-
-    def forget(self, replica: int) -> None:
-        """Forget what was on the way."""
-        self._of(replica).forget()
 
     def report(self) -> dict[str, Any]:
         """Return how often the replica changed, and how often another was asked as well."""

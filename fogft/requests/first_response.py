@@ -19,7 +19,7 @@ Not here: what an answer means (`decide`), who is asked (`choose`), sending, loc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, TypeVar
@@ -38,6 +38,7 @@ class Verdict(Enum):
     WAIT = "wait"  # another attempt is still open
     IDLE = "idle"  # nobody works on it any more: try again, or return the rejection
     LATE = "late"  # already answered, expired or never known: drop it
+    POISON = "poison"  # services died over it: it is not to be sent again
 
 
 @dataclass
@@ -131,26 +132,25 @@ class FirstResponse(Generic[T]):
         pending.open[replica] = now
         return pending
 
-    def declined(self, request: bytes, replica: int) -> Verdict:
+    def declined(self, request: bytes, replica: int) -> None:
         """Note that a replica did not take an attempt. It may be asked again."""
         pending = self._pending.get(request)
-        if pending is None or replica not in pending.open:
-            return Verdict.LATE
-        self._ended(request, pending, replica)
+        if pending is not None and replica in pending.open:
+            self._ended(request, pending, replica)
+
+    def _ended(self, request: bytes, pending: Pending[T], replica: int) -> Verdict:
+        del pending.open[replica]
+        self._short[request] = 0.0
         return Verdict.WAIT if pending.open else Verdict.IDLE
 
-    def _ended(self, request: bytes, pending: Pending[T], replica: int) -> None:
-        pending.open.pop(replica, None)
-        self._short[request] = 0.0
-
-    def succeeded(self, request: bytes, now: float) -> tuple[Verdict, Pending[T] | None]:
-        """Note a success. WON exactly once a request, and never after its deadline."""
+    def succeeded(self, request: bytes, now: float) -> Pending[T] | None:
+        """Note a success: return its request once, and never after its deadline."""
         pending = self._pending.get(request)
         if pending is None or now >= pending.deadline:
-            return Verdict.LATE, None
+            return None
         del self._pending[request]
         self._short.pop(request, None)
-        return Verdict.WON, pending
+        return pending
 
     def rejected(self, request: bytes, replica: int, response: bytes) -> Verdict:
         """Note a real response that is not ok: kept, and returned if nothing better comes."""
@@ -159,9 +159,8 @@ class FirstResponse(Generic[T]):
             return Verdict.LATE
         pending.rejection = response
         self.has_rejected = True
-        self._ended(request, pending, replica)
         pending.barred.add(replica)
-        return Verdict.WAIT if pending.open else Verdict.IDLE
+        return self._ended(request, pending, replica)
 
     def failed(
         self, request: bytes, replica: int, now: float, *, counts: bool, bar: bool = False
@@ -176,7 +175,6 @@ class FirstResponse(Generic[T]):
         pending = self._pending.get(request)
         if pending is None or replica not in pending.open:
             return Verdict.LATE
-        self._ended(request, pending, replica)
         failures = pending.failures.get(replica, 0) + (1 if counts else 0)
         pending.failures[replica] = failures
         _, waited_s = pending.waits.get(replica, (0.0, RETRY_FIRST_S / 2))
@@ -184,7 +182,7 @@ class FirstResponse(Generic[T]):
         pending.waits[replica] = (now + wait_s, wait_s)
         if bar or failures >= self._attempts:
             pending.barred.add(replica)
-        return Verdict.WAIT if pending.open else Verdict.IDLE
+        return self._ended(request, pending, replica)
 
     def close(self, request: bytes) -> Pending[T] | None:
         """Take a request out, whatever its state."""
@@ -202,13 +200,9 @@ class FirstResponse(Generic[T]):
         self._soonest_deadline = min(left, default=float("inf"))
         return expired
 
-    def idle(self) -> Iterator[tuple[bytes, Pending[T]]]:
-        """Go over the requests that nobody works on, in the order in which that began."""
-        return (
-            (request, self._pending[request])
-            for request in list(self._short)
-            if not self._pending[request].open
-        )
+    def idle(self) -> list[bytes]:
+        """Return the requests that nobody works on, in the order in which that began."""
+        return [request for request in self._short if not self._pending[request].open]
 
     def short(self, now: float) -> tuple[list[tuple[bytes, Pending[T]]], float]:
         """Return the requests for which a further replica may have to be asked now.
@@ -229,25 +223,19 @@ class FirstResponse(Generic[T]):
         if request in self._short:
             self._short[request] = at
 
-    def candidates(self, pending: Pending[T], able: Sequence[int], now: float) -> list[int]:
-        """Return who may be asked for a request now: not at work on it, barred, or waiting."""
-        return [
-            replica
-            for replica in able
-            if replica not in pending.open
-            and replica not in pending.barred
-            and pending.waits.get(replica, _NO_WAIT)[0] <= now
-        ]
-
     @staticmethod
-    def rests_until(pending: Pending[T], able: Iterable[int]) -> float:
-        """Return when the first of the able that may be asked, but for a wait, may be asked."""
-        waits = [
-            pending.waits.get(replica, _NO_WAIT)[0]
+    def candidates(pending: Pending[T], able: Sequence[int], now: float) -> tuple[list[int], float]:
+        """Return who may be asked for a request now, and when the first may be of those left alone.
+
+        Who works on it, or is barred from it, may not.
+        """
+        until = {
+            replica: pending.waits.get(replica, _NO_WAIT)[0]
             for replica in able
             if replica not in pending.open and replica not in pending.barred
-        ]
-        return min(waits, default=float("inf"))
+        }
+        found = [replica for replica, at in until.items() if at <= now]
+        return found, min(until.values(), default=float("inf"))
 
     def came(self, replica: int) -> None:
         """A replica came (back): it may be asked at once for all that it does not work on.

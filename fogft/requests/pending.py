@@ -131,7 +131,8 @@ class PendingRequests(Generic[T]):
         self, request: bytes, pending: Pending[T], able: Sequence[int], now: float
     ) -> tuple[Sequence[int], float]:
         """Return whom a request goes to now, and when to look at it again if nothing happens."""
-        candidates, room = self._table.candidates(pending, able, now), len(able)
+        candidates, rests_until = self._table.candidates(pending, able, now)
+        room = len(able)
         if pending.deaths:  # alone
             room = 0 if pending.open else 1
         elif now < self._cautious_until and pending.open:
@@ -139,16 +140,11 @@ class PendingRequests(Generic[T]):
             room -= len(pending.open) + (0 if waited else 1)
             candidates = candidates[: max(0, room)]
         elif not candidates:
-            return (), self._table.rests_until(pending, able)
+            return (), rests_until
         if room <= 0:
             return (), now
         chosen = self.choose.more(request, pending.open, candidates, now)[:room]
         return chosen, self.choose.look_at if self.choose.look_at < NEVER else now
-
-    def poisonous(self, request: bytes | None) -> bool:
-        """Whether a request has ended so many services that it is not to be sent again."""
-        pending = self.get(request)
-        return pending is not None and pending.deaths >= POISON_DEATHS
 
     def attempt(self, request: bytes, replica: int, now: float) -> Pending[T] | None:
         """Enter a further attempt; None where it is not wanted any more."""
@@ -213,7 +209,7 @@ class PendingRequests(Generic[T]):
         if request is None:
             return means, None, (), Verdict.LATE
         if means is Means.SUCCESS:
-            _, pending = self._table.succeeded(request, now)
+            pending = self._table.succeeded(request, now)
             if pending is None:
                 self.choose.late(request, replica, now, answered=True)
                 return means, None, (), Verdict.LATE
@@ -230,12 +226,15 @@ class PendingRequests(Generic[T]):
             weaker = means is Means.WEAKER_REJECTION
             kept = pending.rejection if weaker and pending is not None else None
             verdict = self._table.rejected(request, replica, payload if kept is None else kept)
-            self._failed(request, replica, verdict, now, answered=True, fault=False)
+            if verdict is Verdict.LATE:
+                self.choose.late(request, replica, now, answered=True)
+            else:
+                self.choose.failed(request, replica, now, fault=False)
             means = Means.REJECTION
         return means, None, (), verdict
 
     def refused(self, request: bytes, replica: int, refusal: Refusal, now: float) -> Verdict:
-        """Take a refusal."""
+        """Take a refusal; return POISON where so many services died that it is sent no more."""
         pending = self._table.get(request)
         crashed = refusal is Refusal.CRASHED and self._counts_deaths
         if crashed and self._alarms.believed(replica, now):
@@ -252,24 +251,12 @@ class PendingRequests(Generic[T]):
             counts=Effect.BLAMELESS not in refusal.effect,
             bar=Effect.FINAL in refusal.effect,
         )
-        fault = Effect.FAULT in refusal.effect
-        self._failed(request, replica, verdict, now, answered=False, fault=fault)
-        return verdict
-
-    def _failed(
-        self,
-        request: bytes,
-        replica: int,
-        verdict: Verdict,
-        now: float,
-        *,
-        answered: bool,
-        fault: bool,
-    ) -> None:
         if verdict is Verdict.LATE:
-            self.choose.late(request, replica, now, answered=answered)
+            self.choose.late(request, replica, now, answered=False)
         else:
-            self.choose.failed(request, replica, now, fault=fault)
+            self.choose.failed(request, replica, now, fault=Effect.FAULT in refusal.effect)
+        poison = pending is not None and pending.deaths >= POISON_DEATHS
+        return Verdict.POISON if poison else verdict
 
     # -- a request ends -------------------------------------------------------------------
 
@@ -286,7 +273,7 @@ class PendingRequests(Generic[T]):
 
     def idle(self) -> list[bytes]:
         """Return the requests that nobody works on, where some were answered, if not well."""
-        return [request for request, _ in self._table.idle()] if self._table.has_rejected else []
+        return self._table.idle() if self._table.has_rejected else []
 
     def stop(self, request: bytes, now: float) -> Pending[T] | None:
         """Take a request out that its caller does not want any more."""
@@ -326,7 +313,7 @@ class PendingRequests(Generic[T]):
         overdue = self.fallback.answered(request)
         if overdue is not None or not ok:
             return overdue, True
-        _, pending = self._table.succeeded(request, now)
+        pending = self._table.succeeded(request, now)
         if pending is not None:
             self._stopped(request, pending, now)
         return pending, False

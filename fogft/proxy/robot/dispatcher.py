@@ -278,8 +278,7 @@ class Dispatcher:
             if request is None:
                 return
             verdict = self._requests.refused(request, replica, refusal, now)
-            poisonous = self._requests.poisonous(request)
-        if poisonous:
+        if verdict is Verdict.POISON:
             self._end_poison(request, now)
         else:
             self._after(request, verdict)
