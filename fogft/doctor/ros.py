@@ -140,10 +140,7 @@ def profile(_: Situation) -> Iterator[Finding]:
 def judge_segment(segment_bytes: int, variable: str, ours: str) -> Finding:
     """Judge the shared memory that a node maps in fogft's environment.
 
-    Args:
-        segment_bytes: Size of its largest segment; 0 where its middleware maps none.
-        variable: Where the Fast DDS that is loaded looks for its profile.
-        ours: The shipped profile, where fogft sets it for its own processes.
+    `ours` is the shipped profile, where fogft sets the variable to it for its own processes.
     """
     if environment.profile_in_force(segment_bytes):
         if ours:

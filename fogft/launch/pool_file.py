@@ -125,13 +125,6 @@ def pool_tree(
 ) -> dict[str, Any]:
     """Return a pool file's tree: a base file with what the launch file says laid over it.
 
-    Args:
-        base: The tree of a pool file that supplies the rest; empty for none.
-        name: The pool's name; empty for the base's.
-        run: What a replica runs.
-        task: SkyPilot's keys that the launch file sets.
-        fogft: Keys of the `fogft` section that the launch file sets.
-
     Raises:
         FogftError: The base runs something itself, or there is no name.
     """

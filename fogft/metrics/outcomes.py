@@ -88,13 +88,7 @@ class Outcomes:
         refused: Mapping[int, Refusal] = MappingProxyType({}),
         replica: str = "",
     ) -> None:
-        """Trace how a request ended.
-
-        Args:
-            took_s: Since it arrived.
-            asked: Who was asked for it, and when after its arrival, in seconds.
-            refused: Who refused it, and why the last time.
-        """
+        """Trace how a request ended."""
         if self.trace is not None:
             self.trace.append(
                 {

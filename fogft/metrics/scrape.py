@@ -28,12 +28,7 @@ Measure = Callable[[], "Iterable[Metric]"]
 
 
 class Scrape:
-    """Metrics at an endpoint, which may change or be none.
-
-    Args:
-        measure: Returns what there is to tell; called for each request, on another thread.
-        labels: Of every sample.
-    """
+    """Metrics at an endpoint, which may change or be none; measured for each request."""
 
     def __init__(self, measure: Measure, labels: Labels) -> None:
         self._tell = lambda: text(measure(), labels)

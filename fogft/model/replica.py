@@ -181,11 +181,7 @@ _DOUBTED_AFTER_ROUND_TRIPS = 3
 
 
 def doubted_after_s(rtt_s: float | None) -> float:
-    """Return when a silent replica is doubted: seconds after the first unanswered probe.
-
-    Args:
-        rtt_s: Round trip of the last probe that was answered; a long way takes its time.
-    """
+    """Return when a silent replica is doubted: seconds after the first unanswered probe."""
     return max(DOUBTED_AFTER_S, _DOUBTED_AFTER_ROUND_TRIPS * (rtt_s or 0.0))
 
 

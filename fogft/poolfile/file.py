@@ -38,9 +38,7 @@ def parse(
     """Return what the text of a pool file asks for.
 
     Args:
-        source: The text.
         file: Its name, for messages; its stem names the pool where the text does not.
-        checks: What is asked of this machine.
         folder: Where `workdir` is looked for; None to leave it unjudged.
 
     Raises:

@@ -126,7 +126,6 @@ class Section:
         """Yield an error for each key that is not known.
 
         Args:
-            known: The keys that may stand here.
             hints: Keys that are no longer or not yet there: what is to be said, and what to do.
             elsewhere: Keys that have their place in another section, with that place.
         """

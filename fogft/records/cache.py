@@ -31,11 +31,7 @@ class _File:
 
 
 def write(path: Path, records: Sequence[SignedRecord], *, durable: bool = True) -> None:
-    """Replace the file.
-
-    Raises:
-        StateError: It cannot be written; the old one is as it was.
-    """
+    """Replace the file."""
     content = [to_plain(one) for one in records]
     whole = {"version": VERSION, "checksum": _checksum(content), "records": content}
     disk.write_json(path, whole, durable=durable)

@@ -61,9 +61,6 @@ class RendezvousClient:
     """The records of one process.
 
     Args:
-        endpoints: ``host:port`` of each rendezvous; none is fine.
-        credentials: The process's certificate and key, and the pool's CA.
-        pool_uid: The pool.
         cache: File that the records are kept in; None for nowhere.
         changed: Called on the client's thread after anything changed; must not block.
 
@@ -126,10 +123,6 @@ class RendezvousClient:
         """Say something of our own, to everybody, from now on. From any thread.
 
         Args:
-            kind: What it is about.
-            subject: Whom.
-            generation: See `Record`.
-            content: JSON data.
             sequence: Its number; None for one above all that were said before.
         """
         own = _Own(generation, dict(content), sequence)

@@ -30,14 +30,7 @@ _GREETING_TIMEOUT_S = 5.0
 
 
 class Caller:
-    """Connects one process to one rendezvous.
-
-    Args:
-        endpoint: ``host:port``; a name is looked up with each attempt.
-        credentials: The pool's CA is what counts here.
-        signer: Proves who we are.
-        pool_uid: The pool that the rendezvous must belong to.
-    """
+    """Connects one process to one rendezvous of its pool; a name is looked up with each attempt."""
 
     def __init__(
         self, endpoint: str, credentials: CredentialPaths, signer: Signer, pool_uid: str

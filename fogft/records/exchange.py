@@ -71,12 +71,7 @@ class Connection:
 
 
 class Exchange:
-    """A record set and the connections over which it is kept the same.
-
-    Args:
-        records: The set; used on this loop only, unless its owner guards it.
-        changed: Called after records were accepted.
-    """
+    """A record set and the connections over which it is kept the same."""
 
     def __init__(self, records: RecordSet, changed: Callable[[], None] = lambda: None) -> None:
         self.records = records

@@ -38,11 +38,7 @@ _GREETING_PREFIX = b"fogft caller 1\n"  # so that no other signature is good for
 
 
 class Unframer:
-    """Cuts a stream of bytes into messages.
-
-    Attributes:
-        limit: The longest message that is read, in bytes.
-    """
+    """Cuts a stream of bytes into messages."""
 
     def __init__(self, limit: int = FRAME_LIMIT) -> None:
         self.limit = limit
@@ -95,13 +91,7 @@ def read_challenge(message: dict[str, Any]) -> tuple[bytes, str]:
 
 
 def proof_bytes(purpose: str, nonce: bytes, binding: bytes) -> bytes:
-    """Return what a caller signs.
-
-    Args:
-        purpose: What the greeting is for: it is good for nothing else.
-        nonce: From the challenge: it is good only once.
-        binding: Whom it is for: it cannot be passed on to another.
-    """
+    """Return what a caller signs: good for one purpose, once, and to nobody else."""
     return _GREETING_PREFIX + purpose.encode() + b"\n" + nonce + binding
 
 

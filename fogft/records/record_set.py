@@ -51,13 +51,7 @@ class _Held:
 
 
 class RecordSet:
-    """The records of one pool. Not thread-safe: its owner sees to that.
-
-    Args:
-        pool_uid: Records of other pools are refused.
-        verify: Checks a signature and its certificate.
-        limit: The most keys that are kept; records for further ones are refused.
-    """
+    """The records of one pool, up to a limit of keys. Not thread-safe: its owner sees to that."""
 
     def __init__(self, pool_uid: str, verify: Verify, *, limit: int = KEYS_LIMIT) -> None:
         self.pool_uid = pool_uid

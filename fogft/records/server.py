@@ -43,9 +43,6 @@ class RendezvousServer:
 
     Args:
         listen: ``host:port``; port 0 for any that is free.
-        credentials: The rendezvous's certificate and key, and the pool's CA.
-        verify: Tells who signed a greeting.
-        exchange: The records.
     """
 
     def __init__(

@@ -29,10 +29,6 @@ _KNOWN_LIMIT = 4096
 class Signer:
     """Signs with a key on disk; reads it again when its certificate was replaced.
 
-    Args:
-        certificate: Path of the certificate (PEM).
-        key: Path of its key (PEM), which is never shown.
-
     Raises:
         CredentialError: They cannot be used, or do not belong together.
     """
@@ -100,8 +96,6 @@ class Verifier:
     """Tells who signed something: a certificate of the pool's CA, in its time, with its key.
 
     Args:
-        ca: Path of the pool's CA (PEM; several certificates while it is being replaced).
-        now: The time in UTC.
         any_time: Accept certificates out of their time: for what was verified before.
 
     Raises:

@@ -51,11 +51,7 @@ def paths_of(name: str | None = None) -> PoolPaths:
 
 
 def store_of(name: str | None = None) -> PoolStore:
-    """Return the store of the pool that is named, else of the only one there is.
-
-    Raises:
-        PoolNotFound: As for `paths_of`.
-    """
+    """Return the store of the pool that is named, else of the only one; see `paths_of`."""
     return make_store(paths_of(name).folder.name)
 
 
@@ -68,11 +64,7 @@ def make_store(pool: str) -> PoolStore:
 
 
 def make_cloud(name: str, base: Path) -> Cloud:
-    """Return a cloud by name.
-
-    Args:
-        name: One of `CLOUDS`.
-        base: Folder of the pool file: relative paths in it start there.
+    """Return a cloud, one of `CLOUDS`; relative paths in its pool file start at `base`.
 
     Raises:
         CloudError: There is no such cloud.

@@ -35,13 +35,7 @@ def certificates(store: PoolStore) -> Sequence[Entry]:
 def issue_credentials(
     store: PoolStore, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
 ) -> tuple[Issued, Path]:
-    """Write a join bundle for the next generation of a holder; return both.
-
-    Raises:
-        CredentialError: The name or the passphrase is refused, the CA cannot be used, or
-            whoever joined would find nobody.
-        FogftError: The file exists, or there is no such pool.
-    """
+    """Write a join bundle for the next generation of a holder; return both. See `joining.issue`."""
     file = out or Path(f"{name}.join")
     if file.exists():
         raise FogftError(f"`{file}` exists", "choose another name with `--out`")
@@ -91,10 +85,6 @@ def _generation_in(paths: PoolPaths, slot: int, now: float) -> int | None:
 def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:
     """Give this machine's client proxy new credentials, and revoke the old ones once the new
     ones are in use; return the new holder, the old ones, and whether that has happened.
-
-    Raises:
-        CredentialError: The pool's CA cannot be used.
-        FogftError: There is no such pool.
     """
     ledger = Ledger(store.paths.credentials)
     holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())

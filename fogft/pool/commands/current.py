@@ -73,11 +73,6 @@ def current(
     """Return what is known now.
 
     Args:
-        status: What the manager saw last.
-        report: The client proxy's last report.
-        manager_alive: Whether the manager's lock is held.
-        proxy_alive: Whether the client proxy's is.
-        now: Seconds since the epoch.
         heard_since: Only a link whose replica has answered a probe since then counts as up;
             None for what the report says.
     """

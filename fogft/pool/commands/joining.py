@@ -167,12 +167,7 @@ def join(
 ) -> Joined:
     """Set this machine up from a bundle, and destroy the bundle.
 
-    Args:
-        file: The bundle.
-        passphrase: What it was sealed with.
-        root: The folder of all of fogft's state.
-        now: Seconds since the epoch.
-        claim: Sees that no other machine has joined with it.
+    `claim` sees that no other machine has joined with it.
 
     Raises:
         CredentialError: It is no bundle, was used, is too old, or the passphrase is wrong; or

@@ -21,10 +21,7 @@ EVENTS = 200
 def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[str, Path]]:
     """Return logs with their names: ``manager``, ``proxy``, then ``slot.generation``.
 
-    Args:
-        store: The pool.
-        cloud: Where its machines run, or ran until lately.
-        slot: Only the logs of replicas in this slot.
+    Of one slot where it is given: then only those of its replicas.
 
     Raises:
         FogftError: There is no log of that slot (the hint lists those there are).

@@ -43,12 +43,7 @@ class Awaited:
     digest: str = ""
 
     def outcome(self, seen: Seen, *, is_last: bool = False) -> Outcome:
-        """Judge a status.
-
-        Args:
-            seen: The status.
-            is_last: There is no time left to wait for the end of an update.
-        """
+        """Judge a status; `is_last` where no time is left to wait for the end of an update."""
         if self.is_updating(seen) and not is_last:
             hopeless = seen.status.applied == self.digest and keeps_ending(seen)
             return Outcome.RUN_KEEPS_ENDING if hopeless else Outcome.PENDING

@@ -63,12 +63,8 @@ def plan_file(
 ) -> PlanShown:
     """Return the plan of a pool file, from nothing. Touches no cloud but for prices and distances.
 
-    Args:
-        file: The pool file.
-        cloud: Whose prices; None for what its resources name, else `local`.
-        prices: A price table instead of a cloud.
-        offline: Measure no distances; what is kept or estimated counts.
-        told: Called with what takes long, before it is done.
+    Prices are of the cloud that its resources name, else `local`, unless told; `prices` is a table
+    in place of a cloud. Offline no distance is measured; `told` hears of what takes long.
 
     Raises:
         SpecError: The first mistake in the file or in the table.
@@ -138,13 +134,8 @@ def far(
     offline: bool = False,
     told: Callable[[str], None] = lambda _: None,
 ) -> tuple[Mapping[str, Distance], list[str]]:
-    """Return how far the regions of offers are, and what could not be measured.
-
-    Args:
-        spec: The pool file, whose word goes first.
-        sold: The offers.
-        offline: Measure nothing.
-        told: Called before anything is measured.
+    """Return how far the regions of offers are, the pool file's word first, and what could not be
+    measured; offline nothing is.
     """
     regions, latencies, notes = regions_of(sold), Latencies(latency_file()), []
     if not offline and (stale := latencies.stale(regions)):

@@ -93,10 +93,8 @@ def order(
 ) -> Order:
     """Read and judge a pool file, and find out what applying it would do. Changes nothing.
 
-    Args:
-        file: The pool file.
-        cloud: Where to run it; None for what its resources name, else `local`.
-        told: Called with what takes long, before it is done.
+    It runs on the cloud that its resources name, else `local`, unless told; `told` hears of what
+    takes long.
 
     Raises:
         SpecError: The first mistake in the file, or the cloud can never meet its resources.

@@ -76,12 +76,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Services:
-    """Where units go, and whose they are.
-
-    Args:
-        system: Of the machine, which starts them at boot; else of this user.
-        folder: Where unit files are.
-    """
+    """Where unit files are, and whose: the machine's, which starts them at boot, or this user's."""
 
     system: bool
     folder: Path
@@ -174,11 +169,7 @@ def environment(environ: Mapping[str, str] = os.environ) -> str:
 def install(where: Services, units: Sequence[Unit], env_file: Path) -> list[str]:
     """Write units and their environment, have them started now and at each boot.
 
-    Returns:
-        What systemd said against it; nothing where they were started.
-
-    Raises:
-        StateError: A file cannot be written.
+    Returns what systemd said against it; nothing where they were started.
     """
     disk.write_whole(env_file, environment())
     where.folder.mkdir(parents=True, exist_ok=True)

@@ -61,10 +61,6 @@ def checked(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.
 
     The client proxy probes all links by itself, at least once a second; a link that has not had
     an answer within `limit_s` counts as suspect.
-
-    Raises:
-        PoolNotFound: There is no such pool.
-        StateError: The status is damaged, or another version's.
     """
     asked_at, deadline = clock(), time.monotonic() + limit_s
     while True:

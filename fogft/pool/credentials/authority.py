@@ -89,17 +89,13 @@ def create_authority(folder: Path, pool_uid: str) -> None:
 
 
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
-    """Make a key and have the folder's CA certify it.
+    """Make a key and have the folder's CA certify it, under a name of 1 to 64 characters.
 
     Args:
-        folder: Holds the CA.
-        common_name: Of a `Holder`.
-        role: What the holder may do.
         days: How long it is valid from now; never beyond the CA's own end.
 
     Raises:
         CredentialError: There is no CA, or it cannot be used.
-        ValueError: The name is empty or longer than 64 characters.
     """
     from cryptography.hazmat.primitives.asymmetric import ec
 

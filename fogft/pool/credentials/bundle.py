@@ -66,11 +66,7 @@ def check_passphrase(passphrase: str) -> None:
 
 
 def seal(label: Label, content: Mapping[str, Any], passphrase: str) -> bytes:
-    """Return a bundle's bytes.
-
-    Raises:
-        CredentialError: The passphrase is too short.
-    """
+    """Return a bundle's bytes."""
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
     check_passphrase(passphrase)
@@ -103,11 +99,6 @@ def read_label(data: bytes) -> Label:
 
 def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[str, Any]]:
     """Return a bundle's label and content.
-
-    Args:
-        data: The file's bytes.
-        passphrase: What it was sealed with.
-        now: Seconds since the epoch.
 
     Raises:
         CredentialError: It is no bundle, the passphrase is wrong, or its time is over.

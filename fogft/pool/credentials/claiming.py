@@ -69,16 +69,8 @@ def claim(
 ) -> None:
     """Claim a holder's certificate for this machine. Repeatable with the same token.
 
-    A rendezvous's own is not claimed: it can neither ask, answer nor sign anything.
-
-    Args:
-        holder: Whom the bundle is for.
-        token: This machine's, from `new_token`.
-        endpoints: ``host:port`` of each rendezvous of the pool.
-        credentials: What the bundle brought.
-        limit_s: How long to try.
-        settle_s: How long another's word may take on its way, when several join at once.
-        clock: Monotonic seconds.
+    A rendezvous's own is not claimed: it can neither ask, answer nor sign anything. Another's word
+    may take `settle_s` on its way, when several join at once.
 
     Raises:
         CredentialError: Another machine has joined with it, or nobody can tell.

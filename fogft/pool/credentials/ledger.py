@@ -61,12 +61,7 @@ class _Issued:
 
 
 class Ledger:
-    """A pool's list of certificates. Safe to use from several processes.
-
-    Args:
-        folder: Holds the CA.
-        clock: Seconds since the epoch.
-    """
+    """A pool's list of certificates. Safe to use from several processes."""
 
     def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
         self.path = folder / "issued.json"

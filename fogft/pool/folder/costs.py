@@ -94,8 +94,6 @@ class CostBook:
         """Charge what runs, up to now, and write it down from time to time.
 
         Args:
-            machines: The cloud's own list.
-            offers: What is sold now: spot machines are charged at these prices.
             alone_s: For how long a machine runs on of which no manager has heard.
 
         Raises:

@@ -32,11 +32,7 @@ _NOTED = 5  # of what is not offered
 
 
 class Discovery:
-    """Keeps the file of one pool. The manager's.
-
-    Args:
-        path: The file.
-    """
+    """Keeps the file of one pool. The manager's."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -46,11 +42,6 @@ class Discovery:
 
     def look(self, spec: PoolSpec, observed: Observed, wanted: int) -> bool:
         """Take up what most replicas offer; return whether that changed the file.
-
-        Args:
-            spec: The pool file.
-            observed: What there is now.
-            wanted: How many replicas are wanted now.
 
         Raises:
             StateError: It cannot be written.

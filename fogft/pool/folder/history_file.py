@@ -23,12 +23,7 @@ COMPACT_AFTER = 20_000
 
 
 class HistoryFile:
-    """The events of one pool. Safe to use from several threads; one process writes it.
-
-    Args:
-        path: Where; made with the first event.
-        clock: Seconds since the epoch.
-    """
+    """The events of one pool. Safe to use from several threads; one process writes it."""
 
     def __init__(self, path: Path, clock: Callable[[], float]) -> None:
         self._path = path

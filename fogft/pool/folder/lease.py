@@ -54,7 +54,6 @@ class Lease:
 
         Raises:
             PoolBusy: A later manager has it: this one must stop at once.
-            StateError: The lease cannot be written.
         """
         if _read(self._paths).epoch > self.epoch:
             raise PoolBusy(f"pool `{self._paths.folder.name}` has a later manager")

@@ -87,10 +87,10 @@ class Store(Protocol):
 class PoolStore:
     """A pool's folder. Safe to use from several threads; one process writes each file.
 
+    What cannot be written raises `StateError`; where there is no such pool, `PoolNotFound`.
+
     Args:
-        paths: Where.
         parse: Reads a pool file's text: ``parse(text, file) -> PoolSpec``.
-        clock: Seconds since the epoch.
     """
 
     def __init__(
@@ -168,11 +168,7 @@ class PoolStore:
             raise PoolNotFound(f"pool `{self.paths.folder.name}` has no spec") from None
 
     def applied(self) -> str:
-        """Return the digest of the pool file that was applied last.
-
-        Raises:
-            PoolNotFound: There is none.
-        """
+        """Return the digest of the pool file that was applied last."""
         return digest(self._applied())
 
     def good(self) -> PoolSpec | None:
@@ -190,11 +186,7 @@ class PoolStore:
         return self._good[1]
 
     def keep_good(self, spec: PoolSpec) -> bool:
-        """Keep the file that `spec` was read from as the good one, if it was read last.
-
-        Raises:
-            StateError: It cannot be written.
-        """
+        """Keep the file that `spec` was read from as the good one, if it was read last."""
         if self._spec is None or self._spec[1] is not spec:
             return False
         disk.write_whole(self.paths.good_spec, self._spec[0])
@@ -209,11 +201,7 @@ class PoolStore:
             return Trial()  # damaged: the file is tried again
 
     def write_trial(self, trial: Trial) -> None:
-        """Remember it.
-
-        Raises:
-            StateError: It cannot be written.
-        """
+        """Remember it."""
         disk.write_json(self.paths.trial, to_plain(trial))
 
     def intent(self) -> Intent:

@@ -36,13 +36,7 @@ _LEASE_SHARE = 0.1  # of a short lease, after which the next one is signed
 
 
 class ManagerRecords:
-    """Publishes one pool's membership.
-
-    Args:
-        paths: The pool's folder.
-        pool_uid: Its uid.
-        epoch: Of the active manager.
-    """
+    """Publishes one pool's membership."""
 
     def __init__(self, paths: PoolPaths, pool_uid: str, epoch: int) -> None:
         self._paths = paths

@@ -80,15 +80,7 @@ def proxy_config(
     name: str = "",
     role: Role = Role.ROBOT,
 ) -> str:
-    """Return a client proxy's configuration, or a gateway's.
-
-    Args:
-        paths: How its files are called; where they are does not matter.
-        identity: The pool.
-        spec: Its services.
-        name: The robot's or gateway's name; empty for this machine's robot.
-        role: Which of the two it is.
-    """
+    """Return a client proxy's configuration, or a gateway's; this robot's unless named."""
     folder, stem = Path(paths.credentials.name), role.value
     config = ClientProxyConfig(
         pool=identity.name,
@@ -141,12 +133,7 @@ def certify_robot(
 
 
 def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
-    """Give this machine's client proxy new credentials; it takes them into use by itself.
-
-    Raises:
-        CredentialError: The pool's CA cannot be used.
-        StateError: They cannot be written; the old ones stay.
-    """
+    """Give this machine's client proxy new credentials; it takes them into use by itself."""
     holder, issued = Ledger(paths.credentials).issue_next(
         Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
     )
@@ -163,10 +150,6 @@ def build_order(
     announcements: bytes = b"",
 ) -> Launch:
     """Return the order of a planned launch, with all that its server proxy needs.
-
-    Args:
-        announcements: What the manager has signed: whom no replica lets in, however new, and for
-            how long it serves without hearing of the manager.
 
     Raises:
         CredentialError: The pool's CA cannot be used.
@@ -200,8 +183,7 @@ def replica_config(
 ) -> str:
     """Return a replica's configuration. Address, domain and folder are the machine's to add.
 
-    Args:
-        announcements: Whether what the manager has signed lies beside it.
+    With `announcements`, what the manager has signed lies beside it.
     """
     services = services_at(spec, id.slot)
     envs: dict[str, Any] = dict(spec.task.get("envs") or {})

@@ -75,14 +75,7 @@ def connect_time(host: str, port: int) -> float:
 
 
 class Latencies:
-    """What is known of distances on this machine, by ``cloud/region``.
-
-    Args:
-        file: Where measurements are kept.
-        clock: Seconds since the epoch.
-        endpoint: What answers in a region.
-        connect: Times one connect; `connect_time` unless told.
-    """
+    """What is known of distances on this machine, by ``cloud/region``, and kept in a file."""
 
     def __init__(
         self,
@@ -137,13 +130,7 @@ class Latencies:
     def known(
         self, regions: Iterable[str], placement: PlacementSpec, links: Mapping[str, float]
     ) -> dict[str, Distance]:
-        """Return the best that is known of each region; regions of which nothing is are left out.
-
-        Args:
-            regions: ``cloud/region``.
-            placement: The pool file's word.
-            links: Round trips to running replicas by region.
-        """
+        """Return the best that is known of each region of which anything is."""
         measured, out = self.measured(), {}
         for region in regions:
             told = placement.rtt_s.get(region, placement.rtt_s.get(region.split("/")[0]))
@@ -163,12 +150,7 @@ class Latencies:
 
 
 class Distances:
-    """What the manager hands to its planner each tick. Measures in the background.
-
-    Args:
-        latencies: What is known on this machine.
-        submit: Runs a function on another thread.
-    """
+    """What the manager hands to its planner each tick. Measures in the background."""
 
     def __init__(
         self, latencies: Latencies, submit: Callable[[Callable[[], object]], object]

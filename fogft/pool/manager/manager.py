@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from fogft import __version__, disk, logfile
 from fogft.cloud.port import Accounts, Cloud, Launch
@@ -70,8 +71,6 @@ class Manager:
     """Manages one pool until told to stop. Holds the pool's lease from the start.
 
     Args:
-        store: The pool's folder.
-        cloud: Where its machines run.
         proxy_command: What to start as client proxy, in place of our own.
         metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
         keeps_proxy: Whether it starts client proxies; else somebody else does.
@@ -337,30 +336,11 @@ class Manager:
         return bool(changed - {report_path})
 
 
-def run(
-    store: PoolStore,
-    cloud_of: Callable[[Identity], Cloud],
-    *,
-    proxy_command: Sequence[str] | None = None,
-    metrics: str | None = None,
-    keeps_proxy: bool = True,
-) -> None:
+def run(store: PoolStore, cloud_of: Callable[[Identity], Cloud], **how: Any) -> None:
     """Run a pool's manager in this process until a signal ends it, or the pool has ended.
 
-    Args:
-        store: The pool.
-        cloud_of: Returns the cloud that a pool runs on.
-        proxy_command: What to start as client proxy, in place of our own.
-        metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
-        keeps_proxy: Whether it starts client proxies; else somebody else does.
-
-    Raises:
-        PoolBusy: The pool has a manager, or a later one has taken over.
-        PoolNotFound: There is no such pool.
+    What it takes besides, and raises, is as of `Manager`.
     """
     start_log()
     stop = stop_on_signal()
-    cloud = cloud_of(store.identity())
-    Manager(
-        store, cloud, proxy_command=proxy_command, metrics=metrics, keeps_proxy=keeps_proxy
-    ).run(stop)
+    Manager(store, cloud_of(store.identity()), **how).run(stop)

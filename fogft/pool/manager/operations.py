@@ -35,12 +35,7 @@ class Outcome(Generic[T]):
 
 
 class Operations(Generic[T]):
-    """Operations under way, each with what it is about.
-
-    Args:
-        submit: Runs a function, now or on another thread.
-        on_done: Called from there when one has ended.
-    """
+    """Operations under way, each with what it is about; `on_done` is called when one has ended."""
 
     def __init__(self, submit: Submit, on_done: Callable[[], None] = lambda: None) -> None:
         self._submit = submit

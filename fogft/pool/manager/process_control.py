@@ -49,9 +49,6 @@ def end_holder(lock: Path, *, patience_s: float = 10.0) -> int | None:
 
     Returns when it is gone, not only its lock: a process lets go of what it holds, and may
     hang only then.
-
-    Args:
-        patience_s: How long to wait after each signal.
     """
     pid = lock_holder(lock)
     if pid is None or pid == os.getpid():

@@ -44,8 +44,6 @@ class ProxySupervisor:
     """Looks after a pool's client proxies; `look` is called with each tick.
 
     Args:
-        paths: The pool's folder.
-        clock: Monotonic seconds.
         command: What to start, alone; ``python -m fogft proxy --config ...`` unless told.
         ended: Called, from any thread, when a proxy has ended: then `look` is due at once.
     """
@@ -75,8 +73,7 @@ class ProxySupervisor:
     def look(self, *, outdated: bool = False) -> bool:
         """Start what is missing; return whether a proxy works, or starts.
 
-        Args:
-            outdated: The one that works is of another version of fogft: one of ours takes over.
+        One of ours takes over from one that is outdated: of another version of fogft.
         """
         now = self._clock()
         for child in [one for one in self._children if one.process.poll() is not None]:

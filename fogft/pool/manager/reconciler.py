@@ -103,19 +103,11 @@ class Reconciler:
     """Brings one pool to what is wanted.
 
     Args:
-        cloud: Where its machines run.
-        store: What it remembers.
-        clock: Seconds since the epoch.
         reading: Tells in place of `clock` what it is, and whether it was set; see
             `planning.observed.clock_jumps`.
-        links: ``links(pool_uid, now)``: a fresh report of the client proxy, or None.
-        build_order: Makes the order of a planned launch, files included.
-        submit: Runs a long cloud call, now or on another thread.
         epoch: Of the lease; goes into every membership.
-        revoked: Common names of certificates that were taken back.
         by_hand: Replicas that people start themselves, and that are still let in.
         gateways: Name -> generations of its certificates that are good.
-        on_done: Called when a long cloud call has ended.
         distances: Says how far regions are from the robot, of what is sold and what runs.
     """
 

@@ -20,12 +20,7 @@ log = logging.getLogger(__name__)
 
 
 class Remembering:
-    """Adds to a pool's history. Events are on disk before a method returns.
-
-    Args:
-        store: Where the history is.
-        clock: Seconds since the epoch.
-    """
+    """Adds to a pool's history. Events are on disk before a method returns, or `StateError`."""
 
     def __init__(self, store: Store, clock: Callable[[], float]) -> None:
         self._store = store
@@ -42,11 +37,7 @@ class Remembering:
         at: float | None = None,
         version: str = "",
     ) -> None:
-        """Add one event, of now unless told.
-
-        Raises:
-            StateError: It cannot be written; it did not happen.
-        """
+        """Add one event, of now unless told."""
         when = self._clock() if at is None else at
         self._store.append(
             Event(when, kind, id.slot, id.generation, location, reason, on_demand, version=version)
@@ -69,11 +60,7 @@ class Remembering:
                 self.add(kind, id, at=observed.now)
 
     def health(self, health: Health, history: History, now: float) -> None:
-        """Note who became ready, stopped to be, or failed, as observed at `now`.
-
-        Args:
-            health: Assessment by this very history.
-        """
+        """Note who became ready, stopped to be, or failed; judged by this very history."""
         for judged in health.replicas:
             machine, record = judged.machine, judged.record
             id = machine.id

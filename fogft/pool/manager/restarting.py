@@ -17,11 +17,7 @@ from fogft.pool.folder.paths import PoolPaths
 
 
 def allow(paths: PoolPaths, environ: Mapping[str, str] = os.environ) -> None:
-    """Say how this process is started, should it die.
-
-    Raises:
-        StateError: It cannot be written.
-    """
+    """Say how this process is started, should it die."""
     if environ.get("NOTIFY_SOCKET"):
         forbid(paths)
         return

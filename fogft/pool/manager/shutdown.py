@@ -36,12 +36,7 @@ def end(
 ) -> list[str]:
     """End a pool and return what was ended, in words, in order.
 
-    Args:
-        store: The pool.
-        cloud_of: Returns the cloud that a pool runs on.
-        told: Called with each thing as it has been ended.
-        warned: Called with what could not be made certain.
-        limit_s: How long machines may take to go.
+    `told` hears of each thing as it has ended, `warned` of what could not be made certain.
 
     Raises:
         PoolNotFound: There is no such pool (any more).

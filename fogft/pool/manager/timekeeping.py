@@ -26,7 +26,6 @@ class Timekeeping:
     """The time of one manager's ticks.
 
     Args:
-        clock: Seconds since the epoch.
         reading: Tells in place of `clock` what time it is, and whether it was set; None where
             nobody sets it.
     """

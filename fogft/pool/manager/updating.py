@@ -26,21 +26,13 @@ log = logging.getLogger(__name__)
 
 
 class Updating:
-    """The updates of one pool.
-
-    Args:
-        store: What it remembers.
-    """
+    """The updates of one pool; what cannot be remembered raises `StateError`."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def look(self, uid: str, observed: Observed, history: History) -> tuple[PoolSpec, Trial]:
-        """Give up the file that is being applied if it must be; return the file in force.
-
-        Raises:
-            StateError: What must be remembered cannot be written.
-        """
+        """Give up the file that is being applied if it must be; return the file in force."""
         store = self._store
         spec, good, trial = store.spec(), store.good(), store.trial()
         if trial.file != store.applied():
@@ -59,11 +51,7 @@ class Updating:
         return store.spec(), trial
 
     def move(self, by_s: float) -> None:
-        """Let what is remembered be later: the clock was set.
-
-        Raises:
-            StateError: It cannot be written.
-        """
+        """Let what is remembered be later: the clock was set."""
         trial = self._store.trial()
         if trial.began_at:
             self._store.write_trial(replace(trial, began_at=trial.began_at + by_s))
@@ -78,11 +66,7 @@ class Updating:
         wanted: int,
         now: float,
     ) -> Update | None:
-        """Keep the file in force once the pool is wholly ready with it; return the update's state.
-
-        Raises:
-            StateError: It cannot be kept.
-        """
+        """Keep the file in force once the pool is whole with it; return the update's state."""
         good = self._store.good()
         if not trial.fault and spec is not good and spec != good:
             settle_s = rollout.SETTLE_S if good is not None else 0.0
