@@ -176,32 +176,37 @@ class Relay:
             connection.add_done_callback(self._connections.pop)
 
     async def _serve(self, client: socket.socket) -> None:
-        with client, socket.socket() as server:
+        with client, contextlib.ExitStack() as stack:
+            sides = [client]
             try:
                 await self._passes.wait()
-                await self._connect(client, server)
-                await self._exchange(client, server)
+                sides.append(stack.enter_context(await self._connected(client)))
+                await self._exchange(*sides)
             except (OSError, asyncio.CancelledError):
-                for side in (client, server):
+                for side in sides:
                     with contextlib.suppress(OSError):
                         side.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
 
-    async def _connect(self, client: socket.socket, server: socket.socket) -> None:
+    async def _connected(self, client: socket.socket) -> socket.socket:
         """Connect to the server; wait until it first listens, as for a machine that still boots."""
-        for side in (client, server):
-            side.setblocking(False)
-            side.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         while True:
             reached = self.reached  # before: meanwhile another connection may find it listening
+            # A new one each time: connecting again, one that was refused may fail untried.
+            server = socket.socket()
+            server.setblocking(False)
+            server.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             try:
                 await self._loop.sock_connect(server, self._upstream)
-            except OSError:
-                if reached or _has_left(client):
+            except (OSError, asyncio.CancelledError) as error:
+                server.close()
+                if reached or isinstance(error, asyncio.CancelledError) or _has_left(client):
                     raise
                 await asyncio.sleep(RETRY_S)
             else:
                 self.reached = True
-                return
+                return server
 
     async def _exchange(self, client: socket.socket, server: socket.socket) -> None:
         up, down = self._shapers

@@ -222,15 +222,15 @@ class Manager:
         def done(what: str) -> None:
             log.info("ended pool=%s what=%r", self._identity.name, what)
 
-        shutdown.end_client_proxy(self._paths, done)
-        teardown.end_machines(
-            self._cloud,
-            self._identity.uid,
-            known=teardown.known(self._store),
-            done=done,
-            warned=lambda what: log.warning("not_verified reason=%r", what),
-            limit_s=LEAVE_LIMIT_S,
-        )
+        with shutdown.without_client_proxy(self._paths, done):
+            teardown.end_machines(
+                self._cloud,
+                self._identity.uid,
+                known=teardown.known(self._store),
+                done=done,
+                warned=lambda what: log.warning("not_verified reason=%r", what),
+                limit_s=LEAVE_LIMIT_S,
+            )
 
     def _attempt(self, step: Callable[[], None]) -> None:
         try:

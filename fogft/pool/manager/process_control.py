@@ -48,7 +48,7 @@ def end_holder(lock: Path, *, patience_s: float = 10.0) -> int | None:
     """End the process that holds a lock: SIGTERM, then SIGKILL. Return its pid; None for nobody.
 
     Returns when it is gone, not only its lock: a process lets go of what it holds, and may
-    hang only then.
+    hang only then. Another that waited for the lock may hold it by then.
     """
     pid = lock_holder(lock)
     if pid is None or pid == os.getpid():
@@ -59,7 +59,7 @@ def end_holder(lock: Path, *, patience_s: float = 10.0) -> int | None:
                 process.send(number)
                 process.send(signal.SIGCONT)  # one that is stopped would never hear of it
             end = time.monotonic() + patience_s
-            while disk.is_locked(lock) or process.alive:
+            while process.alive or (disk.is_locked(lock) and lock_holder(lock) in (None, pid)):
                 if time.monotonic() > end:
                     break
                 time.sleep(POLL_S)

@@ -3,6 +3,9 @@
 Manager first (it would repair what we end), then the client proxy, then every machine
 that carries the pool's uid, then the folder. Stopped half-way, it can be run again.
 
+It takes each lock from the process that it ends, and keeps it: what is only starting, a manager
+that the client proxy began or a standby, finds its place taken and ends.
+
 Owns: the order, and the end of our own processes.
 Not here: the machines, and the proof that none is left (`teardown`).
 """
@@ -11,7 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +27,7 @@ from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import process_control, teardown
 
 LIMIT_S = 600.0
+_TRIES = 4  # as many may wait for a lock: a standby, and what each of its starters began
 
 
 def end(
@@ -50,18 +54,16 @@ def end(
         ended.append(what)
         told(what)
 
-    with disk.locked(paths.intent_lock):
+    with disk.locked(paths.intent_lock), contextlib.ExitStack() as kept:
         try:
             identity = store.identity()
         except PoolNotFound:
             return ended  # another `down` was faster
-        _end_process(done, "manager", paths.manager_lock)
+        kept.enter_context(_taken(done, "manager", paths.manager_lock))
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             store.write_intent(replace(_intent(store), stopping=True))
-        end_client_proxy(paths, done)
-        # The client proxy may have started one since.
-        _end_process(done, "manager", paths.manager_lock)
+        kept.enter_context(without_client_proxy(paths, done))
         teardown.end_machines(
             cloud_of(identity),
             identity.uid,
@@ -76,14 +78,18 @@ def end(
     return ended
 
 
-def end_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> None:
-    """End a pool's client proxy, and the one in line behind it, which would take over. Repeatable.
+@contextlib.contextmanager
+def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Iterator[None]:
+    """End a pool's client proxy and its standby; none can start while this is open.
 
     Raises:
         FogftError: It does not end.
     """
-    _end_process(lambda _: None, "standby client proxy", paths.standby_lock)
-    _end_process(done, "client proxy", paths.proxy_lock)
+    with (
+        _taken(lambda _: None, "standby client proxy", paths.standby_lock),
+        _taken(done, "client proxy", paths.proxy_lock),
+    ):
+        yield
 
 
 def _intent(store: PoolStore) -> Intent:
@@ -93,13 +99,23 @@ def _intent(store: PoolStore) -> Intent:
         return Intent()
 
 
-def _end_process(done: Callable[[str], None], what: str, lock: Path) -> None:
-    pid = process_control.end_holder(lock)
-    if disk.is_locked(lock):
+@contextlib.contextmanager
+def _taken(done: Callable[[str], None], what: str, path: Path) -> Iterator[None]:
+    """Hold a lock; end who holds it, and whoever takes it before us."""
+    lock = disk.Lock(path)
+    for _ in range(_TRIES):
+        pid = process_control.end_holder(path)
+        if pid is not None and process_control.lock_holder(path) != pid:
+            done(f"{what} (pid {pid})")
+        if lock.acquire(wait=False):
+            break
+    else:
         raise FogftError(
-            f"the {what} of `{lock.parent.name}` does not end",
+            f"the {what} of `{path.parent.name}` does not end",
             "it belongs to another user, or hangs in the kernel; end "
             "it, then run `fogft down` again",
         )
-    if pid is not None:
-        done(f"{what} (pid {pid})")
+    try:
+        yield
+    finally:
+        lock.release()

@@ -66,7 +66,9 @@ def wait(
     log.info("standby_ready pool=%s", config.pool)
     ours, watchdog = _taken(lock), Watchdog()
     notify("READY=1")
-    while not ours.wait(LOOK_S):
+    taken = False
+    while not taken:
+        taken = ours.wait(LOOK_S)
         watchdog.work()
         if stop.is_set() or not config.lock.parent.exists():
             stop.set()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -169,3 +171,43 @@ def test_a_damaged_specification_neither_stops_its_repair_nor_the_end(scene: Sce
     scene.paths.spec.write_bytes(b"\xff\xfe\x00 not text")
     scene.end()
     assert not scene.paths.folder.exists()
+
+
+TAKE = """
+import sys
+from pathlib import Path
+from fogft import disk
+
+lock = disk.Lock(Path(sys.argv[1]))
+print("waits", flush=True)
+lock.acquire(wait=True)
+if Path(sys.argv[1]).exists():  # as a standby looks: no folder, no work
+    sys.stdin.read()
+"""
+
+
+def test_a_standby_that_is_only_starting_is_ended_too(scene: Scene) -> None:
+    """It holds no place in line yet, and may take the work over while `down` ends the proxy."""
+    scene.write()
+    line = [
+        subprocess.Popen(
+            [sys.executable, "-c", TAKE, str(scene.paths.proxy_lock)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    try:
+        for one in line:
+            assert one.stdout is not None
+            assert one.stdout.readline() == "waits\n"
+        scene.wait(lambda: disk.is_locked(scene.paths.proxy_lock))
+        told = scene.end()
+        codes = {one.pid: one.wait(30) for one in line}
+        assert set(codes.values()) <= {-signal.SIGTERM, 0}
+        ended = [pid for pid, code in codes.items() if code]
+        assert sorted(told) == sorted(f"client proxy (pid {pid})" for pid in ended)
+        assert ended
+    finally:
+        for one in line:
+            one.kill()
+            one.communicate()
