@@ -44,6 +44,7 @@ def show(shown: PlanShown, *, everything: bool = False) -> None:
 def to_json(shown: PlanShown) -> dict[str, Any]:
     """Return the plan as a JSON value. Money in US dollars, times in seconds."""
     plan = shown.explanation
+    names = [service.name for service in shown.spec.services]
     return {
         "pool": shown.spec.name,
         "prices_from": shown.cloud,
@@ -60,7 +61,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
                 "usd_per_hour": replica.offer.usd_per_hour,
                 "extras_usd_per_hour": replica.offer.extras_usd_per_hour,
                 "rtt_s": replica.rtt_s,
-                "services": list(replica.services),
+                "services": names,
             }
             for replica in plan.replicas
         ],
@@ -75,9 +76,9 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
         "pool_is_cheapest": plan.is_cheapest,
         "availability": {
             "target": plan.target,
-            "expected": plan.least_expected.correlated,
-            "if_independent": plan.least_expected.independent,
-            "services": {name: vars(one) for name, one in plan.expected.items()},
+            "expected": plan.expected.correlated,
+            "if_independent": plan.expected.independent,
+            "services": dict.fromkeys(names or ["*"], vars(plan.expected)),
             "assumed": {
                 "spot_uptime_s": plan.assumed.spot_uptime_s,
                 "on_demand_uptime_s": plan.assumed.on_demand_uptime_s,
@@ -151,11 +152,7 @@ def _summary(shown: PlanShown) -> list[str]:
     plan = shown.explanation
     count = len(plan.replicas)
     out = [f"replicas      {count} of {plan.wanted} wanted"]
-    names = {service.name for service in shown.spec.services}
-    for replica in plan.replicas:
-        if set(replica.services) != names or replica.group:
-            group = f" ({replica.group})" if replica.group else ""
-            out.append(f"  slot {replica.slot}{group} carries {', '.join(replica.services)}")
+    out += [f"  slot {one.slot} ({one.group})" for one in plan.replicas if one.group]
     cap = "" if plan.cap is None else f"; the cap is ${plan.cap:.2f}/h"
     out.append(f"cost          {_money(plan.cost)}{cap}")
     extras = sum(replica.offer.extras_usd_per_hour for replica in plan.replicas)
@@ -199,7 +196,7 @@ def _verdict(shown: PlanShown) -> list[str]:
     plan = shown.explanation
     if plan.single is None:
         return []
-    target = plan.least_expected.correlated if plan.target is None else plan.target
+    target = plan.expected.correlated if plan.target is None else plan.target
     asked = f"for {100 * target:.6g} %"
     if plan.is_cheapest is None:
         return [f"cheapest      {asked} neither this pool nor one on-demand machine is enough"]
@@ -211,14 +208,10 @@ def _verdict(shown: PlanShown) -> list[str]:
 def _availability(shown: PlanShown) -> list[str]:
     plan, assumed = shown.explanation, shown.explanation.assumed
     target = "" if plan.target is None else f", {plan.target:.6g} is asked for"
-    levels, least = assumed.correlation, plan.least_expected
-    better = [
-        f"  {name}: {one.correlated:.6f}" for name, one in plan.expected.items() if one != least
-    ]
+    levels, least = assumed.correlation, plan.expected
     return [
         f"availability  {least.correlated:.6f} expected{target} "
         f"({least.independent:.6f} if replicas failed independently)",
-        *better,
         f"  assuming spot up {assumed.spot_uptime_s / 3600:.3g} h, on demand "
         f"{assumed.on_demand_uptime_s / 3600:.4g} h, away {assumed.recovery_s / 60:.3g} min; "
         f"correlation {levels.zone:g} in a zone, {levels.region:g} in a region, "

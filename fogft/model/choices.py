@@ -192,8 +192,8 @@ class GroupSpec:
     name: str = key(
         Text(
             "a group's name",
-            "use lower-case letters, digits and dashes, at most 20, and not `critical`",
-            only(re.compile(r"(?!critical$)[a-z][a-z0-9-]{0,19}").fullmatch),
+            "use lower-case letters, digits and dashes, at most 20, such as `anchor`",
+            only(re.compile(r"[a-z][a-z0-9-]{0,19}").fullmatch),
         ),
         "Name of the group: lower-case letters, digits and dashes, at most 20.",
     )

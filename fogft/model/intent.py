@@ -84,7 +84,7 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
             f"cannot scale `{spec.name}` to {wanted} replicas: at most {MAX_REPLICAS} can be had"
         )
     for service in spec.services:
-        if service.quorum > max(wanted, service.min_replicas):
+        if service.quorum > wanted:
             raise FogftError(
                 f"cannot scale `{spec.name}` to {wanted} replicas: `{service.name}` has a quorum "
                 f"of {service.quorum}, and no answer could win",

@@ -147,13 +147,6 @@ class ServiceSpec:
         parameter=True,
     )
     hedging_budget: float = 0.1
-    min_replicas: int = key(
-        Whole(1, MAX_REPLICAS, "machines"),
-        "Replicas that carry this service, where that is more than the pool has. The additional "
-        "ones carry such services alone; `run` finds their names in `FOGFT_SERVICES`.",
-        default=0,
-        usual="as the pool",
-    )
     traffic: TrafficSpec = key(
         Map(TrafficSpec, "write `{requests_per_s: 10, request_bytes: 100000}`"),
         "Load on the service, for the costs that `fogft plan` shows; measured where it is not set.",
@@ -477,19 +470,24 @@ class PoolSpec:
         return self.services or self.discovered
 
     @cached_property
+    def proxied_names(self) -> frozenset[str]:
+        """Their names: what makes a replica ready; none for never."""
+        return frozenset(service.name for service in self.proxied)
+
+    @cached_property
     def replica_hash(self) -> str:
         """16 hexadecimal digits that change when running replicas must be replaced.
 
         Covers what a replica runs and serves, fogft on it, and the machine it needs; not how
         many there are, how long the robot waits, or where machines may be.
         """
-        return self.hash_with(self.services, self.task.get("resources"))
+        return self.hash_with(self.task.get("resources"))
 
-    def hash_with(self, services: tuple[ServiceSpec, ...], resources: Any) -> str:
-        """Return the `replica_hash` of a replica with these services and such `resources`."""
+    def hash_with(self, resources: Any) -> str:
+        """Return the `replica_hash` of a replica with such `resources`."""
         asked: dict[str, Any] = {
             "fogft": __version__,
-            "services": sorted(_run_by_replica(s) for s in services),
+            "services": sorted(_run_by_replica(s) for s in self.services),
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
         }
         if self.topics:

@@ -150,7 +150,7 @@ class Buyer:
             at_leisure: For one that need not be launched: nothing that refused lately is in it.
         """
         full = self._full(group) if spot else frozenset()
-        key = (group.offers, spot, at_leisure, full)
+        key = (group.name, spot, at_leisure, full)
         if key not in self._markets:
             backing_off = self._backing_off
             if at_leisure:
@@ -201,13 +201,13 @@ class Buyer:
 
     def whole_market(self, group: Group, spot: bool | None) -> Market:
         """Return what is sold to a group where nothing backs off or is avoided."""
-        key = (group.offers, spot)
+        key = (group.name, spot)
         if key not in self._whole:
             self._whole[key] = Market(self._listing(group, spot), hazards=self.hazards)
         return self._whole[key]
 
     def _listing(self, group: Group, spot: bool | None) -> Listing:
-        return self._catalogue.listing(group.offers, spot, self.intent.excluded, self.scale)
+        return self._catalogue.listing(group.name, spot, self.intent.excluded, self.scale)
 
     def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
         """Return the market of what failed longest ago, where all backs off; None to wait."""

@@ -45,28 +45,18 @@ class Cost:
         return self.usd_per_hour * HOURS_A_MONTH
 
 
-def cost(replicas: Sequence[tuple[Offer, Sequence[ServiceSpec]]]) -> Cost:
-    """Return what replicas cost: each an offer, and the services that it carries."""
-    machines = sum(offer.usd_per_hour - offer.egress_usd_per_hour for offer, _ in replicas)
-    carriers = {
-        service.name: sum(service in carried for _, carried in replicas)
-        for _, carried in replicas
-        for service in carried
-    }
-    egress = sum(
-        egress_bytes_per_s(carried, carriers) * 3600 / GB * egress_price(offer.placement.cloud)
-        for offer, carried in replicas
-    )
-    return Cost(machines, egress)
+def cost(offers: Sequence[Offer], services: Iterable[ServiceSpec]) -> Cost:
+    """Return what replicas cost that carry these services, an offer each."""
+    machines = sum(offer.usd_per_hour - offer.egress_usd_per_hour for offer in offers)
+    each = egress_bytes_per_s(services, len(offers)) * 3600 / GB
+    return Cost(machines, sum(each * egress_price(offer.placement.cloud) for offer in offers))
 
 
-def egress_bytes_per_s(carried: Iterable[ServiceSpec], carriers: dict[str, int]) -> float:
-    """Return what leaves one replica, of services that so many replicas carry."""
+def egress_bytes_per_s(services: Iterable[ServiceSpec], replicas: int) -> float:
+    """Return what leaves one of so many replicas."""
     return sum(
-        service.traffic.requests_per_s
-        * service.traffic.response_bytes
-        * _share(service, carriers[service.name])
-        for service in carried
+        one.traffic.requests_per_s * one.traffic.response_bytes * _share(one, replicas)
+        for one in services
     )
 
 
@@ -75,7 +65,7 @@ def egress_price(cloud: str) -> float:
     return EGRESS_USD_PER_GB.get(cloud, UNKNOWN_EGRESS_USD_PER_GB)
 
 
-def _share(service: ServiceSpec, carriers: int) -> float:
+def _share(service: ServiceSpec, replicas: int) -> float:
     """Return the fraction of requests that one of so many replicas answers."""
     # Under `auto` a replica that is idle gets a copy of every request: the most that it may be.
-    return 1.0 / carriers if service.hedging is HedgingMode.FAILOVER else 1.0
+    return 1.0 / replicas if replicas and service.hedging is HedgingMode.FAILOVER else 1.0

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 from fogft.model.choices import Assumption
-from fogft.model.groups import group_at, services_at
+from fogft.model.groups import group_of, groups_of
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
-from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.model.spec import PoolSpec
 from fogft.planning.availability import Expected, expected, unavailability_of
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
@@ -59,16 +59,11 @@ class Considered:
 
 @dataclass(frozen=True)
 class Replica:
-    """One that would be launched.
-
-    Attributes:
-        services: The names of what it carries.
-    """
+    """One that would be launched."""
 
     slot: int
     group: str
     offer: Offer
-    services: tuple[str, ...]
     rtt_s: float | None
 
 
@@ -80,7 +75,7 @@ class Explanation:
         wanted: Replicas wanted now.
         cap: US dollars per hour; None for none.
         assumed: What the availability rests on.
-        expected: Of each service, by the replicas that carry it; ``*`` for all where `run` tells.
+        expected: That a request can be answered.
         cost: Of the planned replicas.
         single: The cheapest on-demand machine that would do alone, and its cost; None where
             no price is known.
@@ -92,16 +87,11 @@ class Explanation:
     wanted: int
     cap: float | None
     assumed: Assumption
-    expected: Mapping[str, Expected]
+    expected: Expected
     target: float | None
     cost: Cost
     single: tuple[Offer, Cost] | None
     notes: tuple[Reason, ...]
-
-    @property
-    def least_expected(self) -> Expected:
-        """Of the service that is expected to answer least often."""
-        return min(self.expected.values(), key=lambda one: one.correlated)
 
     @property
     def is_cheapest(self) -> bool | None:
@@ -112,7 +102,7 @@ class Explanation:
         """
         if self.single is None:
             return None
-        pool = self.least_expected.correlated
+        pool = self.expected.correlated
         target = pool if self.target is None else self.target
         costs = [(self.cost.usd_per_hour, True)] if pool >= target else []
         if 1.0 - unavailability_of(self.assumed, spot=False) >= target:
@@ -161,7 +151,6 @@ def explain(
     assumed = spec.availability.assumed if spec.availability else Assumption()
     if recovery_s is not None and assumed.recovery_s == Assumption().recovery_s:
         assumed = replace(assumed, recovery_s=recovery_s)
-    carried = [(launch.offer, services_at(spec, launch.slot)) for launch in planned.launches]
     cheapest = min(
         (o for o in on_demand if is_possible(o)),
         key=lambda o: (o.usd_per_hour, o.placement),
@@ -174,29 +163,19 @@ def explain(
                 launch.slot,
                 launch.offer.group,
                 launch.offer,
-                tuple(service.name for service in services),
                 scale.latency(launch.offer.placement),
             )
-            for launch, (_, services) in zip(planned.launches, carried, strict=True)
+            for launch in planned.launches
         ),
         wanted=planned.wanted,
         cap=sized.max_usd_per_hour,
         assumed=assumed,
-        expected={
-            service.name: expected([o.placement for o, has in carried if service in has], assumed)
-            for service in spec.services
-        }
-        # What `run` advertises is not known before it runs: all replicas carry all of it.
-        or {"*": expected([o.placement for o, _ in carried], assumed)},
+        expected=expected([launch.offer.placement for launch in planned.launches], assumed),
         target=spec.availability.target if spec.availability else None,
-        cost=cost(carried),
-        single=None if cheapest is None else (cheapest, _alone(cheapest, spec.services)),
+        cost=cost([launch.offer for launch in planned.launches], spec.services),
+        single=None if cheapest is None else (cheapest, cost([cheapest], spec.services)),
         notes=planned.notes,
     )
-
-
-def _alone(offer: Offer, services: Sequence[ServiceSpec]) -> Cost:
-    return cost([(offer, services)])
 
 
 class _Reasons:
@@ -225,9 +204,9 @@ class _Reasons:
         taken: list[Placement] = []
         spent = 0.0
         for launch in launches:
-            group = group_at(spec, launch.slot)
+            group = group_of(groups_of(spec), launch.slot)
             pick = _Pick(launch, dict(crowding(taken)), None if cap is None else cap - spent)
-            self._picks.setdefault(group.offers, []).append(pick)
+            self._picks.setdefault(group.name, []).append(pick)
             self._slots.setdefault(launch.offer, []).append(launch.slot)
             taken.append(launch.offer.placement)
             spent += launch.offer.usd_per_hour

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from fogft.model.choices import MAX_REPLICAS
-from fogft.model.groups import Group, critical_group, groups_of, shares
+from fogft.model.groups import Group, groups_of, shares
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer
@@ -34,7 +34,7 @@ class Size(NamedTuple):
     """What is wanted.
 
     Attributes:
-        groups: In the order of their slots; the one of critical services last.
+        groups: In the order of their slots.
         counts: How many of each.
         max_usd_per_hour: The cap that holds now; None for none.
         notes: What may surprise.
@@ -76,12 +76,7 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
     elif spec.availability and now.replicas == spec.replicas:
         total, unmet = _for_target(spec, intent, observed, now.max_usd_per_hour, running)
         notes += because(unmet)
-    counts = shares(groups, total)
-    extra = critical_group(spec, total)
-    if extra.replicas and total:
-        room = MAX_REPLICAS - total
-        groups, counts = (*groups, extra), (*counts, min(extra.replicas, room))
-    return Size(groups, counts, now.max_usd_per_hour, tuple(notes))
+    return Size(groups, shares(groups, total), now.max_usd_per_hour, tuple(notes))
 
 
 def layout(
@@ -132,7 +127,7 @@ class Markets:
             kinds = kinds if group.on_demand.fallback else kinds[:1]
         places = [offer.placement for _, offer in taken]
         for spot in kinds:
-            found = self._market(group.offers, spot).choose(places, budget_usd_per_hour=budget)
+            found = self._market(group.name, spot).choose(places, budget_usd_per_hour=budget)
             if found.offer is not None:
                 return found.offer
         return None

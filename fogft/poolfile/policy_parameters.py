@@ -74,7 +74,7 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         key = error.key.removeprefix(f"{spec.name}.").removeprefix(f"{ADVANCED}.")
         reason = f"{key}: {error.what}"
         raise ValueError(f"{reason}; {error.hint}" if error.hint else reason) from None
-    return replace(read, min_replicas=spec.min_replicas, traffic=spec.traffic)
+    return replace(read, traffic=spec.traffic)
 
 
 def _timeout(spec: ServiceSpec, value: Value) -> float:

@@ -202,12 +202,11 @@ def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> Non
     """Refuse a quorum that can never be reached, or at some time of the week cannot."""
     windows = spec.schedule.windows if spec.schedule else ()
     fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas is not None)])
-    carry = max(fewest, service.min_replicas)
-    if service.quorum > carry:
+    if service.quorum > fewest:
         where = " in a window of `schedule`" if fewest < spec.replicas else ""
         raise section.error(
             "quorum",
-            f"is {service.quorum}, but only {carry} can be asked{where}: no answer could win",
+            f"is {service.quorum}, but only {fewest} can be asked{where}: no answer could win",
             f"write `replicas: {service.quorum}` or more there, or a smaller `quorum`",
         )
 

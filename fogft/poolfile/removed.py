@@ -22,6 +22,7 @@ _AUTOSCALE = {
     "replicas there are"
 }
 _DEFAULT_IS_RIGHT = "is no key any more; remove it: the default is right"
+_OWN_POOL = "is no key of a service; put this service into a pool of its own, with as many"
 _HINTS: dict[type, dict[str, str]] = {
     PoolSpec: {
         **_AUTOSCALE,
@@ -30,7 +31,8 @@ _HINTS: dict[type, dict[str, str]] = {
     ServiceSpec: {
         **_AUTOSCALE,
         "hedging_budget": _DEFAULT_IS_RIGHT,
-        "replicas": "is called `min_replicas` now; write that",
+        "replicas": _OWN_POOL,
+        "min_replicas": _OWN_POOL,
         "uplinks": "is called `uplink_policy` now; write `advanced: {uplink_policy: ...}`",
         "fallback": "is called `fallback_service` now; write `fallback_service: {name: ...}`",
     },

@@ -19,7 +19,6 @@ from fogft.model.choices import (
     ScheduleSpec,
     WindowSpec,
 )
-from fogft.model.groups import CRITICAL_BLOCK, services_at
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.model.scoring import Weights
@@ -29,7 +28,6 @@ from fogft.planning.observed.history import Event, EventKind
 from tests.nightly import by_day
 from tests.planning.pool_worlds import (
     NOW,
-    SERVICE,
     UID,
     World,
     applied,
@@ -204,7 +202,7 @@ def test_a_target_does_not_shrink_while_nothing_is_offered():
     assert not world.plan().draining
 
 
-# -- groups, on-demand, critical services ------------------------------------------------------
+# -- groups, on-demand -------------------------------------------------------------------------
 
 GROUPS = (
     GroupSpec("anchor", 1, {"cpus": 4}),
@@ -280,17 +278,6 @@ def test_without_fallback_nothing_stands_in():
     asked = spec(2, on_demand=OnDemandSpec(1, False))
     world, _ = lived(World(asked, offers=ON_DEMAND), 3)
     assert [p.spot for p in ours(world)] == [False]
-
-
-def test_critical_services_get_replicas_that_carry_them_alone():
-    critical = replace(SERVICE, name="/stop", min_replicas=4)
-    asked = replace(spec(2), services=(SERVICE, critical))
-    planned = World(asked).plan()
-    assert planned.wanted == 4
-    first = CRITICAL_BLOCK * 100
-    assert [x.slot for x in planned.launches] == [0, 1, first, first + 1]
-    assert [s.name for s in services_at(asked, 0)] == ["/plan", "/stop"]
-    assert [s.name for s in services_at(asked, first)] == ["/stop"]
 
 
 # -- schedule --------------------------------------------------------------------------------

@@ -398,8 +398,8 @@ MISTAKES = {
     ),
     "key with another name now": (
         pool(services="[{name: a, type: a/srv/A, replicas: 4}]"),
-        "pool.yaml:3: fogft.services[0].replicas: is called `min_replicas` now",
-        "write that",
+        "pool.yaml:3: fogft.services[0].replicas: is no key of a service",
+        "put this service into a pool of its own, with as many",
     ),
     "advanced key beside the others": (
         pool(services="[{name: a, type: a/srv/A, trace: true}]"),

@@ -35,7 +35,6 @@ def services(draw):
         ok_field=draw(st.sampled_from(("", "success"))),
         trace=draw(st.booleans()),
         advertise=draw(st.sampled_from((None, *Advertise))),
-        min_replicas=draw(st.integers(0, 3)),
         traffic=TrafficSpec(requests_per_s=draw(st.sampled_from((0.0, 5.0)))),
     )
 
@@ -71,8 +70,8 @@ def test_what_holds_is_shown_and_nothing_else_has_changed(service, news):
     assert {k: now[k] for k in kept if k not in news} == {
         k: before[k] for k in kept if k not in news
     }
-    assert (after.name, after.type, after.min_replicas, after.traffic) == (
-        service.name, service.type, service.min_replicas, service.traffic,
+    assert (after.name, after.type, after.traffic) == (
+        service.name, service.type, service.traffic,
     )  # fmt: skip
 
 

@@ -147,7 +147,6 @@ WINDOW = "  schedule: {time_zone: UTC, windows: [{days: mon, replicas: %d}]}\n"
     ("more", "fewest"),
     [
         ("      quorum: 3\n", 2),
-        ("      quorum: 5\n      min_replicas: 4\n", 4),
         ("      quorum: 3\n  replicas: 2\n", 2),
         ("      quorum: 2\n  availability: 0.99\n", 1),
         ("      quorum: 2\n  groups: [{name: a, replicas: 1}]\n", 1),
@@ -166,7 +165,6 @@ def test_a_quorum_that_cannot_be_reached_is_refused(more, fewest):
     "more",
     [
         "      quorum: 2\n",
-        "      quorum: 4\n      min_replicas: 4\n",
         "      quorum: 3\n  replicas: 3\n" + WINDOW % 4,
         "      quorum: 2\n  replicas: 2\n  availability: 0.99\n",
     ],

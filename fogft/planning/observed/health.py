@@ -14,7 +14,7 @@ import math
 from enum import Enum
 from typing import NamedTuple
 
-from fogft.model.groups import ready_at, replica_hash
+from fogft.model.groups import replica_hash
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
@@ -191,7 +191,7 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
         return False
     if machine.spec_hash != replica_hash(spec, machine.id.slot):
         return bool(link.ready)
-    wanted = ready_at(spec, machine.id.slot)
+    wanted = spec.proxied_names
     if spec.discovered and not spec.services and spec.discovered_by != machine.spec_hash:
         wanted = frozenset(name for name, _ in link.offered)
     return bool(wanted) and wanted <= link.ready

@@ -18,7 +18,7 @@ from fogft import disk
 from fogft.cloud.port import Launch
 from fogft.errors import CredentialError
 from fogft.model.credentials import NAME_LIMIT, CredentialPaths, Holder, Role, holder_of
-from fogft.model.groups import FIRST_BY_HAND, replica_hash, services_at, task_at
+from fogft.model.groups import FIRST_BY_HAND, replica_hash, task_at
 from fogft.model.proxy_config import ClientProxyConfig, RendezvousConfig, ServerProxyConfig
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
@@ -185,16 +185,13 @@ def replica_config(
 
     With `announcements`, what the manager has signed lies beside it.
     """
-    services = services_at(spec, id.slot)
-    envs: dict[str, Any] = dict(spec.task.get("envs") or {})
-    if services != spec.services:  # `run` need not start the others
-        envs.setdefault("FOGFT_SERVICES", ",".join(service.name for service in services))
+    envs = spec.task.get("envs") or {}
     config = ServerProxyConfig(
         pool=identity.name,
         pool_uid=identity.uid,
         slot=id.slot,
         generation=id.generation,
-        services=services,
+        services=spec.services,
         run=str(spec.task.get("run") or ""),
         credentials=CredentialPaths(Path("ca.crt"), Path("replica.crt"), Path("replica.key")),
         envs={str(k): "" if v is None else str(v) for k, v in envs.items()},

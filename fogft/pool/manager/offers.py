@@ -50,7 +50,6 @@ def _priced(offer: Offer, spec: PoolSpec) -> Offer:
     price = egress_price(offer.placement.cloud)
     if not price or not any(one.traffic.response_bytes for one in spec.services):
         return offer
-    carriers = {service.name: spec.replicas for service in spec.services}
-    egress = egress_bytes_per_s(spec.services, carriers) * 3600 / GB * price
+    egress = egress_bytes_per_s(spec.services, spec.replicas) * 3600 / GB * price
     total = offer.usd_per_hour + egress
     return replace(offer, usd_per_hour=total, egress_usd_per_hour=egress)
