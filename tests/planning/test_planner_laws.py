@@ -152,7 +152,10 @@ def test_unknown_cloud_changes_nothing(world: World) -> None:
 @many
 @given(worlds(links_known=True), st.floats(2.5, 100_000))
 def test_all_silent_replaces_nothing(world: World, silent_s: float) -> None:
-    """When every link that ever answered is silent, no listed replica is replaced or ended."""
+    """When every link that ever answered is silent, no listed replica is replaced or ended.
+
+    A stand-in may be called for all the same: beside one that boots in a lost one's place.
+    """
     links = tuple(
         replace(link, state=LinkState.SUSPECT, ready=frozenset(), silent_for_s=silent_s)
         for link in world.links or ()
@@ -165,18 +168,14 @@ def test_all_silent_replaces_nothing(world: World, silent_s: float) -> None:
     ours = [m for m in machines if m.id.pool_uid == UID and m.id not in world.ending]
     if len(ours) < 2:
         return
-    quiet = replace(
-        world,
-        machines=machines,
-        links=links,
-        intent=replace(world.intent, drained={}, excluded=frozenset()),
-    )
-    planned = quiet.plan()
+    intent = replace(world.intent, drained={}, excluded=frozenset())
+    before = replace(world, machines=machines, intent=intent)
+    planned = replace(before, links=links).plan()
     assert planned.health is not None
     assert planned.health.uplink_suspected
     assert not planned.terminations
     assert not planned.draining
-    assert len(planned.launches) <= max(0, planned.wanted - len(ours))
+    assert len(planned.launches) <= max(planned.wanted - len(ours), len(before.plan().launches))
 
 
 @many
