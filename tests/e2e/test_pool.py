@@ -73,13 +73,14 @@ def test_a_slow_service_is_never_taken_for_a_dead_one_and_replicas_without_a_man
 def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     """Scaled up; one gets a notice; its manager dies and the next one adopts it; scaled down.
 
+    A command that waits returns when what it asked for is done.
     At a notice the successor is launched and serves long before the machine's 60 s are over.
     """
     pool.write(replicas=1)
     pool.up()
     client = pool.client(120, 10)
-    pool.fogft("scale", "up", "1")
-    pool.wait(lambda: pool.ready() == 2)
+    pool.fogft("scale", "up", "1", "--wait")
+    assert pool.ready() == 2
 
     pool.fogft("chaos", "preempt", "0", "--notice", "60")
     pool.wait(
@@ -100,8 +101,10 @@ def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     pool.fogft("up", str(pool.file), "--yes")
     pool.wait(lambda: pool.ready() == 2)
     assert {(r["slot"], r["generation"]) for r in pool.status()["replicas"]} == before
-    pool.fogft("scale", "down", "1")
-    pool.wait(lambda: len(pool.status()["replicas"]) == 1 and pool.ready() == 1)
+    pool.fogft("drain", "1", "--wait")
+    assert max(r["generation"] for r in pool.status()["replicas"] if r["slot"] == 1) > 1
+    pool.fogft("scale", "down", "1", "--wait")
+    assert [r["phase"] for r in pool.status()["replicas"]] == ["ready"]
     assert flawless(client.finish())
 
     status = pool.status()

@@ -52,9 +52,12 @@ def test_a_version_that_crashes_at_start_is_rolled_back_and_the_next_one_taken(p
     assert replicas(pool) == before
 
     pool.file.write_text(good.replace("plan_service.py 0.005", "plan_service.py 0.006"))
-    pool.fogft("up", str(pool.file), "--yes", limit_s=200)
+    first = pool.start("up", str(pool.file), "--yes")
+    pool.wait(lambda: (pool.status()["update"] or {}).get("state") == "in progress")
+    pool.fogft("up", str(pool.file), "--yes", limit_s=200)  # joins what is under way
     assert not before & replicas(pool), "`up` returns once the update is done"
     assert pool.status()["update"] is None
+    assert first.wait(60) == 0
     result = client.finish()
     assert result["requests"] > 100
     assert flawless(result), result

@@ -1,11 +1,9 @@
-"""What `fogft status` says of processes that hang, die and come back; what commands wait for."""
+"""What `fogft status` says of processes that hang, die and come back."""
 
 from __future__ import annotations
 
 import os
 import signal
-import sys
-from subprocess import DEVNULL, Popen
 
 import pytest
 
@@ -14,12 +12,6 @@ from fogft.pool.manager.process_control import lock_holder
 from tests.e2e.pool import Pool
 
 pytestmark = pytest.mark.timeout(300)
-
-
-def start(pool: Pool, *words: str) -> Popen[bytes]:
-    """Run a command beside others."""
-    command = [sys.executable, "-m", "fogft", *words]
-    return Popen(command, env=pool.environ, cwd=pool.folder, stdout=DEVNULL, stderr=DEVNULL)
 
 
 def pids(pool: Pool) -> list[int]:
@@ -34,7 +26,7 @@ def pids(pool: Pool) -> list[int]:
 
 def answers(pool: Pool) -> bool:
     """Return what `fogft status --check` exits by."""
-    return start(pool, "status", "--check").wait(30) == 0
+    return pool.start("status", "--check").wait(30) == 0
 
 
 def test_status_says_what_is_true_now(pool: Pool) -> None:
@@ -66,25 +58,3 @@ def test_status_says_what_is_true_now(pool: Pool) -> None:
     assert "no request is answered" in told
     pool.fogft("up", str(pool.file), "--yes")  # what doctor says to do
     pool.wait(lambda: answers(pool), 30)
-
-
-def test_a_command_that_waits_returns_when_it_is_done(pool: Pool) -> None:
-    """A drain, more and fewer replicas, and a second `up` during an update."""
-    pool.write(replicas=2)
-    pool.up()
-    before = {one["slot"]: one["generation"] for one in pool.status()["replicas"]}
-    pool.fogft("drain", "0", "--wait")
-    after = {one["slot"]: one["generation"] for one in pool.status()["replicas"]}
-    assert after[0] > before[0]
-    pool.fogft("scale", "up", "1", "--wait")
-    assert pool.ready() == 3
-    pool.fogft("scale", "down", "1", "--wait")
-    assert len(pool.status()["replicas"]) == 2
-
-    pool.write(replicas=2, work_s=0.006)
-    first = start(pool, "up", str(pool.file), "--yes")
-    pool.wait(lambda: pool.status()["update"] is not None, 30)
-    joined = start(pool, "up", str(pool.file), "--yes")
-    assert joined.wait(120) == 0
-    assert pool.status()["update"] is None, "it returned before the update had ended"
-    assert first.wait(30) == 0

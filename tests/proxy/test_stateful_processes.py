@@ -15,6 +15,7 @@ import pytest
 
 from fogft.ros import environment
 from tests.linearizability import Call, counter, key_value, linearizable
+from tests.nightly import by_day
 from tests.proxy.by_hand import LIMIT_S, ROOT, Parts, Replica, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
@@ -209,7 +210,7 @@ def test_kills_of_every_kind_leave_one_history_and_one_state(parts, clients):
         for _ in range(2)
     ]
 
-    def answered_more(count: int = 30) -> None:
+    def answered_more(count: int = by_day(12, at_night=30)) -> None:
         before = [c.answered for c in (*counters, *stores)]
         wait_for(
             lambda: all(
