@@ -2,12 +2,12 @@
 
 * **The first copy** goes where it is expected to be answered first: round trip, and one service
   time for it and each request before it. A replica that is doubted, or that fails, comes last.
-* **Spare copies** go at once to every other replica that is believed to be free, so the first
-  answer wins and the loss of a replica is not even seen. A replica drops a spare copy that would
-  have to wait. While spares make other requests wait for longer than they save, fewer requests get
-  them; as the wait goes, all of them do again.
-* **A late hedge**: an attempt that takes longer than 95 % of that replica's recent answers is
-  hedged at a free replica, if the budget has a token.
+* **Spare copies** go to every other replica that is believed to be free, at once or as soon as it
+  is, so the first answer wins and the loss of a replica is not even seen. A replica drops a spare
+  copy that would have to wait. While spares make other requests wait for longer than they save,
+  fewer requests get them; as the wait goes, all of them do again.
+* **A late hedge**: an attempt that takes longer than 95 % of that replica's recent answers, and
+  than what was before it there takes, is hedged at a free replica, if the budget has a token.
 * **Doubt**: a replica with such an attempt, that has ended nothing since that began, is doubted
   until it does. What it has goes to another one at once, which costs no token; so does what
   nobody works on (refused, link suspect, replica gone).
@@ -34,7 +34,7 @@ FEWEST_SPARES = 0.01
 _CUT = 0.5
 # Spares come back while nothing is asked: a pause counts beyond so many service times, and after so
 # many of these every request has spares again.
-_PAUSE = 3.0
+_PAUSE = 10.0
 _RECOVERED_AFTER = 3000.0
 _MEMORY = 0.98  # of what spares saved and cost, from one request to the next
 _RETRY_S = 0.02
@@ -127,6 +127,8 @@ class Auto(Learning):
         self._demand = Demand()
         # When a spare was first, by the copy that it beat, until that has ended.
         self._beaten: dict[tuple[bytes, int], float] = {}
+        # Requests that get another spare as soon as a replica is free, oldest first.
+        self._wanting: dict[bytes, None] = {}
         self.hedges = 0
 
     # -- choices --------------------------------------------------------------------------
@@ -141,17 +143,23 @@ class Auto(Learning):
         known = self._replicas[best]
         self._spares.request(known.service_s(), now)
         if self._spares.open and not known.free(now):
-            self._spares.made_wait(known.service_s())
+            self._spares.made_wait(known.service_s() / len(able))
         others = able if self._spares.chosen(request) else self._stale(able, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
         if self._spares.share < 1.0 and others is able:
             spares = spares[:-1]  # spares were in the way: from now on they leave a replica free
-        for spare in spares:
-            self._spares.open[request, spare] = now
-            self._replicas[spare].asked(request, now)
+        elif len(spares) + 1 < len(others):
+            self._wanting[request] = None
         known.asked(request, now)
-        self._look(now + known.delay_s())
-        return [best, *spares]
+        self._look(known.overdue_at(request, now))
+        return [best, *self._spared(request, spares, now)]
+
+    def _spared(self, request: bytes, replicas: Sequence[int], now: float) -> Sequence[int]:
+        """Note that these get a spare copy; return them."""
+        for replica in replicas:
+            self._spares.open[request, replica] = now
+            self._replicas[replica].asked(request, now)
+        return replicas
 
     def _takes_spare(self, replica: int, now: float) -> bool:
         known = self._replicas[replica]
@@ -169,13 +177,15 @@ class Auto(Learning):
         if not candidates:
             return ()
         if open:
+            free = [c for c in candidates if self._of(c).free(now)]
+            if free and request in self._wanting:
+                return self._spared(request, free, now)
             doubted = [self._doubts(replica, begun, now) for replica, begun in open.items()]
             if not all(doubted):  # somebody works on it: only a free one may help, and few times
-                due = max(begun + self._of(replica).delay_s() for replica, begun in open.items())
+                due = max(self._of(r).overdue_at(request, begun) for r, begun in open.items())
                 if now < due:
                     self._look(due)
                     return ()
-                free = [c for c in candidates if self._of(c).free(now)]
                 if not free or not self._budget.take():
                     self._look(now + _RETRY_S)
                     return ()
@@ -186,7 +196,7 @@ class Auto(Learning):
         best = self._best(request, candidates, now)
         known = self._replicas[best]
         known.asked(request, now)
-        self._look(now + known.delay_s())
+        self._look(known.overdue_at(request, now))
         return (best,)
 
     def _best(self, request: bytes, able: Sequence[int], now: float) -> int:
@@ -230,15 +240,19 @@ class Auto(Learning):
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
-        """Learn, too, whether a spare copy has won."""
+        """Learn, too, whether a spare copy has won, and who is free now."""
+        self._wanting.pop(request, None)
         if self._spares.open.pop((request, replica), None) is not None:
             for other in open:
                 if not self.is_spare(request, other):
                     self._beaten[request, other] = now
-        return super().answered(request, open, replica, load, now)
+        losers = super().answered(request, open, replica, load, now)
+        self._released(replica, now)
+        return losers
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """An attempt ended without an answer."""
+        self._wanting.pop(request, None)
         self._spares.open.pop((request, replica), None)
         if fault:
             self._of(replica).failed(request, now)
@@ -254,11 +268,18 @@ class Auto(Learning):
             self._of(replica).answered(request, None, now)
         else:
             self._of(replica).dropped(request)
+        self._released(replica, now)
+
+    def _released(self, replica: int, now: float) -> None:
+        """Have a replica that has become free work on what waits for one."""
+        if self._wanting and self._of(replica).free(now):
+            self.news = True
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
         """Learn that these would have taken longer than until now."""
+        self._wanting.pop(request, None)
         for replica, begun in open.items():
             known = self._of(replica)
             known.overtaken(begun, now)

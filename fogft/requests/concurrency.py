@@ -19,7 +19,7 @@ from __future__ import annotations
 QUICK_S = 0.003
 SOLO_S = 0.01  # below this, one at a time would leave the service idle between two
 _NEAR = 0.85
-_SAMPLES = 10
+_SAMPLES = 30
 _TRY_AGAIN_S = 60.0
 _WEIGHT = 0.1  # of a sample in the mean
 

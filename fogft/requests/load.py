@@ -25,6 +25,8 @@ _WORD_HOLDS_S = 1.0
 _RTT_GAIN = 0.1
 NEARLY = 0.8  # of what it usually takes
 _ALIKE = 4.0
+# Of what a request is expected to take, and of what is ever at work:
+_LATE, _STALLS = 1.2, 3.0
 _DOUBT_AFTER = 2.0
 _UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
 # A replica that fails is left alone: at first so long, then doubling, while another is able.
@@ -106,7 +108,8 @@ class ReplicaLoad:
         self.doubted = False
         self.ended_at = -NEVER
         self.asked_at = -NEVER
-        self._at_work: dict[bytes, float] = {}  # our attempts that it has not ended, oldest first
+        # Our attempts that it has not ended, oldest first: when each began, and is overdue.
+        self._at_work: dict[bytes, tuple[float, float]] = {}
         self._slots = 0
         self._service_s = 0.0
         self._rtt_s: float | None = None
@@ -133,8 +136,13 @@ class ReplicaLoad:
         if not ahead == len(self._at_work) == 1:
             return False
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
-        [begun] = self._at_work.values()
-        return now - begun >= NEARLY * ((self._rtt_s or 0.0) + self.service_s())
+        return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s())
+
+    def _spent_s(self, now: float) -> float:
+        """Return for how long it has been at the oldest of ours; 0 for none."""
+        for begun, _ in self._at_work.values():
+            return now - max(begun, self.ended_at)
+        return 0.0
 
     def avoided(self, now: float) -> bool:
         """Whether others are to be asked, where there are any: it is doubted, or has failed."""
@@ -143,8 +151,9 @@ class ReplicaLoad:
     def expected_s(self, now: float, typical_s: float) -> float:
         """Return how long an answer to a request that is sent now is believed to take.
 
-        Round trip, and one service time for it and for each request before it. 0 for a replica of
-        which nothing is known: it is tried.
+        Round trip, and one service time for it and for each request before it, less what the one at
+        work has had; one that takes far too long is taken to go on for as long again. 0 for a
+        replica of which nothing is known: it is tried.
 
         Args:
             typical_s: The service time of most replicas. One that is not four times as slow or
@@ -153,7 +162,13 @@ class ReplicaLoad:
         service_s = self.service_s()
         if typical_s / _ALIKE < service_s < typical_s * _ALIKE:
             service_s = typical_s
-        return (self._rtt_s or 0.0) + service_s * (1 + self.ahead(now))
+        rtt_s = self._rtt_s or 0.0
+        left_s, spent_s = service_s * (1 + self.ahead(now)), self._spent_s(now)
+        if spent_s <= _LATE * (rtt_s + service_s):
+            left_s -= min(spent_s, service_s)
+        elif spent_s > _STALLS * (rtt_s + service_s):
+            left_s += spent_s
+        return rtt_s + left_s
 
     def service_s(self) -> float:
         """Return how long it works on a request, as far as is known."""
@@ -171,6 +186,10 @@ class ReplicaLoad:
             self._delay_s = max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
         return self._delay_s
 
+    def overdue_at(self, request: bytes, begun: float) -> float:
+        """Return when an attempt takes longer than nearly all do, and than it was to wait there."""
+        return self._at_work.get(request, (0.0, begun + self.delay_s()))[1]
+
     def doubtful_at(self, begun: float) -> float:
         """Return when an attempt that began then is long overdue.
 
@@ -185,7 +204,8 @@ class ReplicaLoad:
 
     def asked(self, request: bytes, now: float) -> None:
         """Note an attempt that is about to be sent."""
-        self._at_work[request] = now
+        expected_s = (self._rtt_s or 0.0) + self.service_s() * (1 + self.ahead(now))
+        self._at_work[request] = now, now + _LATE * max(self.delay_s(), expected_s)
         self.asked_at = now
 
     def heard(self, request: bytes, load: Load, now: float) -> None:
@@ -194,7 +214,7 @@ class ReplicaLoad:
         What was sent within the last round trip it had not seen then.
         """
         since = now - (self._rtt_s or 0.0)
-        seen = [id for id, begun in self._at_work.items() if begun <= since and id != request]
+        seen = [id for id, (begun, _) in self._at_work.items() if begun <= since and id != request]
         there = load.waiting + load.running
         self._others, self._others_until = max(0, there - len(seen)), now + _WORD_HOLDS_S
         self._slots = load.slots
@@ -202,15 +222,15 @@ class ReplicaLoad:
         for lost in seen[: max(0, len(seen) - there)]:  # their ends were
             del self._at_work[lost]
 
-    def answered(self, request: bytes, load: Load | None, now: float) -> float | None:
-        """Note that it has ended an attempt; return when that began, if it was open."""
-        begun = self._at_work.pop(request, None)
+    def answered(self, request: bytes, load: Load | None, now: float) -> None:
+        """Note that it has ended an attempt."""
+        sent = self._at_work.pop(request, None)
         self.ended_at = now
         self.doubted = False
         self._avoided_s = 0.0
-        if begun is None:
-            return None
-        took_s = now - begun
+        if sent is None:
+            return
+        took_s = now - sent[0]
         self.latencies.add(took_s, now)
         if load is not None:
             rtt_s = max(0.0, took_s - load.spent_s)
@@ -219,7 +239,6 @@ class ReplicaLoad:
                 self._rtt_s = rtt_s
             else:
                 self._rtt_s = known + _RTT_GAIN * (rtt_s - known)
-        return begun
 
     def dropped(self, request: bytes) -> None:
         """Note that an attempt has ended, and that it never worked on it."""

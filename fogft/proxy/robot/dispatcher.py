@@ -205,6 +205,8 @@ class Dispatcher:
             means, pending, losers, verdict = self._requests.answered(
                 attempt, request, replica, payload, reading, answer.load, now
             )
+        if self._requests.choose.news:
+            self._wake()
         if pending is not None and request is not None:
             self._delivery.give(pending, payload)  # first: what is counted can wait
             if losers:
@@ -254,6 +256,8 @@ class Dispatcher:
             if answer.load is not None:
                 choose.heard(answer.request_id, replica, answer.load, now)
             choose.late(answer.request_id, replica, now, answered=worked)
+        if choose.news:
+            self._wake()
         if worked:
             self.outcomes.late()
 

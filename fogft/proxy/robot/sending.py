@@ -121,6 +121,8 @@ class Sender:
             if pending.item.trace is not None:
                 pending.item.trace.asked.setdefault(replica, now)
             handling = Handling.ALONE if pending.deaths else Handling.NORMAL
+            if handling is Handling.NORMAL and requests.choose.is_spare(request, replica):
+                handling = Handling.DROP_IF_BUSY
         name, remaining_s = self._ledger.spec.name, pending.deadline - now
         if not link.offer(name, request, pending.item.payload, remaining_s, handling=handling):
             self._declined(request, replica, is_copy=True)

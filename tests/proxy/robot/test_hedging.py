@@ -38,10 +38,10 @@ def served(mode: HedgingMode, service: str, load: float, *, robots: int = 1, sec
     for _ in range(3):
         worlds[0].replica(SERVICES[service], serial=True)
     worlds += [World(mode, timeout_s=2.0, beside=worlds[0]) for _ in range(robots - 1)]
-    source = random.Random(3)
+    arrivals, source = random.Random(3), random.Random(4)
     end = worlds[0].now + seconds
     while worlds[0].now < end:
-        worlds[0].run(source.expovariate(load * 150.0))
+        worlds[0].run(arrivals.expovariate(load * 150.0))
         source.choice(worlds).ask()
     worlds[0].run(2.5)
     return worlds
@@ -56,11 +56,14 @@ def lost(worlds) -> int:
 
 
 def shortest_queue(service: str, load: float, seconds: float = 40.0) -> float:
-    """Return the p99 of one copy a request to the shortest of three queues, without a network."""
-    source, now, latencies = random.Random(3), 0.0, []
+    """Return the p99 of one copy a request to the shortest of three queues, without a network.
+
+    Requests come when they come to `served`.
+    """
+    arrivals, source, now, latencies = random.Random(3), random.Random(4), 0.0, []
     ends: list[list[float]] = [[], [], []]
     while now < seconds:
-        now += source.expovariate(load * 150.0)
+        now += arrivals.expovariate(load * 150.0)
         for queue in ends:
             queue[:] = [end for end in queue if end > now]
         queue = min(ends, key=len)
@@ -71,30 +74,19 @@ def shortest_queue(service: str, load: float, seconds: float = 40.0) -> float:
 
 
 @pytest.mark.parametrize("service", sorted(SERVICES))
-@pytest.mark.parametrize("load", [0.1, 0.3, 0.5, 0.7, 0.9])
-def test_auto_is_near_the_shortest_queue_from_idle_to_full(service, load):
-    """No request is lost; p99 at most 1.4 of the shortest queue's, and one service time more."""
-    worlds = served(AUTO, service, load)
-    assert lost(worlds) == 0
-    assert p99(worlds) <= 1.4 * shortest_queue(service, load) + 0.020
+@pytest.mark.parametrize("load", [0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.8, 0.9])
+def test_auto_is_as_good_as_the_shortest_queue_and_as_all_from_idle_to_full(service, load):
+    """Beyond the round trip, p99 is at most 1.05 of the better of the two; none is lost.
 
-
-@pytest.mark.parametrize(
-    ("service", "load"),
-    [("constant", 0.1), ("stalling", 0.1), ("stalling", 0.8), ("exponential", 0.8)],
-)
-def test_auto_is_never_much_worse_than_one_copy_to_the_shortest_queue(service, load):
-    """Beyond the round trip: p99 at most 1.05 of it, where copies gain nothing or lack room.
-
-    At 10 % three copies of each request would make three in ten wait, where one in a hundred may.
+    From 70 % on 1.1: what few copies are sent to learn from is work, and there is none to spare.
     """
-    assert p99(served(AUTO, service, load)) - 0.002 <= 1.05 * shortest_queue(service, load)
-
-
-def test_copies_cut_the_tail_of_a_service_that_stalls():
-    """At a third of what three can do, p99 is well below that of one copy to the shortest queue."""
-    queue = shortest_queue("stalling", 0.3, seconds=400.0)
-    assert p99(served(AUTO, "stalling", 0.3, seconds=120.0)) <= 0.8 * queue
+    seconds = 45.0 / load  # as many requests at each load
+    better = shortest_queue(service, load, seconds)
+    if load <= 0.2:  # of more load `all` makes an endless queue
+        better = min(better, p99(served(HedgingMode.ALL, service, load, seconds=seconds)) - 0.002)
+    worlds = served(AUTO, service, load, seconds=seconds)
+    assert lost(worlds) == 0
+    assert p99(worlds) - 0.002 <= (1.05 if load < 0.7 else 1.1) * better
 
 
 def test_copies_become_fewer_with_load():
