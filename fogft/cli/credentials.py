@@ -59,6 +59,7 @@ def issue(
     Without a passphrase of your own, one is generated and shown. Send it separately from the
     file.
     """
+    from fogft.model.credentials import Role
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import issue_credentials
     from fogft.pool.credentials.bundle import new_passphrase
@@ -66,15 +67,14 @@ def issue(
     own = None if passphrase_file is None else _read_passphrase(passphrase_file)
     passphrase = own or new_passphrase()
     store = composition.store_of(pool)
-    issued, file = issue_credentials(
+    holder, file = issue_credentials(
         store, _role(role), name, out, passphrase, open_for_s=hours * 3600
     )
-    holder = issued.holder
     output.data(str(file))
     if own is None:
         output.say(f"passphrase: {passphrase}")
     output.done(f"{holder.role.value} `{holder.short}` may join for {hours:g} hours")
-    if issued.alone:
+    if not store.spec().rendezvous and holder.role is not Role.RENDEZVOUS:
         output.warn(_alone(holder))
     output.hint(f"copy `{file}` to the other machine, and run `fogft join {file.name}` there")
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,10 @@ from fogft import disk
 from fogft.errors import StateError
 from fogft.model.plain import stored
 from fogft.records.record import RecordError, SignedRecord, from_plain, to_plain
+from fogft.records.record_set import RecordSet
+from fogft.records.signing import Verifier
+
+log = logging.getLogger(__name__)
 
 VERSION = 1
 
@@ -55,6 +60,22 @@ def read(path: Path) -> list[SignedRecord]:
         return [from_plain(one) for one in read.records]
     except (RecursionError, RecordError) as error:
         raise StateError(f"`{path}` is damaged: {error}") from error
+
+
+def restore(path: Path, records: RecordSet, ca: Path) -> bool:
+    """Take in what is on disk, certificates that have expired since included.
+
+    A damaged file is told; then false is returned.
+    """
+    try:
+        known = read(path)
+    except StateError as error:  # whoever connects brings them back
+        log.error("cache_damaged reason=%r", error.message)
+        return False
+    any_time = Verifier(ca, any_time=True)
+    for one in known:
+        records.restore(one, any_time)
+    return True
 
 
 def _checksum(content: Any) -> str:

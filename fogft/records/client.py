@@ -22,7 +22,7 @@ from typing import Any
 from fogft.errors import StateError, WireError
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import is_endpoint
-from fogft.records.cache import read, write
+from fogft.records.cache import restore, write
 from fogft.records.dialling import Caller
 from fogft.records.exchange import Exchange
 from fogft.records.record import Record, RecordError, RecordKind, sign_record
@@ -91,9 +91,10 @@ class RendezvousClient:
         self._own: dict[tuple[RecordKind, str], _Own] = {}
         self._details: dict[str, str] = dict.fromkeys(self._endpoints, "not reached yet")
         self._seen_host = ""
-        self._cached = False
         self.known = Known()
-        self._restore()
+        if cache is not None and restore(cache, self._records, credentials.ca):
+            self._cached = True
+            self._refresh()
         self._loop = asyncio.new_event_loop()
         self._main: asyncio.Task[None] | None = None
         self._closing = False
@@ -272,21 +273,6 @@ class RendezvousClient:
             log.exception("change_not_taken")
 
     # -- the cache -----------------------------------------------------------------------------
-
-    def _restore(self) -> None:
-        """Take in what is on disk, certificates that have expired since included."""
-        if self._cache is None:
-            return
-        try:
-            records = read(self._cache)
-        except StateError as error:
-            log.error("cache_damaged reason=%r", error.message)
-            return
-        any_time = Verifier(self._credentials.ca, any_time=True)
-        for one in records:
-            self._records.restore(one, any_time)
-        self._cached = True
-        self._refresh()
 
     async def _keep_cache(self) -> None:
         while True:

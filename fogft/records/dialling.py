@@ -20,8 +20,7 @@ from fogft.model.credentials import CredentialPaths
 from fogft.model.names import host_and_port
 from fogft.records import frames
 from fogft.records.exchange import SILENCE_S, Connection
-from fogft.records.record import RecordError
-from fogft.records.server import PURPOSE, binding_of
+from fogft.records.server import PURPOSE, binding_of, first_message
 from fogft.records.signing import Signer
 
 ATTEMPT_EVERY_S = 0.25
@@ -109,7 +108,9 @@ class Caller:
         try:
             binding = self._check(writer.get_extra_info("ssl_object"))
             unframer = frames.Unframer()
-            nonce, seen_host = frames.read_challenge(await _first_message(reader, unframer))
+            nonce, seen_host = frames.read_challenge(
+                await asyncio.wait_for(first_message(reader, unframer), SILENCE_S)
+            )
             proof = frames.proof_bytes(PURPOSE, nonce, binding)
             writer.write(frames.greeting(*self._signer(proof)))
         except BaseException:
@@ -136,10 +137,3 @@ class Caller:
                 f"`{self._endpoint}` has the certificate of `{name}`, not of a rendezvous"
             )
         return binding_of(link.getpeercert(binary_form=True))
-
-
-async def _first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
-    while data := await asyncio.wait_for(reader.read(4 << 10), SILENCE_S):
-        for message in unframer.feed(data):
-            return message
-    raise RecordError("malformed", "it left without a challenge")

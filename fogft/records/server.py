@@ -153,7 +153,7 @@ class RendezvousServer:
             nonce = secrets.token_bytes(frames.NONCE_BYTES)
             transport.write(frames.challenge(nonce, host))
             unframer = frames.Unframer(limit=16 << 10)
-            message = await _first_message(reader, unframer)
+            message = await first_message(reader, unframer)
             certificate, signature = frames.read_greeting(message)
             caller = self._verify(
                 certificate, signature, frames.proof_bytes(PURPOSE, nonce, binding)
@@ -228,7 +228,7 @@ def binding_of(certificate: bytes) -> bytes:
     return hashlib.sha256(certificate).digest()
 
 
-async def _first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
+async def first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
     """Return the first message; what came along with it stays in the unframer.
 
     Raises:
@@ -238,4 +238,4 @@ async def _first_message(reader: asyncio.StreamReader, unframer: frames.Unframer
     while data := await reader.read(16 << 10):
         for message in unframer.feed(data):
             return message
-    raise EOFError("the caller left without a greeting")
+    raise EOFError("the other end left without a greeting")

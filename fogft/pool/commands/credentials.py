@@ -15,7 +15,7 @@ from fogft import disk
 from fogft.errors import FogftError
 from fogft.model.credentials import Holder, Role
 from fogft.pool.commands import change, joining
-from fogft.pool.commands.joining import Issued, Joined
+from fogft.pool.commands.joining import Joined
 from fogft.pool.commands.status import slots
 from fogft.pool.credentials.ledger import Entry, Ledger
 from fogft.pool.folder.paths import PoolPaths, home
@@ -34,14 +34,14 @@ def certificates(store: PoolStore) -> Sequence[Entry]:
 
 def issue_credentials(
     store: PoolStore, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
-) -> tuple[Issued, Path]:
+) -> tuple[Holder, Path]:
     """Write a join bundle for the next generation of a holder; return both. See `joining.issue`."""
     file = out or Path(f"{name}.join")
     if file.exists():
         raise FogftError(f"`{file}` exists", "choose another name with `--out`")
-    issued = joining.issue(store, role, name, passphrase, time.time(), open_for_s=open_for_s)
-    disk.write_whole(file, issued.data)
-    return issued, file
+    holder, data = joining.issue(store, role, name, passphrase, time.time(), open_for_s=open_for_s)
+    disk.write_whole(file, data)
+    return holder, file
 
 
 def join_here(file: Path, passphrase: str) -> Joined:

@@ -62,24 +62,10 @@ class Joined:
     alone: bool = False
 
 
-@dataclass(frozen=True)
-class Issued:
-    """A bundle.
-
-    Attributes:
-        data: Its bytes.
-        alone: See `Joined`.
-    """
-
-    holder: Holder
-    data: bytes
-    alone: bool
-
-
 def issue(
     store: PoolStore, role: Role, name: str, passphrase: str, now: float, *, open_for_s: float
-) -> Issued:
-    """Certify the next generation of a holder, and return its sealed bundle.
+) -> tuple[Holder, bytes]:
+    """Certify the next generation of a holder; return it, and its sealed bundle.
 
     Raises:
         CredentialError: The name or the passphrase will not do, the CA cannot be used, or
@@ -100,8 +86,7 @@ def issue(
     )
     label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, now + open_for_s)
     content = {"files": _files(store, holder, credential), "rendezvous": list(spec.rendezvous)}
-    alone = not spec.rendezvous and role is not Role.RENDEZVOUS
-    return Issued(holder, bundle.seal(label, content, passphrase), alone)
+    return holder, bundle.seal(label, content, passphrase)
 
 
 def _is_by_hand(name: str) -> bool:

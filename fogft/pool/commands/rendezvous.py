@@ -58,7 +58,7 @@ class _Rendezvous:
         self._config = config
         verify = Verifier(config.credentials.ca)
         self._records = RecordSet(config.pool_uid, verify)
-        self._restore()
+        cache.restore(config.records, self._records, config.credentials.ca)
         self._news = False
         self._reported = ""
         self._trouble = ""
@@ -95,16 +95,6 @@ class _Rendezvous:
             self._save()
             scrape.close()
             log.info("rendezvous_stopped")
-
-    def _restore(self) -> None:
-        try:
-            records = cache.read(self._config.records)
-        except StateError as error:  # whoever connects brings them back
-            log.error("cache_damaged reason=%r", error.message)
-            return
-        any_time = Verifier(self._config.credentials.ca, any_time=True)
-        for one in records:
-            self._records.restore(one, any_time)
 
     def _save(self) -> None:
         try:

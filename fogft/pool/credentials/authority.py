@@ -28,7 +28,8 @@ AUTHORITY_CERTIFICATE = "ca.crt"
 AUTHORITY_KEY = "ca.key"
 AUTHORITY_DAYS = 3650.0
 # A dead manager renews nothing, and must stop no traffic: a leaf outlives any repair.
-LEAF_DAYS = 30.0
+LEAF_DAYS = 365.0
+RENEW_BEFORE = datetime.timedelta(days=60)
 # Robots' clocks are wrong; a certificate that begins tomorrow, by their clock, is refused.
 BACKDATE = datetime.timedelta(hours=24)
 _COMMON_NAME_LIMIT = 64  # X.520's upper bound
@@ -53,7 +54,6 @@ class Description:
     common_name: str
     role: str
     serial: str
-    is_authority: bool
     not_before: datetime.datetime
     not_after: datetime.datetime
 
@@ -136,6 +136,15 @@ def describe(path: Path) -> Description:
     return _described(_load_certificate(path))
 
 
+def is_good(path: Path, now: datetime.datetime, revoked: frozenset[str] = frozenset()) -> bool:
+    """Whether a certificate is there, is not revoked, and lasts for two months more."""
+    try:
+        said = describe(path)
+    except CredentialError:
+        return False  # there is none yet, or it is damaged
+    return said.common_name not in revoked and not said.problem(now + RENEW_BEFORE)
+
+
 def describe_pem(pem: bytes) -> Description:
     """Return what a certificate says of itself.
 
@@ -153,12 +162,10 @@ def describe_pem(pem: bytes) -> Description:
 def _described(certificate: x509.Certificate) -> Description:
     from cryptography import x509
 
-    usage = _extension(certificate, x509.BasicConstraints)
     return Description(
         common_name=_name(certificate, x509.NameOID.COMMON_NAME),
         role=_name(certificate, x509.NameOID.ORGANIZATIONAL_UNIT_NAME),
         serial=f"{certificate.serial_number:x}",
-        is_authority=bool(usage and usage.ca),
         not_before=certificate.not_valid_before_utc,
         not_after=certificate.not_valid_after_utc,
     )
@@ -277,17 +284,6 @@ def _load_certificate(path: Path) -> x509.Certificate:
 
 def _reason(error: Exception) -> str:
     return (error.strerror or str(error)) if isinstance(error, OSError) else "it is damaged"
-
-
-def _extension(
-    certificate: x509.Certificate, kind: type[x509.BasicConstraints]
-) -> x509.BasicConstraints | None:
-    from cryptography import x509
-
-    try:
-        return certificate.extensions.get_extension_for_class(kind).value
-    except x509.ExtensionNotFound:
-        return None
 
 
 def _name(certificate: x509.Certificate, oid: x509.ObjectIdentifier) -> str:

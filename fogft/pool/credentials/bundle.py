@@ -16,12 +16,14 @@ import json
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from fogft.errors import CredentialError
 from fogft.model.credentials import Holder, holder_of
+from fogft.model.keys import only
+from fogft.model.plain import Moment, from_plain, to_plain
 
-VERSION = 1
+VERSION = 2
 SIZE_LIMIT = 1 << 20
 PASSPHRASE_LEAST = 12
 # 64 MiB and about a fifth of a second a guess. Fixed by the version: a file cannot ask for more.
@@ -31,15 +33,18 @@ _SALT_BYTES, _NONCE_BYTES = 16, 12
 _ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # without what looks alike
 
 
+_Name = Annotated[str, only(lambda text: text.isprintable() and 0 < len(text) <= 200, "a name")]
+
+
 @dataclass(frozen=True)
 class Label:
     """What a bundle says of itself before it is opened. Times in seconds since the epoch."""
 
-    id: str
-    pool: str
-    common_name: str
-    issued_at: float
-    open_until: float
+    id: _Name
+    pool: _Name
+    common_name: Annotated[str, holder_of]
+    issued_at: Moment
+    open_until: Moment
 
     @property
     def holder(self) -> Holder:
@@ -73,11 +78,7 @@ def seal(label: Label, content: Mapping[str, Any], passphrase: str) -> bytes:
     salt, nonce = secrets.token_bytes(_SALT_BYTES), secrets.token_bytes(_NONCE_BYTES)
     readable = {
         "fogft_bundle": VERSION,
-        "id": label.id,
-        "pool": label.pool,
-        "for": label.common_name,
-        "issued_at": label.issued_at,
-        "open_until": label.open_until,
+        **to_plain(label),
         "salt": base64.b64encode(salt).decode(),
         "nonce": base64.b64encode(nonce).decode(),
     }
@@ -137,13 +138,7 @@ def _parse(data: bytes) -> tuple[Label, dict[str, Any], bytes]:
             raise ValueError("it says so nowhere")
         if raw["fogft_bundle"] != VERSION:
             raise ValueError(f"it is of version {raw['fogft_bundle']}, not {VERSION}")
-        label = Label(
-            id=_text(raw, "id"),
-            pool=_text(raw, "pool"),
-            common_name=holder_of(_text(raw, "for")).common_name,
-            issued_at=_time(raw, "issued_at"),
-            open_until=_time(raw, "open_until"),
-        )
+        label = from_plain(Label, raw)
         sealed = _bytes(raw, "sealed")
         if len(_bytes(raw, "salt")) != _SALT_BYTES or len(_bytes(raw, "nonce")) != _NONCE_BYTES:
             raise ValueError("its salt or nonce is of the wrong length")
@@ -162,20 +157,6 @@ def _key(passphrase: str, salt: bytes) -> bytes:
 
 def _canonical(readable: Mapping[str, Any]) -> bytes:
     return json.dumps(readable, sort_keys=True, separators=(",", ":")).encode()
-
-
-def _text(raw: Mapping[str, Any], key: str) -> str:
-    value = raw.get(key)
-    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 200:
-        raise ValueError(f"its `{key}` is none")
-    return value
-
-
-def _time(raw: Mapping[str, Any], key: str) -> float:
-    value = raw.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1e11:
-        raise ValueError(f"its `{key}` is no time")
-    return float(value)
 
 
 def _bytes(raw: Mapping[str, Any], key: str) -> bytes:

@@ -102,7 +102,7 @@ class Ledger:
                 found[holder.name] = (*found.get(holder.name, ()), holder.generation)
         return found
 
-    def issue(self, holder: Holder, *, days: float) -> Credential:
+    def issue(self, holder: Holder, *, days: float = authority.LEAF_DAYS) -> Credential:
         """Certify a holder, and remember it.
 
         Raises:

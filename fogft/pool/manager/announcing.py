@@ -13,7 +13,6 @@ from __future__ import annotations
 import datetime
 from typing import Any
 
-from fogft.errors import CredentialError
 from fogft.model.credentials import CredentialPaths, manager_of
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
@@ -27,8 +26,6 @@ from fogft.records.record import Record, RecordKind, sign_record
 from fogft.records.roster import ServingLease, admission_content
 from fogft.records.signing import Signer
 
-CERTIFICATE_DAYS = 365.0
-RENEW_BEFORE = datetime.timedelta(days=60)
 _CERTIFY_EVERY = datetime.timedelta(hours=1)
 _STEM = "manager"
 _LEASE_EVERY_S = 60.0
@@ -132,14 +129,8 @@ class ManagerRecords:
     def _certify(self, now: datetime.datetime) -> None:
         if self._certified_at is not None and abs(now - self._certified_at) < _CERTIFY_EVERY:
             return
-        certificate = self._paths.credentials / f"{_STEM}.crt"
-        try:
-            good = not authority.describe(certificate).problem(now + RENEW_BEFORE)
-        except CredentialError:
-            good = False  # there is none yet, or it is damaged
-        if not good:
-            holder, ledger = manager_of(self._pool_uid), Ledger(self._paths.credentials)
-            issued = ledger.issue(holder, days=CERTIFICATE_DAYS)
+        if not authority.is_good(self._files().certificate, now):
+            issued = Ledger(self._paths.credentials).issue(manager_of(self._pool_uid))
             authority.write(issued, self._paths.credentials, _STEM)
         self._certified_at = now
 

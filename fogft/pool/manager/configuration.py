@@ -16,7 +16,6 @@ from typing import Any
 
 from fogft import disk
 from fogft.cloud.port import Launch
-from fogft.errors import CredentialError
 from fogft.model.credentials import NAME_LIMIT, CredentialPaths, Holder, Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND, replica_hash, task_at
 from fogft.model.proxy_config import ClientProxyConfig, RendezvousConfig, ServerProxyConfig
@@ -29,11 +28,8 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
 from fogft.poolfile import config_file, workspace
 
-# A dead manager renews nothing and must stop no traffic.
-CERTIFICATE_DAYS = 365.0
 # What a certificate lasts beyond the end of a pool that has one.
 MARGIN_DAYS = 30.0
-RENEW_BEFORE = datetime.timedelta(days=60)
 _CLIENT_HEADING = (
     "A client proxy, or a gateway. It is read again whenever it changes. Paths are relative to\n"
     "this file's folder; what is not set here has its default."
@@ -50,7 +46,7 @@ _REPLICA_HEADING = (
 
 def certificate_days(spec: PoolSpec) -> float:
     """Return how long a certificate lasts: a year, and a month more than `max_hours`."""
-    return max(CERTIFICATE_DAYS, (spec.max_hours or 0.0) / 24 + MARGIN_DAYS)
+    return max(authority.LEAF_DAYS, (spec.max_hours or 0.0) / 24 + MARGIN_DAYS)
 
 
 def robot_name() -> str:
@@ -119,15 +115,9 @@ def certify_robot(
     Raises:
         CredentialError: The pool's CA cannot be used.
     """
-    ledger = Ledger(paths.credentials)
-    try:
-        said = authority.describe(paths.credentials / "robot.crt")
-        holder = holder_of(said.common_name)
-        revoked = holder.common_name in ledger.revoked()
-        if not revoked and not said.problem(now + RENEW_BEFORE):
-            return False
-    except (CredentialError, ValueError):
-        pass  # there is none yet, or it is damaged: a new one is issued
+    revoked = Ledger(paths.credentials).revoked()
+    if authority.is_good(paths.credentials / "robot.crt", now, revoked):
+        return False
     rotate_robot(paths, identity, spec)
     return True
 
