@@ -190,15 +190,10 @@ def install(
 
     where = units.services(system=system)
     wanted = _units(pool, gateway, rendezvous, system=system)
-    part = gateway or rendezvous
-    paths = None if part is not None else composition.paths_of(pool)
+    paths = None if gateway or rendezvous else composition.paths_of(pool)
     if paths is not None:
         units.yield_to(paths)
-        env_file = paths.folder / "service.env"
-    else:
-        assert part is not None
-        env_file = part.resolve().with_suffix(".env")
-    refused = units.install(where, wanted, env_file)
+    refused = units.install(where, wanted)
     for unit in wanted:
         output.data(str(where.folder / unit.name))
     if refused:

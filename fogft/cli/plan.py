@@ -62,7 +62,7 @@ def check(file: PoolFile = DEFAULT_FILE, as_json: AsJson = False) -> None:
 
     Looks up the services' types on this machine. Exits with 1 if there are mistakes.
     """
-    from fogft.pool.commands.check import mistakes
+    from fogft.pool.commands.preview import mistakes
 
     found = mistakes(file)
     if as_json:

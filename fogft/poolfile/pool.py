@@ -20,10 +20,9 @@ from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
 from fogft.poolfile import rules
 from fogft.poolfile.actions import action_services, action_topics
-from fogft.poolfile.mistakes import Mistakes
 from fogft.poolfile.reader import Reader
 from fogft.poolfile.task import check_task
-from fogft.poolfile.tree import Node, Section, plain, shown
+from fogft.poolfile.tree import Mistakes, Node, Section, plain, shown
 
 
 def _nothing(*_: object) -> None:

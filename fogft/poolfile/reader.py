@@ -14,8 +14,7 @@ from fogft.errors import SpecError
 from fogft.model import keys
 from fogft.model.keys import Entry, keys_of
 from fogft.poolfile import removed
-from fogft.poolfile.mistakes import Mistakes
-from fogft.poolfile.tree import Node, Section, plain, shown
+from fogft.poolfile.tree import Mistakes, Node, Section, plain, shown
 
 T = TypeVar("T")
 ADVANCED = "advanced"

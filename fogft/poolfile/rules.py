@@ -48,10 +48,8 @@ def _stateful(section: Section, made: ServiceSpec) -> None:
     """A stateful service is asked of every replica, and its first answer is the answer."""
     if made.state is None:
         return
-    for key in ("ok_field", "hedging", "concurrency", "cancel", "quorum", "trace"):
-        if section.has(key) and not (key == "hedging" and made.hedging is HedgingMode.ALL):
-            what = "does not go with `state`: every replica applies every request"
-            raise section.error(key, what, "remove it")
+    what = "does not go with `state`: every replica applies every request"
+    _apart(section, made, ("ok_field", "hedging", "concurrency", "cancel", "quorum", "trace"), what)
     for key, value in (("freshness", "latest"), ("advertise", Advertise.WHILE_READY.value)):
         chosen = getattr(made, key)
         if chosen is not None and chosen.value == value:
@@ -66,9 +64,14 @@ def _with_quorum(section: Section, made: ServiceSpec) -> None:
     if made.tolerance and not section.has("quorum"):
         what = "has no meaning here: answers are compared only with a `quorum`"
         raise section.error("tolerance", what, "write `quorum: 2`, or remove it")
-    for key in ("ok_field", "hedging", "cancel") if section.has("quorum") else ():
+    if section.has("quorum"):
+        what = "does not go with `quorum`: every replica is asked, and every answer counts"
+        _apart(section, made, ("ok_field", "hedging", "cancel"), what)
+
+
+def _apart(section: Section, made: ServiceSpec, keys: Sequence[str], what: str) -> None:
+    for key in keys:
         if section.has(key) and not (key == "hedging" and made.hedging is HedgingMode.ALL):
-            what = "does not go with `quorum`: every replica is asked, and every answer counts"
             raise section.error(key, what, "remove it")
 
 

@@ -10,8 +10,7 @@ from collections.abc import Mapping
 
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import removed
-from fogft.poolfile.mistakes import Mistakes
-from fogft.poolfile.tree import Section, plain, shown
+from fogft.poolfile.tree import Mistakes, Section, plain, shown
 
 # The task schema of SkyPilot 0.14.1, without the keys that it keeps for itself.
 TASK_KEYS = (

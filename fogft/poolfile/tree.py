@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeVar
@@ -256,3 +257,45 @@ def _got(node: Node) -> str:
     if isinstance(value, str):
         return f"the text {shown(value)}"
     return "a list" if isinstance(value, tuple) else "a map"
+
+
+class Incomplete(Exception):
+    """A value cannot be made, for something in it is wrong."""
+
+
+class Mistakes:
+    """What is wrong in a file; with `keep` the reading goes on after each."""
+
+    def __init__(self, *, keep: bool = False) -> None:
+        self._keep = keep
+        self.found: list[SpecError] = []
+
+    @contextmanager
+    def step(self) -> Iterator[None]:
+        """Judge something that does not depend on other steps."""
+        try:
+            yield
+        except SpecError as error:
+            if not self._keep:
+                raise
+            self.found.append(error)
+        except Incomplete:
+            pass
+
+    def add(self, errors: Iterable[SpecError]) -> None:
+        """Take mistakes one by one: the first is raised unless all are kept."""
+        for error in errors:
+            with self.step():
+                raise error
+
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """Judge all parts of one value; where one is wrong there is no value.
+
+        Raises:
+            Incomplete: Something was found within.
+        """
+        before = len(self.found)
+        yield
+        if len(self.found) > before:
+            raise Incomplete

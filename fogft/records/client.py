@@ -91,6 +91,7 @@ class RendezvousClient:
         self._own: dict[tuple[RecordKind, str], _Own] = {}
         self._details: dict[str, str] = dict.fromkeys(self._endpoints, "not reached yet")
         self._seen_host = ""
+        self._cached = False
         self.known = Known()
         if cache is not None and restore(cache, self._records, credentials.ca):
             self._cached = True

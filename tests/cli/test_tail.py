@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.cli.tail import Tail, in_order
+from fogft.cli.status import Tail, in_order
 
 
 @pytest.mark.parametrize(("last", "expected"), [(0, []), (1, ["c"]), (2, ["b", "c"]), (9, "abc")])

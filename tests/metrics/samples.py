@@ -7,8 +7,7 @@ from fogft.metrics.families import text
 from fogft.metrics.outcomes import BUCKETS_S, OUTCOMES_COUNTED
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
-from fogft.pool.manager.metrics import of_pool, of_rendezvous
-from fogft.pool.manager.tally import Tally
+from fogft.pool.manager.tally import Tally, of_pool, of_rendezvous
 from tests.cli.pools import STATUS
 
 SERVICE = {

@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families as parsed
 import fogft
 from fogft.metrics import proxies
 from fogft.metrics.families import counter, gauge, histogram, text
-from fogft.pool.manager.metrics import of_pool
+from fogft.pool.manager.tally import of_pool
 from tests.cli.pools import STATUS
 from tests.metrics.samples import CLIENT, LINK, POOL, PROCESSES, tally
 from tests.needs import needs

@@ -15,7 +15,7 @@ from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
 from fogft.errors import SpecError
 from fogft.model.names import VM_CLOUDS
 from fogft.model.replica import Offer, Placement
-from fogft.poolfile.resources import alternatives as each
+from fogft.poolfile.named_clouds import alternatives as each
 from fogft.poolfile.tree import nearest, shown
 
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)

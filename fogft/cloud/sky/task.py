@@ -20,7 +20,7 @@ from fogft.cloud.sky import naming
 from fogft.errors import CloudError, FogftError, SpecError
 from fogft.model.names import LINK_PORT, NO_VM_CLOUDS, SETUP_LIMIT_S
 from fogft.model.replica import Placement
-from fogft.poolfile.resources import alternatives, place
+from fogft.poolfile.named_clouds import alternatives, place
 
 OURS = "~/.fogft"
 DISK_GB = 64  # where the pool file names none; SkyPilot takes 256

@@ -22,7 +22,7 @@ from fogft.cloud.local.catalogue import Instance
 from fogft.cloud.local.resources import alternatives, suffices, use_spot
 from fogft.errors import SpecError
 from fogft.model.replica import Offer, Placement
-from fogft.poolfile.resources import place
+from fogft.poolfile.named_clouds import place
 from fogft.poolfile.tree import shown
 
 _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")

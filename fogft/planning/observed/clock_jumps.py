@@ -7,7 +7,7 @@ and one that does not. What the wall clock gained on the first is no time in whi
 all that is remembered moves along with it (`history`), so that durations stay what they were.
 
 Owns: how far the clock was moved, and for how long the time of day is in doubt.
-Not here: reading clocks (`fogft.pool.manager.clocks`), moving what is remembered (`history`).
+Not here: reading clocks (`fogft.pool.manager.timekeeping`), moving what is remembered (`history`).
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from fogft import disk
@@ -21,9 +21,9 @@ from fogft.pool.credentials.ledger import Entry, Ledger
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import PoolStore
 from fogft.pool.manager import configuration
+from fogft.pool.manager.process_control import wait_for
 
 PUBLISH_LIMIT_S = 10.0
-_POLL_S = 0.05
 
 
 def certificates(store: PoolStore) -> Sequence[Entry]:
@@ -89,7 +89,7 @@ def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:
     ledger = Ledger(store.paths.credentials)
     holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
     old = [h for h in ledger.named(Role.ROBOT, holder.name) if h != holder]
-    in_use = _wait(lambda: _in_use(store.paths, holder))
+    in_use = wait_for(lambda: _in_use(store.paths, holder), PUBLISH_LIMIT_S)
     if in_use and old:
         ledger.revoke(old)
         _published(store, old)
@@ -115,13 +115,4 @@ def _published(store: PoolStore, holders: Sequence[Holder]) -> bool:
         membership = store.membership()
         return membership is not None and names <= membership.revoked
 
-    return told() or (disk.is_locked(store.paths.manager_lock) and _wait(told))
-
-
-def _wait(condition: Callable[[], bool], limit_s: float = PUBLISH_LIMIT_S) -> bool:
-    end = time.monotonic() + limit_s
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(_POLL_S)
-    return True
+    return told() or (disk.is_locked(store.paths.manager_lock) and wait_for(told, PUBLISH_LIMIT_S))

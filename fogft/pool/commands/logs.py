@@ -1,7 +1,7 @@
 """Which logs a pool has: its manager's, its client proxy's, and one for each launch.
 
 Owns: finding them.
-Not here: reading and following them (`fogft.cli.tail`).
+Not here: reading and following them (`fogft.cli.status`).
 """
 
 from __future__ import annotations

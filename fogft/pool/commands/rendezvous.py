@@ -17,7 +17,7 @@ from fogft import disk
 from fogft.errors import StateError
 from fogft.metrics.scrape import Scrape
 from fogft.model.proxy_config import RendezvousConfig
-from fogft.pool.manager.metrics import of_rendezvous
+from fogft.pool.manager.tally import of_rendezvous
 from fogft.poolfile import config_file
 from fogft.process import ENDING_SIGNALS, Watchdog, notify, start_log
 from fogft.records import cache

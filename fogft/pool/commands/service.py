@@ -18,8 +18,7 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,10 +67,11 @@ WantedBy={wanted_by}
 
 @dataclass(frozen=True)
 class Unit:
-    """One unit's name and text."""
+    """One unit's name and text, and the file with its environment."""
 
     name: str
     text: str
+    environment: Path
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _unit(name: str, words: Sequence[str], needs: Path, environment: Path, *, sy
         user=f"User={owner}\n" if system else "",
         wanted_by="multi-user.target" if system else "default.target",
     )
-    return Unit(f"{name}.service", text)
+    return Unit(f"{name}.service", text, environment)
 
 
 def _quoted(word: str) -> str:
@@ -166,12 +166,12 @@ def environment(environ: Mapping[str, str] = os.environ) -> str:
     return "\n".join(lines) + "\n"
 
 
-def install(where: Services, units: Sequence[Unit], env_file: Path) -> list[str]:
+def install(where: Services, units: Sequence[Unit]) -> list[str]:
     """Write units and their environment, have them started now and at each boot.
 
     Returns what systemd said against it; nothing where they were started.
     """
-    disk.write_whole(env_file, environment())
+    disk.write_whole(units[0].environment, environment())
     where.folder.mkdir(parents=True, exist_ok=True)
     for unit in units:
         disk.write_whole(where.folder / unit.name, unit.text)
@@ -197,7 +197,7 @@ def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
     old = process_control.lock_holder(paths.proxy_lock)
     if old is None:
         return
-    if _wait(lambda: disk.is_locked(paths.standby_lock), STANDBY_LIMIT_S):
+    if process_control.wait_for(lambda: disk.is_locked(paths.standby_lock), STANDBY_LIMIT_S):
         gone = threading.Event()
         process_control.call_at_end(old, gone.set)
         with contextlib.suppress(ProcessLookupError):
@@ -207,13 +207,6 @@ def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
     names = [unit.name for unit in units]
     where.systemctl("reset-failed", *names)
     where.systemctl("start", "--no-block", *names)
-
-
-def _wait(condition: Callable[[], bool], limit_s: float) -> bool:
-    end = time.monotonic() + limit_s
-    while not (found := condition()) and time.monotonic() < end:
-        time.sleep(process_control.POLL_S)
-    return found
 
 
 def installed(where: Services, names: Sequence[str] = ()) -> list[str]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from fogft import disk
@@ -56,16 +56,16 @@ def _current(
     )
 
 
-def checked(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.time) -> Seen:
+def checked(paths: PoolPaths, limit_s: float) -> Seen:
     """Wait until each link has had its probe answered from now on, and return what holds then.
 
     The client proxy probes all links by itself, at least once a second; a link that has not had
     an answer within `limit_s` counts as suspect.
     """
-    asked_at, deadline = clock(), time.monotonic() + limit_s
+    asked_at, deadline = time.time(), time.monotonic() + limit_s
     while True:
-        seen = read(paths, clock())
-        asked = _current(paths, seen.status, clock(), heard_since=asked_at)
+        seen = read(paths, time.time())
+        asked = _current(paths, seen.status, time.time(), heard_since=asked_at)
         links = [(*one.status.replicas, *one.status.by_hand) for one in (seen, asked)]
         if not seen.status.proxy_alive or time.monotonic() >= deadline:
             return asked
@@ -85,18 +85,18 @@ def every(names: Iterable[str], now: float) -> Iterator[tuple[str, Seen | StateE
             yield name, error
 
 
-def renewed(paths: PoolPaths, limit_s: float, clock: Callable[[], float] = time.time) -> Seen:
+def renewed(paths: PoolPaths, limit_s: float) -> Seen:
     """Have the living manager look again, and return what it saw.
 
     Raises:
         StateError: It did not within `limit_s`, or it died meanwhile.
     """
-    asked_at = clock()
+    asked_at = time.time()
     deadline = time.monotonic() + limit_s
     with contextlib.suppress(OSError):
         os.utime(paths.intent)  # the manager watches it; without one, its next tick comes soon
     while True:
-        seen = read(paths, clock())
+        seen = read(paths, time.time())
         if seen.age_s is not None and seen.status.observed_at >= asked_at:
             return seen
         if not seen.manager_alive or time.monotonic() >= deadline:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fogft import disk
+from fogft import disk, template_files
 from fogft.cloud.port import Launch
 from fogft.model.credentials import NAME_LIMIT, CredentialPaths, Holder, Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND, replica_hash, task_at
@@ -26,7 +26,7 @@ from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
-from fogft.poolfile import config_file, workspace
+from fogft.poolfile import config_file
 
 # What a certificate lasts beyond the end of a pool that has one.
 MARGIN_DAYS = 30.0
@@ -153,7 +153,7 @@ def build_order(
         placement=planned.offer.placement,
         usd_per_hour=planned.offer.usd_per_hour,
         spec_hash=replica_hash(spec, id.slot),
-        task=workspace.with_build(absolute(task_at(spec, id.slot), Path(identity.file).parent)),
+        task=with_build(absolute(task_at(spec, id.slot), Path(identity.file).parent)),
         files={
             "replica.yaml": replica_config(
                 identity, spec, id, announcements=bool(announcements)
@@ -223,3 +223,20 @@ def absolute(task: Mapping[str, Any], base: Path) -> dict[str, Any]:
 
 def _absolute(path: str, base: Path) -> str:
     return path if "://" in path else str((base / Path(path).expanduser()).resolve())
+
+
+def with_build(task: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a task that builds its workspace, where it has one and says nothing of `setup`.
+
+    Raises:
+        FogftError: The installation lacks its templates.
+    """
+    workdir = task.get("workdir")
+    if task.get("setup") or not isinstance(workdir, str) or not is_workspace(Path(workdir)):
+        return dict(task)
+    return {**task, "setup": (template_files.folder() / "workspace.sh").read_text()}
+
+
+def is_workspace(folder: Path) -> bool:
+    """Whether there are packages below its `src`."""
+    return next((folder / "src").rglob("package.xml"), None) is not None

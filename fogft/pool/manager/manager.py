@@ -35,21 +35,20 @@ from fogft.pool.folder.lease import Lease
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import (
-    clocks,
     configuration,
     proxy_report,
-    restarting,
+    proxy_supervisor,
     shutdown,
     status,
     teardown,
+    timekeeping,
 )
 from fogft.pool.manager.announcing import ManagerRecords
 from fogft.pool.manager.distances import Distances, Latencies
-from fogft.pool.manager.metrics import of_pool
 from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 from fogft.pool.manager.reconciler import Reconciler, Tick
-from fogft.pool.manager.tally import Tally
+from fogft.pool.manager.tally import Tally, of_pool
 from fogft.process import Watchdog, notify, start_log, stop_on_signal
 from fogft.records.roster import ServingLease
 
@@ -122,7 +121,7 @@ class Manager:
             cloud,
             store,
             clock=time.time,
-            reading=clocks.read,
+            reading=timekeeping.read,
             links=self._links,
             build_order=self._build_order,
             submit=on_thread,
@@ -142,7 +141,7 @@ class Manager:
         """
         log.info("manager_started pool=%s epoch=%d", self._identity.name, self._lease.epoch)
         try:
-            self._attempt(lambda: restarting.allow(self._paths))
+            self._attempt(lambda: proxy_supervisor.allow_restart(self._paths))
             watchdog = Watchdog()
             while not stop.is_set():
                 if self._work():
@@ -150,7 +149,7 @@ class Manager:
                 notify("READY=1")
                 watchdog.work()
                 self._rest(stop)
-            restarting.forbid(self._paths)
+            proxy_supervisor.forbid_restart(self._paths)
         except PoolNotFound:
             log.info("manager_stopped pool=%s reason=ended", self._identity.name)
         finally:

@@ -20,6 +20,14 @@ from fogft import disk
 POLL_S = 0.05
 
 
+def wait_for(condition: Callable[[], bool], limit_s: float) -> bool:
+    """Wait until a condition holds; return whether it does in time."""
+    end = time.monotonic() + limit_s
+    while not (found := condition()) and time.monotonic() < end:
+        time.sleep(POLL_S)
+    return found
+
+
 def lock_holder(lock: Path) -> int | None:
     """Return the process that holds a lock; None for nobody.
 

@@ -4,7 +4,8 @@ The death of one is no reason to touch a replica, and its life needs no manager:
 in a session of its own and lives on when the manager goes. The one in line takes over by itself,
 in the instant in which the first ends; here both are started, and adopted where they run already.
 
-Owns: starting them again, with backoff.
+Owns: starting them again, with backoff; and `manager.json`, by which a client proxy starts a
+manager again that was killed (`fogft.proxy.robot.manager_restart`).
 Not here: its configuration (`configuration`).
 """
 
@@ -16,7 +17,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -144,3 +145,23 @@ class ProxySupervisor:
             return None
         log_name = str(self._paths.proxy_log)
         return Reason(Cause.PROXY_KEEPS_ENDING, count=self._failures, name=log_name)
+
+
+def allow_restart(paths: PoolPaths, environ: Mapping[str, str] = os.environ) -> None:
+    """Say how this process is started, should it die."""
+    if environ.get("NOTIFY_SOCKET"):
+        forbid_restart(paths)
+        return
+    value = {
+        "command": [sys.executable, *sys.orig_argv[1:]],
+        "folder": os.getcwd(),
+        "lock": paths.manager_lock.name,
+        "changing": paths.intent_lock.name,  # while it is held, somebody may be ending the pool
+        "log": paths.manager_log.name,
+    }
+    disk.write_json(paths.manager_start, value)
+
+
+def forbid_restart(paths: PoolPaths) -> None:
+    """Say that this process shall not be started again."""
+    paths.manager_start.unlink(missing_ok=True)

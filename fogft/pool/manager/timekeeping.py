@@ -11,6 +11,7 @@ Not here: what a jump is (`planning.observed.clock_jumps`), and what moves
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 
 from fogft.model.reason import Cause, Reason
@@ -80,3 +81,22 @@ class Timekeeping:
         if not self.doubt_s:
             return []
         return [Reason(Cause.CLOCK_DOUBTED, seconds=self.doubt_s)]
+
+
+_QUICK_S = 0.1
+_TRIES = 10
+
+
+def read() -> Reading:
+    """Return all three as of one moment.
+
+    A process that is held up between two of them would see a jump where there is none, so it
+    reads again.
+    """
+    for _ in range(_TRIES):
+        awake_s = time.monotonic()
+        steady_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+        found = Reading(time.time(), awake_s, steady_s)
+        if time.monotonic() - awake_s < _QUICK_S:
+            break
+    return found

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fogft.metrics.families import text
-from fogft.pool.manager import metrics
+from fogft.pool.manager import tally
 from fogft.pool.manager.tally import Tally
 from tests.cli.pools import STATUS
 
 
 def test_a_pool_is_told_as_its_status_says():
-    said = text(metrics.of_pool(STATUS, Tally()), {"pool": STATUS.pool}).splitlines()
+    said = text(tally.of_pool(STATUS, Tally()), {"pool": STATUS.pool}).splitlines()
     assert f'fogft_pool_ready_replicas{{pool="{STATUS.pool}"}} {STATUS.ready:.1f}' in said
     assert f'fogft_pool_target_replicas{{pool="{STATUS.pool}"}} {STATUS.target:.1f}' in said
     for phase in ("ready", "starting", "draining", "gone"):
@@ -21,15 +21,15 @@ def test_a_pool_is_told_as_its_status_says():
 
 
 def test_before_the_first_tick_only_counters_are_told():
-    told = {family.name for family in metrics.of_pool(None, Tally())}
+    told = {family.name for family in tally.of_pool(None, Tally())}
     assert "fogft_pool_launches" in told
     assert "fogft_pool_ready_replicas" not in told
 
 
 def test_the_end_of_credentials_and_the_cost_are_told_where_they_are_known():
-    said = text(metrics.of_pool(STATUS, Tally()), {"pool": STATUS.pool})
+    said = text(tally.of_pool(STATUS, Tally()), {"pool": STATUS.pool})
     assert "fogft_credentials_left_seconds{" not in said
     known = replace(STATUS, credentials_end_at=STATUS.observed_at + 90, usd_to_date=1.5)
-    said = text(metrics.of_pool(known, Tally()), {"pool": STATUS.pool})
+    said = text(tally.of_pool(known, Tally()), {"pool": STATUS.pool})
     assert f'fogft_credentials_left_seconds{{pool="{STATUS.pool}"}} 90.0' in said
     assert f'fogft_pool_usd_total{{pool="{STATUS.pool}"}} 1.5' in said

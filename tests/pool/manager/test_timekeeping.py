@@ -9,7 +9,7 @@ from fogft.model.reason import Cause
 from fogft.planning.observed.clock_jumps import Reading, Watch
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.rollout import Trial
-from fogft.pool.manager import clocks
+from fogft.pool.manager import timekeeping
 from fogft.pool.manager.timekeeping import Timekeeping
 from fogft.pool.manager.updating import Updating
 from tests.pool.scene import Scene
@@ -18,7 +18,7 @@ from tests.pool.scene import Scene
 def test_this_machine_s_clocks_are_read_together() -> None:
     """Two readings one after the other show no jump, busy as the machine may be."""
     watch = Watch()
-    assert [watch.look(clocks.read()) for _ in range(100)] == [None] * 100
+    assert [watch.look(timekeeping.read()) for _ in range(100)] == [None] * 100
 
 
 def test_a_jump_that_cannot_be_written_down_is_written_later(

@@ -12,7 +12,7 @@ import pytest
 from fogft import disk
 from fogft.errors import StateError
 from fogft.pool.folder.paths import PoolPaths
-from fogft.pool.manager import restarting
+from fogft.pool.manager import proxy_supervisor
 from fogft.proxy.robot.manager_restart import LOOK_S, NAME, ManagerRestart
 
 
@@ -22,7 +22,7 @@ class Scene:
         self.now = 100.0
         environ = {**os.environ, "WORD": "said"}
         self.restart = ManagerRestart(folder, environ, lambda: self.now)
-        restarting.allow(self.paths, {})
+        proxy_supervisor.allow_restart(self.paths, {})
         told = disk.read_json(self.paths.manager_start)
         code = "import os; print(os.environ['WORD'], os.getcwd())"
         told |= {"command": [sys.executable, "-c", code]}
@@ -77,7 +77,7 @@ def test_one_that_has_not_begun_ends_with_its_proxy(scene):
 
 
 def test_one_that_ended_well_or_has_systemd_is_let_be(scene):
-    restarting.allow(scene.paths, {"NOTIFY_SOCKET": "/run/systemd/notify"})
+    proxy_supervisor.allow_restart(scene.paths, {"NOTIFY_SOCKET": "/run/systemd/notify"})
     assert not scene.looks(5)
     scene.paths.manager_start.write_text("[]")
     with pytest.raises(StateError, match="damaged"):
