@@ -36,7 +36,6 @@ def announce(
     """Say what will be done.
 
     Args:
-        preview: Of the file.
         joined: The update that is under way to this very file.
         upgrade_from: By which version of fogft the pool's manager runs, where it has one.
     """

@@ -64,9 +64,6 @@ def table(
     """Return a table without lines, or several below each other that begin with one column.
 
     Args:
-        header: The columns' names.
-        rows: As many cells each.
-        width: Of a terminal's line; None for no limit.
         right: Columns that are aligned to the right.
         folds: Columns whose cells may be folded.
         optional: Columns that a terminal is spared where they are empty, or 0 everywhere.

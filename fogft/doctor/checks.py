@@ -16,11 +16,7 @@ ALL: tuple[Check, ...] = (*machine.CHECKS, *ros.CHECKS, *leftovers.CHECKS, *pool
 
 
 def examine(file: Path | None = None) -> Iterator[Finding]:
-    """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come.
-
-    Raises:
-        SpecError: The first mistake in the pool file.
-    """
+    """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come."""
     spec = None if file is None else read(file)
     pools_here = tuple(composition.pools())
     yield from run(ALL, Situation(home(), pools_here, spec, time.time()))

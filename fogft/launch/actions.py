@@ -68,11 +68,7 @@ class CloudNode(Node):  # type: ignore[misc]
         super().__init__(**arguments)
 
     def command(self, context: LaunchContext) -> NodeCommand:
-        """Return how the node is started, all substitutions made.
-
-        Raises:
-            FogftError: A parameter file cannot be read.
-        """
+        """Return how the node is started, all substitutions made."""
         self._perform_substitutions(context)
         name, namespace = self._given_name(context), self.expanded_node_namespace
         specific = {"name": f"__node:={name}"} if name else {}
@@ -102,11 +98,7 @@ class CloudNode(Node):  # type: ignore[misc]
         return "" if "unspecified" in name else name
 
     def execute(self, context: LaunchContext) -> list[Action] | None:
-        """Run it on this machine, in a fog pool that stays here.
-
-        Raises:
-            FogftError: It is in no fog pool.
-        """
+        """Run it on this machine, in a fog pool that stays here."""
         if not _stays_here(context):
             raise FogftError(
                 "a cloud node is in no fog pool", "put it into a `FogPool` (`fog_pool`)"
@@ -153,11 +145,7 @@ class FogPool(Action):  # type: ignore[misc]
         return cls, arguments
 
     def execute(self, context: LaunchContext) -> list[Action]:
-        """Write the pool file, run the pool, and start the local actions when it answers.
-
-        Raises:
-            FogftError: The arguments do not make a pool file.
-        """
+        """Write the pool file, run the pool, and start the local actions when it answers."""
         if _stays_here(context):
             return self._actions
         asked = {key: _evaluated(context, value) for key, value in self._given.items()}

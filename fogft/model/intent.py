@@ -103,11 +103,7 @@ def drain(intent: Intent, slot: int, generation: int) -> Intent:
 
 
 def exclude(intent: Intent, location: str) -> Intent:
-    """Keep out of a location. Repeatable.
-
-    Raises:
-        FogftError: That is not a location.
-    """
+    """Keep out of a location. Repeatable."""
     return replace(intent, excluded=intent.excluded | {checked_location(location)})
 
 
@@ -138,11 +134,7 @@ def file_changed(intent: Intent, before: PoolSpec, after: PoolSpec) -> Intent:
 
 
 def checked_location(text: str) -> str:
-    """Return a location without surrounding slashes.
-
-    Raises:
-        FogftError: It is none.
-    """
+    """Return a location without surrounding slashes."""
     place = text.strip().strip("/")
     if not LOCATION.fullmatch(place):
         raise FogftError(

@@ -133,11 +133,7 @@ def from_dict(raw: Any) -> Membership:
 
 
 def from_content(content: Any) -> Membership:
-    """Return a membership from its JSON form without the checksum.
-
-    Raises:
-        StateError: It is none.
-    """
+    """Return a membership from its JSON form without the checksum."""
     membership = stored(Membership, content, "not a membership")
     ids = [m.id for m in membership.members]
     if len(set(ids)) != len(ids):

@@ -52,11 +52,7 @@ UNCHECKED = Checks()
 
 
 def pool_spec(root: Node, file: str, checks: Checks = UNCHECKED) -> PoolSpec:
-    """Return what a pool file asks for.
-
-    Raises:
-        SpecError: The first mistake found; ``file:line: key: what is wrong``.
-    """
+    """Return what a pool file asks for."""
     return _judged(root, file, checks, Mistakes())
 
 

@@ -29,11 +29,7 @@ class Reader:
         self._mistakes = mistakes or Mistakes()
 
     def map(self, cls: type[T], section: Section) -> T:
-        """Return the dataclass that a map describes.
-
-        Raises:
-            SpecError: The first mistake.
-        """
+        """Return the dataclass that a map describes."""
         entries = keys_of(cls)
         below = [e.name for e in entries if e.key.advanced]
         known = [e.name for e in entries if not e.key.advanced]

@@ -40,11 +40,7 @@ _ENV_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def check_task(top: Section, mistakes: Mistakes) -> None:
-    """Check the top level of a pool file.
-
-    Raises:
-        SpecError: The first mistake, unless all are kept.
-    """
+    """Check the top level of a pool file."""
     mistakes.add(
         top.error(key, "cannot stand in a pool file", reason, at_key=True)
         for key, reason in REFUSED_TASK_KEYS.items()

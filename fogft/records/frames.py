@@ -45,11 +45,7 @@ class Unframer:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[dict[str, Any]]:
-        """Yield the messages that are complete now; what is not taken stays for the next call.
-
-        Raises:
-            RecordError: The stream is no such stream; it cannot go on.
-        """
+        """Yield the messages that are complete now; what is not taken stays for the next call."""
         self._buffer += data
         while len(self._buffer) >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._buffer)
@@ -78,11 +74,7 @@ def challenge(nonce: bytes, seen_host: str) -> bytes:
 
 
 def read_challenge(message: dict[str, Any]) -> tuple[bytes, str]:
-    """Return nonce and the caller's host as seen.
-
-    Raises:
-        RecordError: It is no challenge.
-    """
+    """Return nonce and the caller's host as seen."""
     _expect(message, "challenge")
     nonce, seen = message.get("nonce"), message.get("seen")
     if not isinstance(nonce, str) or not isinstance(seen, str) or len(seen) > 64:
@@ -108,11 +100,7 @@ def greeting(certificate: bytes, signature: bytes) -> bytes:
 
 
 def read_greeting(message: dict[str, Any]) -> tuple[bytes, bytes]:
-    """Return certificate and signature.
-
-    Raises:
-        RecordError: It is no greeting.
-    """
+    """Return certificate and signature."""
     _expect(message, "greeting")
     certificate, signature = message.get("certificate"), message.get("signature")
     if not isinstance(certificate, str) or not isinstance(signature, str):
@@ -139,11 +127,7 @@ def have(digest: Digest) -> bytes:
 
 
 def read_have(message: dict[str, Any]) -> dict[Key, Order]:
-    """Return the other side's digest.
-
-    Raises:
-        RecordError: It is none.
-    """
+    """Return the other side's digest."""
     rows = read(_Have, message).digest
     if len(rows) > _DIGEST_LIMIT:
         raise RecordError("malformed", f"a digest of {len(rows)} records")
@@ -167,11 +151,7 @@ def records(all: Sequence[SignedRecord]) -> Iterator[bytes]:
 
 
 def read_records(message: dict[str, Any]) -> list[SignedRecord]:
-    """Return the records of a message, not yet judged.
-
-    Raises:
-        RecordError: They are none.
-    """
+    """Return the records of a message, not yet judged."""
     rows = message.get("records")
     if not isinstance(rows, list):
         raise RecordError("malformed", "records that are no list")
@@ -184,11 +164,7 @@ def pack(all: Sequence[SignedRecord]) -> bytes:
 
 
 def unpack(data: bytes) -> list[SignedRecord]:
-    """Return the records of `pack`, not yet judged.
-
-    Raises:
-        RecordError: They are none.
-    """
+    """Return the records of `pack`, not yet judged."""
     message = read_json(data, FRAME_LIMIT)
     check_version(message)
     return read_records(message)

@@ -156,22 +156,14 @@ def sign_record(record: Record, sign: Sign) -> SignedRecord:
 
 
 def read_body(signed: SignedRecord) -> Record:
-    """Return what a record says, whoever wrote it: nothing is verified.
-
-    Raises:
-        RecordError: It is no record of this version.
-    """
+    """Return what a record says, whoever wrote it: nothing is verified."""
     if len(signed.certificate) > CERTIFICATE_LIMIT or len(signed.signature) > SIGNATURE_LIMIT:
         raise RecordError("malformed", "a certificate or signature that is too long")
     return _decode(signed.body)
 
 
 def verified_writer(record: Record, signed: SignedRecord, verify: Verify) -> Writer:
-    """Return who wrote a record, once signature, certificate and right to write are checked.
-
-    Raises:
-        RecordError: One of them is wrong.
-    """
+    """Return who wrote a record, once signature, certificate and right to write are checked."""
     writer = verify(signed.certificate, signed.signature, signed_bytes(signed.body))
     expected = expected_writer(record)
     if (writer.role, writer.common_name) != (expected.role.value, expected.common_name):
@@ -184,9 +176,6 @@ def expected_writer(record: Record) -> Holder:
     """Return the only one who may write this record.
 
     A replica's certificate names its generation: it cannot write a later one's record.
-
-    Raises:
-        RecordError: There can be no such record.
     """
     role, subject = _WRITERS.get(record.kind, Role.MANAGER), record.subject
     if role is Role.MANAGER:
@@ -217,21 +206,13 @@ def _decode(body: bytes) -> Record:
 
 
 def check_version(raw: Mapping[str, Any]) -> None:
-    """See that a message or a record is of this version.
-
-    Raises:
-        RecordError: It is not.
-    """
+    """See that a message or a record is of this version."""
     if raw.get("v") is True or raw.get("v") != VERSION:
         raise RecordError("version", f"version {raw.get('v')!r:.20} is not spoken here")
 
 
 def read(cls: type[T], raw: Any) -> T:
-    """Return the value that plain data describes.
-
-    Raises:
-        RecordError: It describes none of this class.
-    """
+    """Return the value that plain data describes."""
     try:
         return plain.from_plain(cls, raw)
     except ValueError as error:
@@ -239,11 +220,7 @@ def read(cls: type[T], raw: Any) -> T:
 
 
 def read_json(text: bytes, limit: int) -> dict[str, Any]:
-    """Return a JSON object of limited size, without numbers that are none.
-
-    Raises:
-        RecordError: It is anything else.
-    """
+    """Return a JSON object of limited size, without numbers that are none."""
     if len(text) > limit:
         raise RecordError("malformed", f"{len(text)} bytes, where {limit} are the limit")
     try:
@@ -269,11 +246,7 @@ def to_plain(signed: SignedRecord) -> dict[str, str]:
 
 
 def from_plain(raw: Any) -> SignedRecord:
-    """Read a signed record from JSON data; its body is not looked at.
-
-    Raises:
-        RecordError: It is none.
-    """
+    """Read a signed record from JSON data; its body is not looked at."""
     try:
         body, certificate, signature = (raw[k] for k in ("body", "certificate", "signature"))
         signed = SignedRecord(

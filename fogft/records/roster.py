@@ -1,7 +1,8 @@
 """What records say, put together: whom a proxy shall talk to, and where. Pure.
 
 The manager's admission says which generation of which slot is in. A replica's own record
-says where it is: it counts only while its generation is the one admitted.
+says where it is: it counts only while its generation is the one admitted. A content that is
+none raises `RecordError`.
 
 Owns: the contents of records, and the membership that follows from them.
 Not here: who may write them (`records`) and which one stands (`record_set`).
@@ -69,20 +70,12 @@ class _Revoked:
 
 
 def slot_state(record: Record) -> SlotState:
-    """Read a replica's record.
-
-    Raises:
-        RecordError: Its content is none.
-    """
+    """Read a replica's record."""
     return read(SlotState, record.content)
 
 
 def dial_in(record: Record) -> str:
-    """Return where a robot or a gateway lets replicas dial in; empty for nowhere.
-
-    Raises:
-        RecordError: Its content is none.
-    """
+    """Return where a robot or a gateway lets replicas dial in; empty for nowhere."""
     return read(DialIn, record.content).dial_in
 
 
@@ -93,11 +86,7 @@ def admission_content(membership: Membership) -> dict[str, Any]:
 
 
 def admission(record: Record) -> Membership:
-    """Read the manager's admission record: epoch and version are its generation and sequence.
-
-    Raises:
-        RecordError: Its content is none.
-    """
+    """Read the manager's admission record: epoch and version are its generation and sequence."""
     try:
         order = {"epoch": record.generation, "version": record.sequence}
         return from_content({**record.content, **order, "pool_uid": record.pool_uid, "revoked": []})
@@ -106,11 +95,7 @@ def admission(record: Record) -> Membership:
 
 
 def revoked_names(record: Record) -> frozenset[str]:
-    """Return the common names of certificates that a revocation record takes back.
-
-    Raises:
-        RecordError: Its content is none.
-    """
+    """Return the common names of certificates that a revocation record takes back."""
     holders = [holder_of(name) for name in read(_Revoked, record.content).names]
     if any(holder.pool_uid != record.pool_uid for holder in holders):
         raise RecordError("malformed", "names of another pool")
@@ -118,20 +103,12 @@ def revoked_names(record: Record) -> frozenset[str]:
 
 
 def lease(record: Record) -> ServingLease:
-    """Read the manager's lease.
-
-    Raises:
-        RecordError: Its content is none.
-    """
+    """Read the manager's lease."""
     return read(ServingLease, record.content)
 
 
 def check_content(record: Record) -> None:
-    """See that a record's content can be used.
-
-    Raises:
-        RecordError: It cannot.
-    """
+    """See that a record's content can be used."""
     _READERS[record.kind](record)
 
 

@@ -120,11 +120,7 @@ class Verifier:
         self._known: dict[bytes, x509.Certificate] = {}
 
     def __call__(self, certificate: bytes, signature: bytes, message: bytes) -> Writer:
-        """Return who signed `message`.
-
-        Raises:
-            RecordError: The signature or the certificate is no good.
-        """
+        """Return who signed `message`; what is no good raises `RecordError`."""
         from cryptography.exceptions import InvalidSignature
         from cryptography.hazmat.primitives import hashes
         from cryptography.hazmat.primitives.asymmetric import ec
@@ -179,11 +175,7 @@ class LazyVerifier:
         self._verifier: Verifier | None = None
 
     def __call__(self, certificate: bytes, signature: bytes, message: bytes) -> Writer:
-        """Return who signed `message`; see `Verifier`.
-
-        Raises:
-            RecordError: The signature, the certificate or our own CA is no good.
-        """
+        """Return who signed `message`; see `Verifier`."""
         if self._verifier is None:
             try:
                 self._verifier = Verifier(self._ca)

@@ -15,11 +15,7 @@ if TYPE_CHECKING:
 
 
 def draw(shown: PlanShown, path: Path) -> None:
-    """Draw a plan to a PNG, SVG or PDF file. Offers of unknown distance stand apart.
-
-    Raises:
-        FogftError: It cannot be drawn or written.
-    """
+    """Draw a plan to a PNG, SVG or PDF file. Offers of unknown distance stand apart."""
     check(path)
     from matplotlib.figure import Figure
 

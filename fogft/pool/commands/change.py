@@ -30,22 +30,14 @@ def scale(store: PoolStore, by: int) -> tuple[int, int]:
 
 
 def drain(store: PoolStore, slot: int, now: float) -> int:
-    """Have the replica in a slot replaced; return its generation.
-
-    Raises:
-        FogftError: There is none.
-    """
+    """Have the replica in a slot replaced; return its generation."""
     generation = generation_in(store.paths, slot, now)
     _change(store, lambda now: intent.drain(now, slot, generation))
     return generation
 
 
 def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
-    """Keep out of a location; return whether that is new.
-
-    Raises:
-        FogftError: The pool's cloud has no such location.
-    """
+    """Keep out of a location; return whether that is new."""
     identity, place = store.identity(), intent.checked_location(location)
     resources = store.spec().task.get("resources") or {}
     sold = [offer.placement for offer in cloud.offers(resources)]
@@ -62,11 +54,7 @@ def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
 
 
 def include(store: PoolStore, location: str) -> None:
-    """Allow a location again.
-
-    Raises:
-        FogftError: It is not excluded.
-    """
+    """Allow a location again."""
     _change(store, lambda now: intent.include(now, location))
 
 

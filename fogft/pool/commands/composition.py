@@ -64,11 +64,7 @@ def make_store(pool: str) -> PoolStore:
 
 
 def make_cloud(name: str, base: Path) -> Cloud:
-    """Return a cloud, one of `CLOUDS`; relative paths in its pool file start at `base`.
-
-    Raises:
-        CloudError: There is no such cloud.
-    """
+    """Return a cloud, one of `CLOUDS`; relative paths in its pool file start at `base`."""
     if name not in CLOUDS:
         known = ", ".join(f"`{cloud}`" for cloud in CLOUDS)
         raise CloudError(
@@ -85,11 +81,7 @@ def make_cloud(name: str, base: Path) -> Cloud:
 
 
 def cloud_of(identity: Identity) -> Cloud:
-    """Return the cloud that a pool runs on.
-
-    Raises:
-        CloudError: This version knows no such cloud.
-    """
+    """Return the cloud that a pool runs on."""
     return make_cloud(identity.cloud, Path(identity.file).parent)
 
 

@@ -45,11 +45,7 @@ def issue_credentials(
 
 
 def join_here(file: Path, passphrase: str) -> Joined:
-    """Set this machine up from a join bundle, which is destroyed by it.
-
-    Raises:
-        CredentialError: It is none, too old, or was used, here or elsewhere.
-    """
+    """Set this machine up from a join bundle, which is destroyed by it. See `joining.join`."""
     logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # an error says what matters
     disk.make_folder(home())
     return joining.join(file, passphrase, home(), time.time())

@@ -203,11 +203,7 @@ def _on_disk(folder: Path, files: dict[str, str], holder: Holder) -> Iterator[Cr
 
 
 def _rendezvous(content: dict[str, Any]) -> list[str]:
-    """Return the rendezvous that a bundle names; older bundles name none.
-
-    Raises:
-        CredentialError: They are no endpoints.
-    """
+    """Return the rendezvous that a bundle names; older bundles name none."""
     listed = content.get("rendezvous", [])
     if not isinstance(listed, list) or not all(
         isinstance(one, str) and is_endpoint(one) for one in listed
@@ -217,11 +213,7 @@ def _rendezvous(content: dict[str, Any]) -> list[str]:
 
 
 def read(file: Path) -> bytes:
-    """Return a bundle's bytes.
-
-    Raises:
-        CredentialError: It cannot be read.
-    """
+    """Return a bundle's bytes."""
     try:
         with file.open("rb") as opened:
             return opened.read(bundle.SIZE_LIMIT + 1)
@@ -233,11 +225,7 @@ def read(file: Path) -> bytes:
 
 
 def checked_files(content: dict[str, Any]) -> dict[str, str]:
-    """Return the files that a bundle brings, once their names are found to be harmless.
-
-    Raises:
-        CredentialError: One is not.
-    """
+    """Return the files that a bundle brings, once their names are found to be harmless."""
     files = content.get("files")
     if not isinstance(files, dict) or not files:
         raise CredentialError("the bundle holds no files")

@@ -34,21 +34,12 @@ _SAVE_EVERY_S = 0.5
 def read_config(
     path: Path, listen: str | None = None, metrics: str | None = None
 ) -> RendezvousConfig:
-    """Read a rendezvous's configuration; paths in it are relative to its folder.
-
-    Raises:
-        StateError: It cannot be read, or a key is missing or of the wrong type.
-    """
+    """Read a rendezvous's configuration; paths in it are relative to its folder."""
     return config_file.read(RendezvousConfig, path, {"listen": listen, "metrics": metrics})
 
 
 def run(config: RendezvousConfig) -> None:
-    """Run until a signal ends it.
-
-    Raises:
-        WireError: The port cannot be had.
-        CredentialError: The certificate, its key or the CA cannot be used.
-    """
+    """Run until a signal ends it."""
     start_log()
     asyncio.run(_Rendezvous(config).live())
 

@@ -82,11 +82,7 @@ class Services:
     folder: Path
 
     def systemctl(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Call systemctl.
-
-        Raises:
-            FogftError: It is missing.
-        """
+        """Call systemctl."""
         scope = [] if self.system else ["--user"]
         try:
             return subprocess.run(
@@ -120,11 +116,7 @@ def of_pool(paths: PoolPaths, *, system: bool) -> list[Unit]:
 
 
 def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
-    """Return the unit of a gateway or a rendezvous.
-
-    Raises:
-        StateError: There is no such configuration.
-    """
+    """Return the unit of a gateway or a rendezvous."""
     config = config.resolve()
     if not config.is_file():
         raise StateError(f"there is no `{config}`", "`fogft join` writes it")

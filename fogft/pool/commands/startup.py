@@ -107,11 +107,7 @@ def _check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> N
 
 
 def manager_version(paths: PoolPaths) -> str:
-    """Return by which version of fogft a pool's manager runs; empty where it has said nothing.
-
-    Raises:
-        StateError: What it said cannot be read.
-    """
+    """Return by which version of fogft a pool's manager runs; empty where it has said nothing."""
     said = disk.read_json(paths.status)
     if not isinstance(said, dict):
         return ""

@@ -108,11 +108,7 @@ def renewed(paths: PoolPaths, limit_s: float) -> Seen:
 
 
 def refreshed(store: PoolStore, limit_s: float = 15.0) -> Seen:
-    """Have the manager look again; without one, ask the cloud and the client proxy's report.
-
-    Raises:
-        StateError: The manager did not look again within `limit_s`.
-    """
+    """Have the manager look again; without one, ask the cloud and the client proxy's report."""
     from fogft.pool.commands.composition import cloud_of
 
     if disk.is_locked(store.paths.manager_lock):
@@ -126,11 +122,7 @@ def slots(paths: PoolPaths) -> list[int]:
 
 
 def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
-    """Look at the cloud and at the client proxy's report, without a manager.
-
-    Raises:
-        PoolNotFound: There is no such pool.
-    """
+    """Look at the cloud and at the client proxy's report, without a manager."""
     # Not above: `fogft status` needs none of these when a manager lives.
     from fogft.model.replica import Observed
     from fogft.planning.observed.health import judge

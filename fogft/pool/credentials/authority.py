@@ -5,6 +5,8 @@ nothing else. A certificate says who its holder is (common name, from `model.nam
 it may do: a robot's is good for asking only, a replica's for answering only. That is the
 extended key usage, which TLS itself checks, so a stolen replica's key can ask nothing.
 
+What cannot be used raises `CredentialError`, what cannot be written `StateError`.
+
 Owns: making, writing, reading and describing keys and certificates. Keys are never shown.
 Not here: who gets one (`fogft.pool`), how they are used (`fogft.link.zenoh.settings`).
 """
@@ -67,12 +69,7 @@ class Description:
 
 
 def create_authority(folder: Path, pool_uid: str) -> None:
-    """Make the pool's CA in a folder, which is made too. An existing CA is kept.
-
-    Raises:
-        CredentialError: The folder holds a CA that cannot be used.
-        StateError: A file cannot be written.
-    """
+    """Make the pool's CA in a folder, which is made too. An existing CA is kept."""
     from cryptography.hazmat.primitives.asymmetric import ec
 
     if (folder / AUTHORITY_CERTIFICATE).exists():
@@ -93,9 +90,6 @@ def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS
 
     Args:
         days: How long it is valid from now; never beyond the CA's own end.
-
-    Raises:
-        CredentialError: There is no CA, or it cannot be used.
     """
     from cryptography.hazmat.primitives.asymmetric import ec
 
@@ -117,9 +111,6 @@ def write(credential: Credential, folder: Path, stem: str) -> None:
     """Write ``<stem>.key``, ``<stem>.crt`` and ``ca.crt`` to a folder (0700), each 0600.
 
     The certificate comes last: where it stands, its key does too.
-
-    Raises:
-        StateError: A file cannot be written.
     """
     disk.make_folder(folder)
     disk.write_whole(folder / AUTHORITY_CERTIFICATE, credential.authority_pem)
@@ -128,11 +119,7 @@ def write(credential: Credential, folder: Path, stem: str) -> None:
 
 
 def describe(path: Path) -> Description:
-    """Return what a certificate file says of itself.
-
-    Raises:
-        CredentialError: It cannot be read or holds no certificate.
-    """
+    """Return what a certificate file says of itself."""
     return _described(_load_certificate(path))
 
 
@@ -146,11 +133,7 @@ def is_good(path: Path, now: datetime.datetime, revoked: frozenset[str] = frozen
 
 
 def describe_pem(pem: bytes) -> Description:
-    """Return what a certificate says of itself.
-
-    Raises:
-        CredentialError: It is none.
-    """
+    """Return what a certificate says of itself."""
     from cryptography import x509
 
     try:

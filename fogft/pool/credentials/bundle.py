@@ -2,7 +2,8 @@
 
 It is readable JSON around sealed content: the key that seals it is made from a passphrase
 (scrypt), and the readable part is sealed along with it (AES-GCM), so whoever changes a
-byte, the date included, is left with nothing. It can be opened for a limited time only.
+byte, the date included, is left with nothing. It can be opened for a limited time only. What is
+wrong raises `CredentialError`.
 
 Owns: sealing and opening. Not here: what is in it (`joining`), and that it is used once.
 """
@@ -58,11 +59,7 @@ def new_passphrase() -> str:
 
 
 def check_passphrase(passphrase: str) -> None:
-    """See that a passphrase is long enough.
-
-    Raises:
-        CredentialError: It is not.
-    """
+    """See that a passphrase is long enough."""
     if len(passphrase.strip()) < PASSPHRASE_LEAST:
         raise CredentialError(
             f"the passphrase is shorter than {PASSPHRASE_LEAST} characters",
@@ -90,20 +87,12 @@ def seal(label: Label, content: Mapping[str, Any], passphrase: str) -> bytes:
 
 
 def read_label(data: bytes) -> Label:
-    """Return what a bundle says of itself. Nothing of it is proved before it is opened.
-
-    Raises:
-        CredentialError: It is no bundle.
-    """
+    """Return what a bundle says of itself. Nothing of it is proved before it is opened."""
     return _parse(data)[0]
 
 
 def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[str, Any]]:
-    """Return a bundle's label and content.
-
-    Raises:
-        CredentialError: It is no bundle, the passphrase is wrong, or its time is over.
-    """
+    """Return a bundle's label and content."""
     from cryptography.exceptions import InvalidTag
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 

@@ -45,11 +45,7 @@ def new_token(now: float) -> str:
 
 
 def own_token(claims: Path, id: str, now: float) -> str:
-    """Return this machine's claim to a bundle: the same again where it was ended in between.
-
-    Raises:
-        StateError: It cannot be written down.
-    """
+    """Return this machine's claim to a bundle: the same again where it was ended in between."""
     known = stored(dict[str, str], disk.read_json(claims) or {}, f"`{claims}` is damaged")
     if id not in known:
         latest = dict(list(known.items())[-_KEPT:])

@@ -2,7 +2,8 @@
 
 Every issue is on disk before its certificate leaves this module, so nothing that the CA
 ever signed is missing from the list, and no generation of a name is used twice. Keys are
-not in it.
+not in it. What cannot be written down was not done, and raises `StateError`; what cannot be
+certified raises `CredentialError`.
 
 Owns: ``issued.json`` beside the CA, written under its lock by the manager and by commands.
 Not here: making certificates (`credentials`), telling others of a revocation (`manager`).
@@ -70,11 +71,7 @@ class Ledger:
         self._clock = clock
 
     def entries(self) -> tuple[Entry, ...]:
-        """Return all certificates, oldest first.
-
-        Raises:
-            StateError: The list is damaged.
-        """
+        """Return all certificates, oldest first."""
         raw = disk.read_json(self.path)
         if raw is None:
             return ()
@@ -103,24 +100,14 @@ class Ledger:
         return found
 
     def issue(self, holder: Holder, *, days: float = authority.LEAF_DAYS) -> Credential:
-        """Certify a holder, and remember it.
-
-        Raises:
-            CredentialError: The CA cannot be used, or this very name is revoked.
-            StateError: It cannot be remembered; nothing was issued.
-        """
+        """Certify a holder, and remember it."""
         with disk.locked(self._lock):
             return self._issue(holder, self.entries(), days)
 
     def issue_next(
         self, role: Role, name: str, pool_uid: str, *, days: float
     ) -> tuple[Holder, Credential]:
-        """Certify the next generation of a name, and remember it.
-
-        Raises:
-            CredentialError: The CA cannot be used, or the name fits no certificate.
-            StateError: It cannot be remembered; nothing was issued.
-        """
+        """Certify the next generation of a name, and remember it."""
         with disk.locked(self._lock):
             entries = self.entries()
             used = [e.holder.generation for e in entries if _is(e, role, name)]
@@ -149,11 +136,7 @@ class Ledger:
         return issued
 
     def revoke(self, holders: Iterable[Holder]) -> None:
-        """Take certificates back, for good. Repeatable.
-
-        Raises:
-            StateError: It cannot be written; nothing was revoked.
-        """
+        """Take certificates back, for good. Repeatable."""
         names, now = {holder.common_name for holder in holders}, self._clock()
         with disk.locked(self._lock):
             self._write(

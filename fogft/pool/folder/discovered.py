@@ -41,11 +41,7 @@ class Discovery:
         self.notes: list[Reason] = []
 
     def look(self, spec: PoolSpec, observed: Observed, wanted: int) -> bool:
-        """Take up what most replicas offer; return whether that changed the file.
-
-        Raises:
-            StateError: It cannot be written.
-        """
+        """Take up what most replicas offer; return whether that changed the file."""
         self.notes = []
         if spec.services:
             return False

@@ -38,7 +38,6 @@ class Lease:
 
         Raises:
             PoolBusy: Another manager has it.
-            StateError: The lease cannot be written.
         """
         lock = disk.Lock(paths.manager_lock)
         if not lock.acquire(wait=False):

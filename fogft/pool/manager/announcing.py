@@ -52,12 +52,7 @@ class ManagerRecords:
     def look(
         self, endpoints: tuple[str, ...], membership: Membership | None, lease: ServingLease
     ) -> None:
-        """Publish what is new, to these rendezvous.
-
-        Raises:
-            CredentialError: The pool's CA cannot be used.
-            StateError: The manager's certificate cannot be written.
-        """
+        """Publish what is new, to these rendezvous."""
         self._announce(self._revoked if membership is None else membership.revoked, lease)
         if endpoints != self._endpoints:
             self.close()
@@ -78,12 +73,7 @@ class ManagerRecords:
             self._said_lease = self._lease
 
     def announcements(self, lease: ServingLease) -> bytes:
-        """Return what a launch takes along: what was taken back up to now, and a lease, signed.
-
-        Raises:
-            CredentialError: The pool's CA cannot be used.
-            StateError: The list of certificates is damaged, or the result cannot be written.
-        """
+        """Return what a launch takes along: what was taken back up to now, and a lease, signed."""
         self._announce(Ledger(self._paths.credentials).revoked(), lease)
         return self._announced
 

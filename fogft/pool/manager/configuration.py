@@ -56,11 +56,7 @@ def robot_name() -> str:
 
 
 def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> bool:
-    """Bring the client proxy's configuration up to date; return whether it changed.
-
-    Raises:
-        StateError: It cannot be written.
-    """
+    """Bring the client proxy's configuration up to date; return whether it changed."""
     content = proxy_config(paths, identity, spec)
     if paths.proxy_config.exists() and paths.proxy_config.read_text() == content:
         return False
@@ -110,11 +106,7 @@ def proxy_config(
 def certify_robot(
     paths: PoolPaths, identity: Identity, spec: PoolSpec, now: datetime.datetime
 ) -> bool:
-    """See to it that the client proxy has a certificate that is good; return whether it is new.
-
-    Raises:
-        CredentialError: The pool's CA cannot be used.
-    """
+    """See to it that the client proxy has a certificate that is good; return whether it is new."""
     revoked = Ledger(paths.credentials).revoked()
     if authority.is_good(paths.credentials / "robot.crt", now, revoked):
         return False
@@ -139,11 +131,7 @@ def build_order(
     *,
     announcements: bytes = b"",
 ) -> Launch:
-    """Return the order of a planned launch, with all that its server proxy needs.
-
-    Raises:
-        CredentialError: The pool's CA cannot be used.
-    """
+    """Return the order of a planned launch, with all that its server proxy needs."""
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
     holder = holder_of(id.certificate_name)
     issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
@@ -226,11 +214,7 @@ def _absolute(path: str, base: Path) -> str:
 
 
 def with_build(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a task that builds its workspace, where it has one and says nothing of `setup`.
-
-    Raises:
-        FogftError: The installation lacks its templates.
-    """
+    """Return a task that builds its workspace, where it has one and says nothing of `setup`."""
     workdir = task.get("workdir")
     if task.get("setup") or not isinstance(workdir, str) or not is_workspace(Path(workdir)):
         return dict(task)

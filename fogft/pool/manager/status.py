@@ -105,7 +105,6 @@ class ReplicaStatus:
 
         Args:
             services: Names of all services: with these it is ready.
-            links_known: There is a fresh report of links.
             stale: What the manager last saw says nothing of now.
         """
         if link is None:
@@ -312,7 +311,6 @@ class PoolStatus:
 
         Args:
             report: Its last report, however old.
-            proxy_alive: Whether it runs now.
             links: What is known of links now; None for nothing.
             stale: What the manager last saw says nothing of now.
         """
