@@ -11,7 +11,7 @@ import typer
 
 from fogft import __version__
 from fogft.cli import options, output
-from fogft.cli.options import DEFAULT_FILE, PoolArgument, PoolFile, PoolOption
+from fogft.cli.options import DEFAULT_FILE, Cloud, PoolArgument, PoolFile, PoolOption, Yes
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
@@ -54,16 +54,8 @@ def init(
 
 def up(
     file: PoolFile = DEFAULT_FILE,
-    cloud: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Cloud to run on; by default the one in the file, else `local`.",
-        ),
-    ] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Skip the confirmation. The local cloud never asks.")
-    ] = False,
+    cloud: Cloud = None,
+    yes: Yes = False,
     timeout: Annotated[
         float | None,
         typer.Option(
@@ -177,12 +169,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
 
 def down(
     pool: PoolArgument = None,
-    yes: Annotated[
-        bool,
-        typer.Option(
-            "--yes", "-y", help="Skip the confirmation. Without a terminal there is none."
-        ),
-    ] = False,
+    yes: Yes = False,
     named: PoolOption = None,
 ) -> None:
     """Shut down a pool: its replicas, client proxy and manager.

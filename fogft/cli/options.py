@@ -82,3 +82,11 @@ Slot = Annotated[
 PoolFile = Annotated[Path, typer.Argument(metavar="FILE", help="The pool file.")]
 DEFAULT_FILE = Path("pool.yaml")
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Cloud = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Cloud; by default the one in the file, else `local`."),
+]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the confirmation, if there is any.")]
+Plot = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Plot to a PNG, SVG or PDF file as well.")
+]

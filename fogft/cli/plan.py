@@ -8,18 +8,12 @@ from typing import Annotated
 import typer
 
 from fogft.cli import output
-from fogft.cli.options import DEFAULT_FILE, AsJson, PoolFile
+from fogft.cli.options import DEFAULT_FILE, AsJson, Cloud, Plot, PoolFile
 
 
 def plan(  # noqa: PLR0917 - Typer reads the command line from them
     file: PoolFile = DEFAULT_FILE,
-    cloud: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Cloud to take prices from; by default the one in the file, else `local`.",
-        ),
-    ] = None,
+    cloud: Cloud = None,
     prices: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Take prices from a CSV file in SkyPilot's format."),
@@ -31,10 +25,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         bool, typer.Option("--all", help="Show every offer, not just the best of each region.")
     ] = False,
     as_json: AsJson = False,
-    plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Plot price over round trip to a PNG, SVG or PDF file."),
-    ] = None,
+    plot: Plot = None,
 ) -> None:
     """Show what a pool file would launch, where, why, and at what price."""
     from fogft.cli import plan_text

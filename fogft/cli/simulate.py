@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fogft.cli import output
-from fogft.cli.options import AsJson
+from fogft.cli.options import AsJson, Cloud, Plot
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -44,14 +44,8 @@ def simulate(
     first_seed: Annotated[
         int, typer.Option(min=0, metavar="N", help="Seed of the first market.")
     ] = 0,
-    cloud: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Cloud to take prices from; by default the pool file's."),
-    ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Plot the results to a PNG, SVG or PDF file."),
-    ] = None,
+    cloud: Cloud = None,
+    plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a pool in spot markets, next to fixed policies.

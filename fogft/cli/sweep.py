@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fogft.cli import output
+from fogft.cli.options import Yes
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
@@ -19,9 +20,7 @@ def sweep(
     end: Annotated[
         bool, typer.Option("--end", help="End the machines found, after asking.")
     ] = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="With --end: skip the confirmation.")
-    ] = False,
+    yes: Yes = False,
     cloud: Annotated[
         str | None,
         typer.Option(

@@ -17,7 +17,7 @@ from typing import Any
 from fogft import disk, template_files
 from fogft.cloud.port import Launch
 from fogft.model.credentials import NAME_LIMIT, CredentialPaths, Holder, Role, holder_of
-from fogft.model.groups import FIRST_BY_HAND, replica_hash, task_at
+from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.proxy_config import ClientProxyConfig, RendezvousConfig, ServerProxyConfig
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
@@ -26,6 +26,7 @@ from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
+from fogft.pool.manager.reconciler import bare_order
 from fogft.poolfile import config_file
 
 # What a certificate lasts beyond the end of a pool that has one.
@@ -135,13 +136,10 @@ def build_order(
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
     holder = holder_of(id.certificate_name)
     issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
-    return Launch(
-        id=id,
-        pool=identity.name,
-        placement=planned.offer.placement,
-        usd_per_hour=planned.offer.usd_per_hour,
-        spec_hash=replica_hash(spec, id.slot),
-        task=with_build(absolute(task_at(spec, id.slot), Path(identity.file).parent)),
+    bare = bare_order(identity, spec, planned)
+    return replace(
+        bare,
+        task=with_build(absolute(bare.task, Path(identity.file).parent)),
         files={
             "replica.yaml": replica_config(
                 identity, spec, id, announcements=bool(announcements)
@@ -151,8 +149,6 @@ def build_order(
             "replica.key": issued.key_pem,
             **({paths.announcements.name: announcements} if announcements else {}),
         },
-        link_port=spec.link_port,
-        dials_out=bool(spec.dial_in),
     )
 
 

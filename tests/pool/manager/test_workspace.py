@@ -18,7 +18,7 @@ def folder(tmp_path):
 
 def test_a_workspace_without_setup_is_built(folder):
     task = {"workdir": str(folder), "run": "x"}
-    script = (template_files.folder() / "configuration.sh").read_text()
+    script = (template_files.folder() / "workspace.sh").read_text()
     assert configuration.with_build(task) == {**task, "setup": script}
 
 
