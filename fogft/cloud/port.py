@@ -38,6 +38,8 @@ class Launch:
     limit_usd_per_hour: float | None = None
     # The replica dials its robots: nobody reaches it, so no port need be open.
     dials_out: bool = False
+    # The networks that may connect to it, where the cloud can hold that; none for all.
+    allow_from: tuple[str, ...] = ()
 
 
 class Cloud(Protocol):
@@ -107,8 +109,15 @@ class Accounts(Protocol):
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
         """Return, in sentences, what may keep launches from working until a time; None for ever."""
 
-    def exposures(self, clouds: Sequence[str], *, open_port: int | None) -> Sequence[str]:
+    def exposures(
+        self, clouds: Sequence[str], *, open_port: int | None, allow_from: Sequence[str] = ()
+    ) -> Sequence[str]:
         """Return, in sentences, what machines there are given or open to that they need not be.
+
+        Args:
+            clouds: Where they may be.
+            open_port: The link's; None where the replicas dial out.
+            allow_from: See `Launch`.
 
         Raises CloudError: it cannot be told now.
         """

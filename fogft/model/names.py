@@ -10,6 +10,7 @@ Source: FogROS2-SGC's construction of identifiers, extended to connections by Fo
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 import re
 from typing import Annotated
 
@@ -97,6 +98,15 @@ def is_endpoint(text: str) -> bool:
     if not host.isascii() or not host.isprintable():
         return False
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
+
+
+def network(text: str) -> str:
+    """Return an address or a network (``203.0.113.0/24``) as a network.
+
+    Raises:
+        ValueError: It is neither, or the address has more bits than the network.
+    """
+    return str(ipaddress.ip_network(text))
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:

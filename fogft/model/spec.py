@@ -43,7 +43,7 @@ from fogft.model.keys import (
     key,
     only,
 )
-from fogft.model.names import LINK_PORT, is_endpoint
+from fogft.model.names import LINK_PORT, is_endpoint, network
 from fogft.model.ros_names import (
     absolute_service_name,
     is_field_name,
@@ -401,6 +401,20 @@ class PoolSpec:
         default=LINK_PORT,
         advanced=True,
     )
+    allow_from: tuple[str, ...] = key(
+        Listed(
+            Text(
+                "an address or a network",
+                "write a list, such as `allow_from: [203.0.113.7, 198.51.100.0/24]`",
+                network,
+            ),
+            20,
+        ),
+        "Who may connect to a replica's VM, to ssh's port too: the public addresses of the robots "
+        "and of the computer that SkyPilot's API server runs on. Held on AWS only.",
+        default=(),
+        usual="anyone",
+    )
     topology: Topology = key(
         Map(Topology),
         "Gateways, and who uses them. Needs a `rendezvous`.",
@@ -496,6 +510,8 @@ class PoolSpec:
             asked["connectivity"] = [self.rendezvous, self.dial_in]
         if self.link_port != LINK_PORT:
             asked["link_port"] = self.link_port
+        if self.allow_from:
+            asked["allow_from"] = self.allow_from
         if self.rmw.replica is not Speaks.RCLPY:
             asked["rmw"] = self.rmw.replica.value
         kinds = _kinds_of_machine(resources)

@@ -33,6 +33,7 @@ class _Launch:
     request: Request
     name: str
     task: Mapping[str, Any]
+    group: str = ""
     error: RefusedError | None = None
     job: int = 1
 
@@ -74,6 +75,10 @@ class ScriptedProvider:
             self.terminated.append(instance.key)
             self.found.pop(instance.key, None)
 
+    def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
+        self._meet()
+        return f"{region} {sorted(ports)} {sorted(sources)}"
+
     def credentials_end_at(self) -> float | None:
         return self.ends_at
 
@@ -97,6 +102,7 @@ class ScriptedSky:
         self.records: dict[str, Cluster] = {}
         self.jobs: dict[str, JobState] = {}
         self.job_logs: dict[str, str] = {}
+        self.provision_logs: dict[str, str] = {}
         self.calls: list[tuple[str, str]] = []
         self.down_fails = 0  # so many times "down" returns an error
         self.down_lies = False  # "down" returns, and the machine runs on
@@ -119,10 +125,10 @@ class ScriptedSky:
 
     # -- the surface --------------------------------------------------------------------------
 
-    def launch(self, task: Mapping[str, Any], name: str) -> str:
+    def launch(self, task: Mapping[str, Any], name: str, group: str = "") -> str:
         self._meet("launch", name)
         request = Request(f"r{next(self._counter)}", active=True)
-        self.launched.append(_Launch(request, name, task))
+        self.launched.append(_Launch(request, name, task, group))
         self._meet("launch-heard", name)
         return request.id
 
@@ -176,7 +182,7 @@ class ScriptedSky:
         return self.job_logs.get(name, "")
 
     def provision_log(self, name: str, lines: int) -> str:
-        return f"provisioning {name}"
+        return self.provision_logs.get(name, f"provisioning {name}")
 
     def down(self, name: str) -> None:
         self._meet("down", name)

@@ -635,8 +635,8 @@ def test_a_replica_ended_by_another_process_while_it_was_ordered_does_not_run(
 ):
     real = scene.sky.launch
 
-    def launch(task: dict, name: str) -> str:
-        request = real(task, name)
+    def launch(task: dict, name: str, group: str) -> str:
+        request = real(task, name, group)
         scene.another_process().terminate(ID)
         scene.sky.boot(name)  # SkyPilot was a moment too fast for the abort
         return request
@@ -645,6 +645,41 @@ def test_a_replica_ended_by_another_process_while_it_was_ordered_does_not_run(
     scene.cloud.launch(scene.order())
     assert not scene.provider.found
     assert not scene.machines()
+
+
+UNAVAILABLE = "ResourcesUnavailableError", "Failed to acquire resources in us-east-1a"
+EXIT = "SystemExit", "1"
+
+
+@pytest.mark.parametrize(
+    ("log", "cause", "kind", "text"),
+    [
+        (
+            "D (UnauthorizedOperation) User: lab is not authorized to perform",
+            Cause.CREDENTIALS,
+            *UNAVAILABLE,
+        ),
+        ("D (AccessDenied) when calling GetInstanceProfile", Cause.CREDENTIALS, *EXIT),
+        ("D (VcpuLimitExceeded) more vCPU capacity than your limit", Cause.QUOTA, *UNAVAILABLE),
+        (
+            "D (InsufficientInstanceCapacity) there is no Spot capacity",
+            Cause.CAPACITY,
+            *UNAVAILABLE,
+        ),
+        ("I nothing to the point", Cause.CAPACITY, *UNAVAILABLE),
+    ],
+)
+def test_what_skypilot_keeps_to_its_log_decides_why_a_launch_failed(
+    scene: Scene, log: str, cause: Cause, kind: str, text: str
+):
+    """Its error says "no resources" of all of these, or "1", and nothing of what AWS said."""
+    scene.cloud.launch(scene.order())
+    scene.sky.provision_logs[NAME] = f"{log}\nI Terminating the failed cluster.\n"
+    scene.sky.fail(NAME, kind, text)
+    scene.work()
+    failure = scene.machine().failure
+    assert failure is not None
+    assert failure.cause is cause
 
 
 # -- logs ---------------------------------------------------------------------------------------
@@ -676,10 +711,44 @@ def test_what_a_machine_need_not_have_is_told(scene: Scene):
     role, files, port = scene.cloud.exposures(["aws"], open_port=7448)
     assert role == "the role may do anything"
     assert "`~/.lambda_cloud/lambda_keys`" in files
-    assert "port 7448 of every VM is open to the world" in port
+    assert "port 7448 of every VM (mutual TLS) and ssh's port (keys only) are open" in port
     assert scene.cloud.exposures(["gcp"], open_port=None) == [files], "of the clouds asked about"
     scene.sky.uploaded = None
     assert "the API server elsewhere decides" in scene.cloud.exposures(["gcp"], open_port=None)[0]
+
+
+# -- who may connect ----------------------------------------------------------------------------
+
+LAB = ("203.0.113.0/24",)
+
+
+@pytest.mark.parametrize(("dials_out", "ports"), [(False, "[22, 7448]"), (True, "[22]")])
+def test_a_machine_lets_in_whom_its_pool_names_and_nobody_else(
+    scene: Scene, dials_out: bool, ports: str
+):
+    scene.cloud.launch(scene.order(allow_from=LAB, dials_out=dials_out))
+    scene.cloud.launch(scene.order(replica(1)))
+    assert [one.group for one in scene.sky.launched] == [f"us-east-1 {ports} {list(LAB)}", ""]
+
+
+def test_where_nobody_can_be_kept_out_nothing_is_launched(scene: Scene):
+    scene.provider.allowed = False
+    with pytest.raises(CloudError, match=r"`fogft\.allow_from` cannot be held in `aws/us-east-1"):
+        scene.cloud.launch(scene.order(allow_from=LAB))
+    scene.provider.allowed, scene.provider.reachable = True, False
+    with pytest.raises(CloudUnreachable):
+        scene.cloud.launch(scene.order(allow_from=LAB))
+    assert not scene.sky.launched
+    assert not scene.cloud.journal.entries()
+
+
+def test_a_cloud_that_lets_everybody_in_all_the_same_is_told(scene: Scene):
+    (told,) = scene.cloud.exposures(["aws", "gcp"], open_port=None, allow_from=LAB)
+    assert told.startswith("on `gcp`, ssh's port")
+    assert scene.cloud.exposures(["aws"], open_port=7448, allow_from=LAB) == []
+    elsewhere = scene.order(place=Placement("gcp", "us-east1", "", "n2"), allow_from=LAB)
+    scene.cloud.launch(elsewhere)
+    assert scene.sky.launched[-1].group == ""
 
 
 # -- ports ------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.provider import NotAllowedError
-from fogft.errors import CloudUnreachable
+from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import ReplicaId
 from tests.needs import needs
 from tests.sky.scripted_sky import replica
@@ -101,6 +101,64 @@ def test_live_prices_are_of_each_zone(account: None):
     assert {kind for _, kind in prices} == {"m5.large"}
     assert all(zone.startswith("us-east-1") for zone, _ in prices)
     assert all(price > 0 for price in prices.values())
+
+
+LAB = ("198.51.100.0/24", "2001:db8::/48")
+
+
+def groups(region: str = "us-east-1") -> dict[str, dict[str, Any]]:
+    """Return the security groups of fogft's own, by the VPC that they are in."""
+    import boto3
+
+    found = boto3.client("ec2", region_name=region).describe_security_groups()["SecurityGroups"]
+    return {group["VpcId"]: group for group in found if group["GroupName"].startswith("fogft-")}
+
+
+def let_in(group: dict[str, Any]) -> set[tuple[int, str]]:
+    return {
+        (one["FromPort"], source)
+        for one in group["IpPermissions"]
+        for source in (
+            *(found["CidrIp"] for found in one["IpRanges"]),
+            *(found["CidrIpv6"] for found in one["Ipv6Ranges"]),
+        )
+    }
+
+
+@needs("moto")
+def test_a_security_group_of_every_vpc_lets_in_those_networks_at_those_ports_alone(account: None):
+    import boto3
+
+    boto3.client("ec2", region_name="us-east-1").create_vpc(CidrBlock="10.9.0.0/16")
+    name = Aws().firewall("us-east-1", (22, 7448), LAB)
+    made = groups()
+    assert len(made) == 2
+    assert {group["GroupName"] for group in made.values()} == {name}
+    for group in made.values():
+        assert let_in(group) == {(port, network) for port in (22, 7448) for network in LAB}
+    assert Aws().firewall("us-east-1", (7448, 22), LAB[::-1]) == name
+    assert groups() == made, "asked again, nothing changes"
+    assert Aws().firewall("us-east-1", (22,), LAB) != name, "other rules, another group"
+
+
+@needs("moto")
+def test_a_security_group_is_completed_but_one_that_somebody_changed_is_refused(account: None):
+    import boto3
+
+    name = Aws().firewall("us-east-1", (22,), LAB)
+    (group,) = groups().values()
+    ec2 = boto3.client("ec2", region_name="us-east-1")
+    ec2.revoke_security_group_ingress(
+        GroupId=group["GroupId"], IpPermissions=group["IpPermissions"]
+    )
+    assert not let_in(*groups().values())
+    assert Aws().firewall("us-east-1", (22,), LAB) == name
+    assert groups() == {group["VpcId"]: group}
+    rule = {"IpProtocol": "tcp", "FromPort": 0, "ToPort": 65535,
+            "IpRanges": [{"CidrIp": "0.0.0.0/0"}]}  # fmt: skip
+    ec2.authorize_security_group_ingress(GroupId=group["GroupId"], IpPermissions=[rule])
+    with pytest.raises(CloudError, match=f"`{name}` .* was changed"):
+        Aws().firewall("us-east-1", (22,), LAB)
 
 
 ANYTHING = (

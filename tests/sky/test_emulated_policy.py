@@ -29,3 +29,9 @@ def test_a_permission_can_be_taken_away():
     policy.taken = {"ec2:Describe*"}
     assert not policy.allows("ec2:DescribeInstances", list)
     assert policy.allows("ec2:RunInstances", list)
+
+
+def test_what_may_be_tagged_is_judged_by_its_kind():
+    policy = Policy(statements(PAGE.read_text()))
+    assert policy.allows("ec2:CreateTags", list, "security-group")
+    assert not policy.allows("ec2:CreateTags", list, "subnet")

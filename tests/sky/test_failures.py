@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.cloud.sky.failures import classify, tail
+from fogft.cloud.sky.failures import classify, tail, told_last
 from fogft.model.reason import Cause
 
 UNAVAILABLE = "ResourcesUnavailableError"
@@ -68,3 +68,15 @@ def test_the_tail_leaves_out_who_spoke_and_what_skypilot_says_of_itself():
         "\x1b[32m✓ Job finished (status: FAILED_SETUP).\x1b[0m\n"
     )
     assert tail(log) == "no such package: yolo\n(not a speaker) stays"
+
+
+def test_of_a_launchs_log_the_last_try_counts():
+    log = (
+        "D create_instances: (InsufficientInstanceCapacity) when calling the RunInstances\n"
+        "D create_instances: (VcpuLimitExceeded) You have requested more vCPU\n"
+        "I Terminating the failed cluster.\n"
+    )
+    failure = told_last(log)
+    assert failure is not None
+    assert failure.cause is Cause.QUOTA
+    assert told_last("I Launching on AWS\n") is None

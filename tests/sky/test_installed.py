@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,12 +22,13 @@ import pytest
 
 from fogft.cloud.sky import answers, guard, settings, task
 from fogft.cloud.sky.installed import InstalledSky
+from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, Sale
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Placement
 from tests.needs import needs
 from tests.sky.scene import Scene
-from tests.sky.scripted_sky import EAST, ScriptedSky
+from tests.sky.scripted_sky import EAST, ScriptedSky, replica
 
 SURFACE = [name for name, member in vars(InstalledSky).items() if inspect.isfunction(member)]
 
@@ -182,6 +184,41 @@ def test_every_launch_asks_for_the_guard_once_after_the_users_own_commands(
         assert asked == ["echo mine", guard.command()]
         assert carried()["gcp"]["remote_identity"] == "NO_UPLOAD"
     assert carried()["allowed_clouds"] == ["aws"], "all else is as it was"
+
+
+@needs("skypilot")
+@pytest.mark.parametrize(
+    ("own", "kept"),
+    [([], []), (["aws.security_group_name=theirs"], [{"*": "theirs"}]),
+     (["aws.security_group_name=[{other-*: theirs}]"], [{"other-*": "theirs"}])],
+)  # fmt: skip
+def test_a_pool_that_says_who_may_connect_has_its_group_before_the_users_own(
+    real: tuple[InstalledSky, Any, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    own: list[str],
+    kept: list[dict[str, str]],
+):
+    """SkyPilot takes the first pattern that a cluster's name matches."""
+    from sky import skypilot_config
+    from sky.server.requests.payloads import get_override_skypilot_config_from_client as carried
+
+    installed, silent, _ = real
+    silent.launch.return_value = "r1"
+    monkeypatch.setattr("sky.utils.annotations.is_on_api_server", False)
+    skypilot_config.apply_cli_config(own)
+
+    def launched(generation: int, group: str) -> Any:
+        name = cluster_name(replica(0, generation))
+        installed.launch({"run": "serve"}, name, group)
+        return carried()["aws"].get("security_group_name", [])
+
+    for generation in (1, 2):
+        ours, *others = launched(generation, "fogft-0123")
+        (pattern,) = ours
+        assert fnmatchcase(cluster_name(replica(0, generation)), pattern)
+        assert not fnmatchcase("other-fogft", pattern)
+        assert (ours[pattern], others) == ("fogft-0123", kept)
+    assert launched(3, "") == kept, "the pool file names nobody any more"
 
 
 FILES_OF_CLOUDS = (

@@ -25,7 +25,7 @@ from fogft.cloud.sky.journal import ON_THE_MACHINE, UNDER_WAY, Entry, Journal, S
 from fogft.cloud.sky.naming import OWNER, cluster_name, label_value, replica_of
 from fogft.cloud.sky.presence import Presence
 from fogft.cloud.sky.prices import Prices
-from fogft.cloud.sky.provider import Provider
+from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
 from fogft.disk import write_whole
@@ -35,6 +35,7 @@ from fogft.model.replica import Machine, Offer, ReplicaId
 
 log = logging.getLogger(__name__)
 
+SSH_PORT = 22
 _LOG_LINES = 1000
 _ENDS_FRESH_S = 60.0
 
@@ -68,7 +69,7 @@ class SkyCloud:
     make_wheel: Callable[[Path], Path] = wheel.make
 
     def __post_init__(self) -> None:
-        by_name = {provider.cloud: provider for provider in self.providers}
+        self._providers = by_name = {provider.cloud: provider for provider in self.providers}
         sky, clock, submit = self.sky, self.clock, self.submit
         self.journal = journal = Journal(self.folder / "launches")
         self._census = Census(by_name, clock, submit)
@@ -100,6 +101,7 @@ class SkyCloud:
 
     def launch(self, order: Launch) -> None:
         """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
+        group = self._firewall(order)
         instead = self._prices.instead(order.placement, order.limit_usd_per_hour)
         made = task.build(
             order,
@@ -118,7 +120,7 @@ class SkyCloud:
         if not self.journal.open(begun, order.files):
             return
         try:
-            request = self.sky.launch(made, cluster_name(order.id))
+            request = self.sky.launch(made, cluster_name(order.id), group)
         except RefusedError as error:
             self.journal.close(order.id)
             raise _refusal(error, order) from error
@@ -196,7 +198,9 @@ class SkyCloud:
         """See `Accounts`."""
         return self._prices.left_out()
 
-    def exposures(self, clouds: Sequence[str], *, open_port: int | None) -> Sequence[str]:
+    def exposures(
+        self, clouds: Sequence[str], *, open_port: int | None, allow_from: Sequence[str] = ()
+    ) -> Sequence[str]:
         """See `Accounts`."""
         files = self.sky.uploaded_credentials(clouds)
         found = [one.warning() for one in self.providers if one.cloud in clouds or not clouds]
@@ -211,10 +215,17 @@ class SkyCloud:
                 f"SkyPilot gives every VM these files of yours, and its own ssh key: {listed}. It "
                 "has no setting against that: move them away where a replica must not have them"
             )
-        if open_port:
+        held = self._providers.keys() if allow_from else ()
+        world = ", ".join(f"`{one}`" for one in clouds if one not in held)
+        if world and (open_port or allow_from):
+            port = f"port {open_port} of every VM (mutual TLS) and " if open_port else ""
             found.append(
-                f"port {open_port} of every VM is open to the world (mutual TLS), as is ssh's "
-                "(keys only): SkyPilot cannot say who may connect. `fogft.dial_in` opens no port"
+                f"on {world}, {port}ssh's port (keys only) are open to the world: "
+                + (
+                    "SkyPilot cannot hold `fogft.allow_from` there"
+                    if allow_from
+                    else "`fogft.allow_from` names who may connect, on AWS"
+                )
             )
         return [one for one in found if one]
 
@@ -251,6 +262,21 @@ class SkyCloud:
 
     def _mine(self, labels: Mapping[str, str]) -> bool:
         return labels.get(OWNER, label_value(self.owner)) == label_value(self.owner)
+
+    def _firewall(self, order: Launch) -> str:
+        """Return the name of what holds an order's `allow_from`; empty for nothing."""
+        place = order.placement
+        provider = self._providers.get(place.cloud)
+        if provider is None or not order.allow_from:
+            return ""
+        ports = (SSH_PORT,) if order.dials_out else (SSH_PORT, order.link_port)
+        try:
+            return provider.firewall(place.region, ports, order.allow_from)
+        except NotAllowedError as error:
+            raise CloudError(
+                f"`fogft.allow_from` cannot be held in `{place.location}`: {error}",
+                "allow what docs/how-to/clouds.md lists, on the computer of the manager too",
+            ) from error
 
     # -- launches under way -------------------------------------------------------------------
 

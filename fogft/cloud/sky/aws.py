@@ -1,7 +1,8 @@
 """AWS by its own interface (boto3, which comes with SkyPilot's AWS support). See `provider`.
 
-Only `describe` calls, and `TerminateInstances` on instances whose tags were just read and are
-ours. Credentials and regions come from the same places as SkyPilot's.
+Only `describe` calls, `TerminateInstances` on instances whose tags were just read and are ours,
+and security groups that are named for what they let in. Credentials and regions come from the
+same places as SkyPilot's.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import itertools
 import json
 import os
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,7 +24,7 @@ from typing import Any, TypeVar
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.failures import classify
 from fogft.cloud.sky.provider import Instance, NotAllowedError
-from fogft.errors import CloudUnreachable
+from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.reason import Cause
 from fogft.model.replica import Placement
 
@@ -77,6 +78,23 @@ class Aws:
         """See `Provider`."""
         for instance in instances:  # one by one: a single unknown key fails a whole call
             self._ask(instance.placement.region, functools.partial(_terminate, instance.key))
+
+    def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
+        """See `Provider`. A security group in each VPC: SkyPilot decides which one a machine is in.
+
+        Named for its rules, it serves all pools that have the same, and is never changed.
+        """
+        rules = {(port, source) for port in ports for source in sources}
+        name = f"fogft-{hashlib.sha256(repr(sorted(rules)).encode()).hexdigest()[:16]}"
+        made = self._ask(region, functools.partial(_firewalls, name, rules))
+        for group, found in made.items():
+            if found != rules:
+                raise CloudError(
+                    f"the security group `{name}` ({group}) in `aws/{region}` was changed: it no "
+                    "longer lets in exactly what `fogft.allow_from` names",
+                    "delete it, and fogft makes it anew",
+                )
+        return name
 
     def credentials_end_at(self) -> float | None:
         """See `Provider`. Of a login by `aws sso login`, or of what says when it ends.
@@ -230,10 +248,59 @@ def _moment(text: str) -> float:
 
 
 def _terminate(key: str, ec2: Any) -> None:
-    try:
+    with _unless("InvalidInstanceID.NotFound"):
         ec2.terminate_instances(InstanceIds=[key])
+
+
+def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> dict[str, Any]:
+    """Make a security group in each VPC that has none, with its rules; return all rules by group.
+
+    One whose making was interrupted has none, and gets them.
+    """
+
+    def groups() -> list[Any]:
+        by_name = [{"Name": "group-name", "Values": [name]}]
+        return list(ec2.describe_security_groups(Filters=by_name)["SecurityGroups"])
+
+    missing = {vpc["VpcId"] for vpc in ec2.describe_vpcs()["Vpcs"]}
+    for vpc in sorted(missing - {group["VpcId"] for group in groups()}):
+        with _unless("InvalidGroup.Duplicate"):
+            ec2.create_security_group(GroupName=name, Description="fogft", VpcId=vpc)
+    for group in groups():
+        if not group["IpPermissions"]:
+            with _unless("InvalidPermission.Duplicate"):
+                ec2.authorize_security_group_ingress(
+                    GroupId=group["GroupId"],
+                    IpPermissions=[_permission(*rule) for rule in sorted(rules)],
+                )
+    return {group["GroupId"]: set(_let_in(group["IpPermissions"])) for group in groups()}
+
+
+def _permission(port: int, source: str) -> dict[str, Any]:
+    ranges = {"Ipv6Ranges": [{"CidrIpv6": source}]} if ":" in source else {}
+    ranges = ranges or {"IpRanges": [{"CidrIp": source}]}
+    return {"IpProtocol": "tcp", "FromPort": port, "ToPort": port, **ranges}
+
+
+def _let_in(permissions: Iterable[Mapping[str, Any]]) -> Iterator[tuple[Any, str]]:
+    """Yield the rules of a group: a port and who may connect to it, other text for any others."""
+    for one in permissions:
+        ports = one.get("FromPort"), one.get("ToPort")
+        tcp = one["IpProtocol"] == "tcp" and ports[0] == ports[1]
+        sources = [found["CidrIp"] for found in one.get("IpRanges", ())]
+        sources += [found["CidrIpv6"] for found in one.get("Ipv6Ranges", ())]
+        others = one.get("UserIdGroupPairs") or one.get("PrefixListIds") or ()
+        for source in (*sources, *map(str, others)):
+            yield ports[0] if tcp else ports, source
+
+
+@contextlib.contextmanager
+def _unless(code: str) -> Iterator[None]:
+    """Pass over an error of AWS's that says that it is so already."""
+    try:
+        yield
     except Exception as error:
-        if "InvalidInstanceID.NotFound" not in str(error):
+        if code not in str(error):
             raise
 
 

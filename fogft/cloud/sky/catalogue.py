@@ -47,10 +47,8 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
         for cloud in enabled if one.cloud is None else [one.cloud]:
             name, wanted = str(cloud).lower(), one.copy(cloud=cloud)
             reason = missing(cloud, wanted)
-            found = [] if reason else _machines(cloud, wanted)
-            if not found:
-                left_out.setdefault(name, reason or "it sells nothing that fits")
-            for machine in found:
+            left_out.setdefault(name, reason or "it sells nothing that fits")
+            for machine in [] if reason else _machines(cloud, wanted):
                 for place, price in _sold(name, machine):
                     prices[place] = min(prices.get(place, price), price)
                     key = place.instance, place.spot

@@ -1,8 +1,8 @@
 """What a failed launch means: capacity, quota, credentials, setup, timeout or error. Pure.
 
-SkyPilot reports a refused launch as one exception with a history of others, and passes the
-clouds' own codes on in their texts. The codes decide, not the exception's class: a region
-without spot capacity and an account without quota come in the same class.
+SkyPilot reports a refused launch as one exception with a history of others. The clouds' own codes
+stand in their texts or, as AWS's do, in the log of the launch only. The codes decide, not the
+exception's class: no capacity, no quota and no permission come in the same class.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ _CODES: tuple[tuple[Cause, str], ...] = (
         r"|SpotMaxPriceTooLow|Unsupported.{0,80}Availability Zone|ZONE_RESOURCE_POOL_EXHAUSTED"
         r"|resourceExhausted|does not have enough resources|SkuNotAvailable|AllocationFailed"
         r"|OverconstrainedAllocationRequest|OverconstrainedZonalAllocation"
-        r"|(?i:no (spot )?capacity)|(?i:insufficient capacity)|(?i:out of capacity)",
+        r"|(?i:no (spot )?capacity)|(?i:insufficient capacity)|(?i:out of capacity)"
+        r"|no longer any instances available",
     ),
 )
 _KINDS = {
@@ -56,6 +57,12 @@ def classify(kind: str, texts: Iterable[str]) -> Reason:
                 return Reason(cause, words=_short(text, pattern))
     words = _short(told[-1] if told else kind, "")
     return Reason(_KINDS.get(kind, Cause.ERROR), words=words)
+
+
+def told_last(log: str) -> Reason | None:
+    """Return the last failure that a launch's log has a cloud's code of; None where it has none."""
+    found = (classify("", [line]) for line in reversed(log.splitlines()))
+    return next((failure for failure in found if failure.cause is not Cause.ERROR), None)
 
 
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")

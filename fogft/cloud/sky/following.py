@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fogft.cloud.sky.ending import Ending
-from fogft.cloud.sky.failures import tail
+from fogft.cloud.sky.failures import tail, told_last
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import UNDER_WAY, Entry, Journal, Stage
 from fogft.cloud.sky.naming import MAPPING_CLOUDS, cluster_name
@@ -34,6 +34,7 @@ on the machine over ssh, in one of its few workers, and holds up whoever wants s
 same machine: it takes some ten seconds of processor time. So nobody asks before `setup` can have
 ended, and the pause grows with the time that an answer takes."""
 
+_TRIES_LINES = 400  # of a launch's log: what its last tries have come to
 ASK_LIMIT_S = 180.0
 """Until SkyPilot has accepted the order; then it is known that it never will."""
 LAUNCH_LIMIT_S = 900.0
@@ -163,6 +164,9 @@ class Following:
             return Reason(cause, words=failure.words + log_tail)
         if error.kind == "RequestCancelled":
             return Reason(Cause.ERROR, words="the launch was cancelled")
+        if error.kind == "ResourcesUnavailableError" or failure.cause is Cause.ERROR:
+            log = self.sky.provision_log(cluster_name(entry.id), _TRIES_LINES)
+            return told_last(log) or failure
         return failure
 
     def _hung(self, entry: Entry, limit_s: float, doing: str) -> Reason:

@@ -18,6 +18,7 @@ from typing import Any, TypeVar, cast
 from fogft.cloud.sky import catalogue
 from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
 from fogft.cloud.sky.calls import Calls
+from fogft.cloud.sky.naming import replica_of
 from fogft.cloud.sky.sdk import Cluster, JobState, RefusedError, Request, Sale
 from fogft.cloud.sky.settings import Settings, report_nothing
 from fogft.errors import CloudError
@@ -60,12 +61,19 @@ class InstalledSky:
         self._settings = Settings()
 
     @_limited(LAUNCH_LIMIT_S, "the launch of `{1}`")
-    def launch(self, task: Mapping[str, Any], name: str) -> str:
-        """Order a cluster; return the request's id, long before the cluster runs."""
+    def launch(self, task: Mapping[str, Any], name: str, group: str = "") -> str:
+        """Order a cluster; return the request's id, long before the cluster runs.
+
+        Args:
+            task: The task, as SkyPilot reads it.
+            name: The cluster's name.
+            group: The security group that it is in, on AWS; empty for SkyPilot's own.
+        """
         sky, sdk = self._sky()
         with as_answer():
             made = sky.Task.from_yaml_config(dict(task))
-        self._settings.apply([str((task.get("resources") or {}).get("infra", "")).split("/")[0]])
+        cloud = str((task.get("resources") or {}).get("infra", "")).split("/")[0]
+        self._settings.apply([cloud], replica_of(name), group)
         return str(sdk.launch(made, cluster_name=name))
 
     @_limited(ASK_LIMIT_S, "the requests of `{0}`")

@@ -50,6 +50,12 @@ class Provider(Protocol):
     def terminate(self, instances: Iterable[Instance]) -> None:
         """Ask for the end of instances. Those that are gone are no error."""
 
+    def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
+        """See to what lets only some networks reach some ports; return its name for SkyPilot.
+
+        Repeatable. Raises `CloudError` where something else goes by that name.
+        """
+
     def warning(self) -> str:
         """Return what a VM there may do that it need not; empty where nothing is known."""
 

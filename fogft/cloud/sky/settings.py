@@ -5,7 +5,9 @@ every cloud that they exist for, and with any of them SkyPilot's own ssh key. Us
 A request carries these settings to the API server. To one elsewhere it carries the guard only:
 which of its own credentials that server gives away its administrator has decided.
 
-Not here: which roles and ports a VM has (`aws`, `task`).
+A pool that says who may connect has a security group named for its clusters, before the user's own.
+
+Not here: which roles, ports and security groups a VM has (`aws`, `task`).
 """
 
 from __future__ import annotations
@@ -17,11 +19,13 @@ import threading
 from collections.abc import Iterable
 from typing import Any
 
-from fogft.cloud.sky import guard
+from fogft.cloud.sky import guard, naming
+from fogft.model.replica import ReplicaId
 
 NO_UPLOAD, UPLOAD = "NO_UPLOAD", "LOCAL_CREDENTIALS"
 ENDED_BY_FILES = frozenset({"nebius", "oci", "vast"})
 """Clouds whose VMs have no identity of their own: to end itself one needs its cloud's files."""
+GROUP = ("aws", "security_group_name")  # by patterns of clusters' names
 NO_REPORTS = "SKYPILOT_DISABLE_USAGE_COLLECTION"
 
 
@@ -38,12 +42,20 @@ class Settings:
         self._set: dict[str, str] = {}  # cloud -> what was written here, and not by the user
         self._launched: set[str] = set()
 
-    def apply(self, clouds: Iterable[str]) -> None:
-        """Set what a launch on some clouds is to have; the user's own commands come first."""
+    def apply(self, clouds: Iterable[str], id: ReplicaId | None = None, group: str = "") -> None:
+        """Set what a launch on some clouds is to have; the user's own commands come first.
+
+        Args:
+            clouds: Where it may be.
+            id: The replica that is launched; None where nothing is.
+            group: The security group of its pool's machines; empty for SkyPilot's own.
+        """
         config = importlib.import_module("sky.skypilot_config")
         with self._lock:
             self._launched |= ENDED_BY_FILES.intersection(clouds)
             changes: list[str] = []
+            if id is not None:
+                changes += _with_group(config, naming.clusters_of(id.pool_uid), group)
             given = list(config.get_nested(guard.SETTING, []) or [])
             if guard.command() not in given:
                 value = json.dumps([*given, guard.command()])
@@ -70,6 +82,16 @@ class Settings:
         kept = [one for name, one in known.items() if _identity(config, name) == NO_UPLOAD]
         mounts = importlib.import_module("sky.check").get_cloud_credential_file_mounts(kept)
         return sorted(mounts)
+
+
+def _with_group(config: Any, clusters: str, group: str) -> list[str]:
+    """Return the change that gives clusters a security group, if there is one to make."""
+    found = config.get_nested(GROUP, None) or []
+    given = [{"*": found}] if isinstance(found, str) else list(found)
+    wanted = [one for one in given if clusters not in one]
+    if group:
+        wanted.insert(0, {clusters: group})
+    return [] if wanted == given else [f"{'.'.join(GROUP)}={json.dumps(wanted)}"]
 
 
 def _is_elsewhere() -> bool:

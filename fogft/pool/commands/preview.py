@@ -123,7 +123,9 @@ def order(
                     usable, None if hours is None else now + hours * HOUR_S
                 )
                 notes += concrete.exposures(
-                    usable, open_port=None if spec.dial_in else spec.link_port
+                    usable,
+                    open_port=None if spec.dial_in else spec.link_port,
+                    allow_from=spec.allow_from,
                 )
             except CloudError as error:
                 notes.append(f"what a VM is given cannot be told now: {error.message}")

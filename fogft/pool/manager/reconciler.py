@@ -96,6 +96,7 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
         task=task_at(spec, planned.slot),
         link_port=spec.link_port,
         dials_out=bool(spec.dial_in),
+        allow_from=spec.allow_from,
     )
 
 

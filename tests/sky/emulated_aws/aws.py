@@ -49,6 +49,7 @@ from moto.server import ThreadedMotoServer
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parents[2]))
+from tests.sky.emulated_aws.http_answers import Answers  # noqa: E402
 from tests.sky.emulated_aws.policy import OF_VMS, PAGE, Policy, statements  # noqa: E402
 
 IMAGE = Path(os.environ["EMULATION"])
@@ -136,6 +137,39 @@ class World:
                 backend.terminate_instances([id])
 
 
+def let_in(instance: Any) -> str:
+    """Return the rules of a VM's security groups, as nftables reads them."""
+    rules = []
+    for group in instance.security_groups:
+        for rule in group.ingress_rules:
+            ports = f"{rule.from_port}-{rule.to_port}" if rule.ip_protocol == "tcp" else "0-65535"
+            for source in rule.ip_ranges:
+                rules.append(f"ip saddr {source['CidrIp']} tcp dport {ports} accept")
+    return "\n".join(
+        (
+            "flush ruleset", "table inet groups {", "chain input {",
+            "type filter hook input priority 0; policy drop;",
+            "ct state established,related accept", "iif lo accept", *sorted(rules), "}", "}\n",
+        )
+    )  # fmt: skip
+
+
+def hold_groups() -> None:
+    """See to it that every VM lets in what its security groups say, as they change."""
+    held: dict[str, str] = {}
+    while True:
+        for _, _, instance in list(all_instances()):
+            rules = let_in(instance)
+            if instance.id in WORLD.vms and held.get(instance.id) != rules:
+                words = ["ip", "netns", "exec", f"f{instance.id[-8:]}", "nft", "-f", "-"]
+                done = subprocess.run(words, input=rules.encode(), check=False, capture_output=True)
+                if done.returncode == 0:  # else its network is not there yet
+                    held[instance.id] = rules
+                elif b"syntax" in done.stderr:
+                    raise AssertionError(f"nftables does not understand: {rules}")
+        time.sleep(0.2)
+
+
 WORLD = World()
 
 
@@ -173,7 +207,10 @@ def patch_moto() -> None:
                 f"There is no Spot capacity available that matches your request in {zone}.",
             )
         made = run(self, image, count, data, groups, **kw)
+        named = [id for card in kw.get("nics") or [] for id in card.get("Groups") or []]
         for instance in made.instances:
+            # moto keeps these with the network interface only.
+            instance.security_groups = list(map(self.get_security_group_from_id, named))
             WORLD.boot(instance)
         return made
 
@@ -191,7 +228,7 @@ def enforce() -> None:
     call = BaseResponse.call_action
 
     def call_action(self: Any) -> Any:
-        action = f"{self.service_name}:{self._get_action()}"
+        action = f"{self.service_name.replace('-', '')}:{self._get_action()}"
         mine = flask.request.remote_addr == "127.0.0.1"
 
         def tags() -> list[dict[str, str]]:
@@ -199,8 +236,14 @@ def enforce() -> None:
             found = [i for _, _, i in all_instances() if i.id in wanted]
             return [{tag["key"]: tag["value"] for tag in one.get_tags()} for one in found]
 
-        if (LAUNCHER if mine else VM).allows(action, tags):
-            return call(self)
+        policy = LAUNCHER if mine else VM
+        if policy.allows(action, tags):
+            tagged = self._get_param("TagSpecifications", None)
+            tagged = tagged or self._get_param("TagSpecification", None) or []
+            kinds = {str(one["ResourceType"]) for one in tagged}
+            if all(policy.allows("ec2:CreateTags", tags, kind) for kind in kinds):
+                return call(self)
+            action = "ec2:CreateTags"
         who = "arn:aws:iam::123456789012:" + ("user/lab" if mine else "role/skypilot-v1")
         WORLD.say("denied", action=action, by=who)
         code, does = "AccessDenied", ""
@@ -212,7 +255,9 @@ def enforce() -> None:
         words = (
             f"{does}User: {who} is not authorized to perform: {action} because no identity-based "
         )
-        error = ServiceException(f"{words}policy allows the {action} action")
+        # moto tells by an exception's module in which service's words it is.
+        denied = type("Denied", (ServiceException,), {"__module__": type(self).__module__})
+        error = denied(f"{words}policy allows the {action} action")
         error.code = code
         return self.serialized(ActionResult(error))
 
@@ -249,20 +294,7 @@ def killing(method: Any) -> Any:
     return wrapped
 
 
-class Handler(BaseHTTPRequestHandler):
-    """Answers JSON or text, and logs nothing."""
-
-    def log_message(self, *_: Any) -> None: ...
-
-    def answer(self, body: Any, status: int = 200) -> None:
-        data = body.encode() if isinstance(body, str) else json.dumps(body).encode()
-        self.send_response(status)
-        self.send_header("content-length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-
-class Control(Handler):
+class Control(Answers, BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if self.path == "/log":
             return self.answer(WORLD.log)
@@ -301,7 +333,7 @@ class Control(Handler):
         return self.answer({})
 
 
-class Metadata(Handler):
+class Metadata(Answers, BaseHTTPRequestHandler):
     """Instance metadata, version 2 only: a request without a token is refused."""
 
     def do_PUT(self) -> None:
@@ -372,6 +404,7 @@ def main() -> None:
         os._exit(0)
 
     signal.signal(signal.SIGTERM, stop)
+    threading.Thread(target=hold_groups, daemon=True).start()
     metadata = ThreadingHTTPServer((METADATA, 80), Metadata)
     threading.Thread(target=metadata.serve_forever, daemon=True).start()
     ThreadingHTTPServer(("127.0.0.1", 5567), Control).serve_forever()

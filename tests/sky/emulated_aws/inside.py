@@ -23,6 +23,7 @@ def main() -> int:
         "AWS_EC2_METADATA_DISABLED": "true",
         "SKYPILOT_API_SERVER_LOCAL_PORT": "46999",
         "EMULATED_AWS": "http://127.0.0.1:5567",
+        "RUNPOD_API_BASE_URL": "http://127.0.0.1:5568",
         "PYTHONPATH": str(HERE.parents[2]),
     }
     subprocess.run([sys.executable, HERE / "home.py", environ["HOME"]], env=environ, check=True)
@@ -30,7 +31,7 @@ def main() -> int:
         aws = subprocess.Popen(
             [sys.executable, HERE / "aws.py"], env=environ, stdout=log, stderr=log
         )
-    servers = [aws]
+    servers = [aws, subprocess.Popen([sys.executable, HERE / "runpod_api.py"], env=environ)]
     try:
         wait_for(environ["EMULATED_AWS"] + "/instances", aws)
         if (EMULATION / "container").is_dir():

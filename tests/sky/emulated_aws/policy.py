@@ -1,8 +1,8 @@
 """The policy of docs/how-to/clouds.md, as the emulated AWS enforces it on whoever launches.
 
-Judged are an action's name, and of `TerminateInstances` whether what it ends carries our label.
-The VMs have the role's: `ec2:Describe*`, and `TerminateInstances` under the same condition. A test
-takes single permissions away.
+Judged are an action's name, of `CreateTags` what is tagged, and of `TerminateInstances` whether
+what it ends carries our label. The VMs have the role's: `ec2:Describe*`, and `TerminateInstances`
+under the same condition. A test takes single permissions away.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 
 PAGE = Path(__file__).parents[3] / "docs/how-to/clouds.md"
 ANYBODY = ("sts:GetCallerIdentity",)  # needs no permission on AWS
+_ACCOUNT = "arn:aws:ec2:us-east-1:ACCOUNT:"
 _CONDITION = {"Null": {"aws:ResourceTag/fogft-pool": "false"}}
 OF_VMS: list[Mapping[str, Any]] = [
     {"Action": "ec2:Describe*"},
@@ -44,14 +45,25 @@ class Policy:
         self._rules = list(rules)
         self.taken: set[str] = set()
 
-    def allows(self, action: str, tags: Callable[[], Iterable[Mapping[str, str]]]) -> bool:
-        """Whether an action is allowed; `tags` are those of each instance that it is about."""
+    def allows(
+        self, action: str, tags: Callable[[], Iterable[Mapping[str, str]]], kind: str = ""
+    ) -> bool:
+        """Whether an action is allowed.
+
+        Args:
+            action: Its name.
+            tags: Returns those of each instance that it is about.
+            kind: What is tagged with `CreateTags`, such as `volume`.
+        """
         if action in ANYBODY:
             return True
         if any(fnmatchcase(action, one) for one in self.taken):
             return False
         for rule in self._rules:
             if not any(fnmatchcase(action, one) for one in actions([rule])):
+                continue
+            tagged = f"{_ACCOUNT}{kind}/x"
+            if kind and not any(fnmatchcase(tagged, one) for one in rule["Resource"]):
                 continue
             condition = rule.get("Condition")
             if condition is None:

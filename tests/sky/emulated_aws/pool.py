@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -141,6 +142,14 @@ def open_ports(region: str, name: str) -> set[int]:
         for port in range(rule.get("FromPort", 0), rule.get("ToPort", 65535) + 1)
         if rule["IpRanges"] or rule["Ipv6Ranges"]
     }
+
+
+def reaches(host: str, port: int, source: str = "") -> bool:
+    """Whether a port of a VM answers, to one of this computer's addresses."""
+    with socket.socket() as one:
+        one.settimeout(5)
+        one.bind((source, 0))
+        return one.connect_ex((host, port)) == 0
 
 
 def clusters() -> set[str]:

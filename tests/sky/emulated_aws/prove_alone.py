@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +31,7 @@ from tests.sky.emulated_aws.pool import (
     machine_of,
     open_ports,
     processes,
+    reaches,
 )
 
 TEMPLATES = Path(__file__).resolve().parents[3] / "templates"
@@ -113,12 +113,6 @@ def up_and_left(pool: Pool) -> subprocess.Popen[bytes]:
 def of_pool(pool: Pool) -> list[dict[str, Any]]:
     uid = pool.status()["uid"]
     return [i for i in running() if i["labels"]["fogft-pool"] == uid]
-
-
-def reaches(host: str, port: int) -> bool:
-    with socket.socket() as one:
-        one.settimeout(5)
-        return one.connect_ex((host, port)) == 0
 
 
 def what_the_machine_has(pool: Pool) -> None:

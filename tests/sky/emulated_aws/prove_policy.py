@@ -25,7 +25,7 @@ from tests.sky.emulated_aws.under_contract import RESOURCES, adapter, stub_serve
 step = Steps()
 # What fogft can do without, as the page says; and what is no call of its own.
 NOT_NEEDED = {"servicequotas:GetServiceQuota", "iam:ListAttachedRolePolicies", "iam:PassRole"}
-AT_THE_END = {"ec2:TerminateInstances", "ec2:DeleteSecurityGroup"}
+OTHERWISE = {"ec2:Describe*", "ec2:TerminateInstances", "ec2:DeleteSecurityGroup"}
 
 
 def outcome(cloud: SkyCloud, slot: int) -> Machine | None:
@@ -48,7 +48,12 @@ def main() -> int:
     with step("credentials are good"):
         assert cloud.check(["aws"]) == {"aws": ""}
     listed = actions(statements(PAGE.read_text()))
-    for slot, action in enumerate([one for one in listed if one not in NOT_NEEDED | AT_THE_END]):
+    control("/deny?action=ec2:Describe*")
+    with step("without ec2:Describe* `up` says that it cannot tell, and names what it asked for"):
+        assert "not authorized to perform: ec2:Describe" in cloud.unverified("aws")
+    control("/deny")
+    tried = [one for one in listed if one not in NOT_NEEDED | OTHERWISE]
+    for slot, action in enumerate(tried):
         control(f"/deny?action={action}")
         with step(f"a launch without {action} fails and names it"):
             machine = outcome(cloud, slot)

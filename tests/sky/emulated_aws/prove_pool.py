@@ -29,12 +29,13 @@ from tests.sky.emulated_aws.pool import (
     Pool,
     clusters,
     machine_of,
-    open_ports,
     processes,
+    reaches,
     region_of,
 )
 
 RATE_HZ = 5.0
+LAUNCHER, STRANGER = "10.66.0.1", "10.66.255.9"  # both addresses of the computer that launches
 REGIONS = ("us-east-1", "us-west-2", "eu-west-1")
 POOL_FILE = f"""\
 name: proof
@@ -56,6 +57,7 @@ run: |
   exec python3 plan_service.py
 fogft:
   replicas: 2
+  allow_from: [{LAUNCHER}]
   services:
     - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10}}
 """
@@ -147,9 +149,10 @@ class Proof:
             assert carried.read_bytes() == made.read_bytes()
             left = list(credentials_below(home))
             assert not left, left
-            # To the world: ssh, which is SkyPilot's, and the link.
-            cluster = f"fogft-{status['uid']}-{name.replace('.', '-')}"
-            assert open_ports(instance["region"], f"sky-sg-{cluster}") == {22, 7448}
+            # Ssh, which is SkyPilot's, and the link: to whom the file names, and to nobody else.
+            for port in (22, 7448):
+                assert reaches(instance["ip"], port, LAUNCHER)
+                assert not reaches(instance["ip"], port, STRANGER)
 
     def preempted_without_notice_and_a_region_is_full(self) -> None:
         lost = next(n for n, r in self.pool.replicas().items() if region_of(r) == "us-east-1")

@@ -60,6 +60,7 @@ unshare --mount --net --pid --ipc --uts --fork --kill-child bash -euc '
   ip link set lo up
   ip link add br0 type bridge
   ip addr add 10.66.0.1/16 dev br0
+  ip addr add 10.66.255.9/16 dev br0  # another one of the launching computer
   ip addr add 169.254.169.254/32 dev br0  # where a VM asks for its metadata
   ip link set br0 up
   mount -t proc proc "$root/proc"
@@ -71,6 +72,7 @@ unshare --mount --net --pid --ipc --uts --fork --kill-child bash -euc '
     umount -l .old
   fi
   exec chroot . env -i HOME=/robot PATH="$venv/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \
-    LANG=C.UTF-8 PYTHONPATH= RESULTS="$results" EMULATION="$image" HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
+    LANG=C.UTF-8 PYTHONPATH= RESULTS="$results" EMULATION="$image" ENFORCED="${ENFORCED:-}" \
+    HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
     "$venv/bin/python" "$here/inside.py" "$@"
 ' world "$root" "$here" "$venv" "$image" "$results" "$@"
