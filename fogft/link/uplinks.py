@@ -24,7 +24,6 @@ from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec
 from fogft.model.uplinks import UplinkPolicy, choose
-from fogft.records.record import SignedRecord
 from fogft.requests.load import Handling
 
 _ANSWERED_KEPT = 1024
@@ -276,6 +275,8 @@ class UplinkDialer:
 
     def __init__(self, inner: Dialer) -> None:
         self.inner = inner
+        self.adopt, self.renew, self.tell = inner.adopt, inner.renew, inner.tell
+        self.certificate, self.close = inner.certificate, inner.close
         self.interfaces: tuple[str, ...] = ()
         self._policies: Mapping[str, UplinkPolicy] = {}
         self._options = DEFAULT_OPTIONS
@@ -291,10 +292,6 @@ class UplinkDialer:
         self.adopt(options)
         return changed
 
-    def adopt(self, options: SendOptions) -> None:
-        """Set what services want of their links, from the next connection on."""
-        self.inner.adopt(options)
-
     def policy(self, service: str) -> UplinkPolicy:
         """Return a service's policy."""
         return self._policies.get(service, UplinkPolicy.PREFER)
@@ -307,19 +304,3 @@ class UplinkDialer:
         if not self.interfaces or peer.endpoint.startswith(("127.", "[::1]")):
             return self.inner.dial(peer, services, events)
         return UplinksLink(self, peer, services, events)
-
-    def renew(self) -> None:
-        """Take the credentials that now stand in their files into use."""
-        self.inner.renew()
-
-    def tell(self, records: Sequence[SignedRecord]) -> None:
-        """Tell every replica these records."""
-        self.inner.tell(records)
-
-    def certificate(self) -> str:
-        """Return the common name of the certificate that every link uses."""
-        return self.inner.certificate()
-
-    def close(self) -> None:
-        """Close every link."""
-        self.inner.close()

@@ -14,14 +14,15 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
-from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import zenoh
 from zenoh import handlers
 
 from fogft.errors import RosError, Unreadable
+from fogft.link.counters import Counters
 from fogft.link.zenoh import threads
+from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.log_limits import worth_logging
 from fogft.rmw_zenoh import naming
 from fogft.ros.pacing.pacer import Pacer, Probes
@@ -32,36 +33,6 @@ log = logging.getLogger(__name__)
 _TIMEOUT_S = 1e6
 _CLOSE_LIMIT_S = 10.0
 _CLIENTS_KEPT = 64
-
-
-class Worker:
-    """A thread that runs functions in order."""
-
-    def __init__(self, name: str) -> None:
-        self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
-
-    def do(self, work: Callable[[], None]) -> None:
-        """Have it done soon."""
-        self._queue.put(work)
-
-    def _run(self) -> None:
-        while (work := self._queue.get()) is not None:
-            try:
-                work()
-            except zenoh.ZError as error:  # the session is closed, or who asked is gone
-                log.debug("zenoh_refused reason=%r", str(error))
-            except Exception:
-                log.exception("the work of %s goes on without this", self._thread.name)
-            finally:
-                work = None  # an idle thread must not keep a query open
-
-    def close(self) -> None:
-        """End it after what is waiting; does not wait for itself."""
-        self._queue.put(None)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(_CLOSE_LIMIT_S)
 
 
 class _Handle(NamedTuple):
@@ -95,7 +66,7 @@ class Server:
         self._open = True
         self._faces: dict[str, tuple[Any, Any]] = {}
         self.name, self.type = token("").service, token("").type
-        self._worker = Worker(f"rmw{self.name}")
+        self._worker = _worker(self.name)
         self._declare(hash)
 
     @property
@@ -105,7 +76,7 @@ class Server:
 
     def clients_hash(self, hash: str) -> None:
         """Offer it to a client whose type has this hash, too."""
-        self._worker.do(partial(self._declare, hash))
+        self._worker.add(partial(self._declare, hash))
 
     def _declare(self, hash: str) -> None:
         if not self._open or hash in self._faces:
@@ -154,7 +125,7 @@ class Server:
             self._answered_ns[handle.client] = time.time_ns()
             if len(self._answered_ns) > _CLIENTS_KEPT:
                 self._answered_ns.popitem(last=False)
-            self._worker.do(partial(self._send, handle, payload))
+            self._worker.add(partial(self._send, handle, payload))
 
     def _send(self, handle: _Handle, payload: bytes) -> None:
         query, attachment, _ = handle
@@ -173,8 +144,9 @@ class Server:
         if self._open:
             self._open = False
             self._pacer.close()
-            self._worker.do(self._undeclare)
+            self._worker.add(self._undeclare)
             self._worker.close()
+            self._worker.join(_CLOSE_LIMIT_S)
 
     def _undeclare(self) -> None:
         for queryable, token in self._faces.values():
@@ -211,7 +183,7 @@ class Client:
         self._errors = 0
         self._open = True
         self._lock = threading.Lock()
-        self._worker = Worker(f"rmw{self._name}")
+        self._worker = _worker(self._name)
 
     @property
     def is_open(self) -> bool:
@@ -242,7 +214,7 @@ class Client:
             self._asked += 1
             ticket = self._asked
             self._waiting[ticket] = _Waiting(on_response, zenoh.CancellationToken())
-        self._worker.do(partial(self._ask, ticket, hashes[0], payload))
+        self._worker.add(partial(self._ask, ticket, hashes[0], payload))
         return ticket
 
     def _ask(self, ticket: int, hash: str, payload: bytes) -> None:
@@ -299,7 +271,7 @@ class Client:
         with self._lock:
             waiting = self._waiting.pop(ticket, None)
         if waiting is not None:
-            self._worker.do(waiting.cancellation.cancel)
+            self._worker.add(waiting.cancellation.cancel)
 
     def close(self) -> None:
         """Withdraw the client. Repeatable."""
@@ -309,14 +281,21 @@ class Client:
             self._open = False
             left, self._waiting = self._waiting, {}
         for waiting in left.values():
-            self._worker.do(waiting.cancellation.cancel)
-        self._worker.do(self._undeclare)
+            self._worker.add(waiting.cancellation.cancel)
+        self._worker.add(self._undeclare)
         self._worker.close()
+        self._worker.join(_CLOSE_LIMIT_S)
 
     def _undeclare(self) -> None:
         if self._told is not None:
             self._told[1].undeclare()
             self._told = None
+
+
+def _worker(service: str) -> WorkQueue:
+    worker = WorkQueue(f"rmw{service}", Counters())
+    worker.start()
+    return worker
 
 
 def _check(fault: str, payload: bytes) -> None:

@@ -1,6 +1,7 @@
 """A worker thread for what Zenoh's threads must not do themselves.
 
-Owns: what waits for it, and how much may. Not here: what there is to do (`control_queries`).
+Owns: what waits for it, and how much may. Not here: what there is to do (`control_queries`,
+`fogft.rmw_zenoh`).
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import threading
 from collections.abc import Callable
 from queue import SimpleQueue
 
+import zenoh
+
 from fogft.link.counters import Counters
 
 log = logging.getLogger(__name__)
@@ -18,22 +21,24 @@ LIMIT = 1024  # probes, records and cancellations that wait; a robot has a few o
 
 
 class WorkQueue:
-    """A thread that does what it is given, in order. Nothing here blocks.
+    """A thread that does what it is given, in order. Only `join` blocks.
 
     Args:
+        name: Of the thread.
         counters: Count ``control_queries_dropped`` and ``failed``.
     """
 
-    def __init__(self, counters: Counters) -> None:
+    def __init__(self, name: str, counters: Counters) -> None:
         self._counters = counters
         self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
 
     def __len__(self) -> int:
         return self._queue.qsize()
 
     def start(self) -> None:
         """Begin. What was given before waits until then."""
-        threading.Thread(target=self._work, name="fogft-probes", daemon=True).start()
+        self._thread.start()
 
     def offer(self, job: Callable[[], None]) -> bool:
         """Take a job, unless too many wait: then count it; return whether it was taken."""
@@ -51,10 +56,20 @@ class WorkQueue:
         """Do what waits, then end."""
         self._queue.put(None)
 
+    def join(self, timeout_s: float) -> None:
+        """Wait for its end, unless it is the worker that asks."""
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout_s)
+
     def _work(self) -> None:
         while (job := self._queue.get()) is not None:
             try:
                 job()
+            except zenoh.ZError as error:  # the session is closed, or who asked is gone
+                self._counters.add("failed")
+                log.debug("zenoh_refused reason=%r", str(error))
             except Exception:
                 self._counters.add("failed")
-                log.exception("job_failed")
+                log.exception("job_failed thread=%s", self._thread.name)
+            finally:
+                job = None  # an idle thread must not keep a query open

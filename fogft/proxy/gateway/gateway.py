@@ -21,11 +21,9 @@ from collections.abc import Callable, Iterable, Mapping
 from queue import SimpleQueue
 from typing import Any
 
-from fogft.errors import RosError
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.ros.port import OnBurst, RosClient
 
 log = logging.getLogger(__name__)
 
@@ -253,47 +251,6 @@ class Forwarder:
         for id in list(self._open):
             self._stop(id, Refusal.LOST)
         self._queue.put(None)
-
-
-class NoRos:
-    """Stands in for ROS in a gateway (`ros.port.RosNode`): requests come from the wire instead."""
-
-    @property
-    def alive(self) -> bool:
-        """There is nothing to die."""
-        return True
-
-    def serve(
-        self,
-        name: str,
-        type_name: str,
-        on_request: Callable[[bytes, Any], None],
-        on_burst: OnBurst | None = None,
-    ) -> NoRos:
-        """Offer nothing: the listener does."""
-        return self
-
-    def respond(self, handle: Any, payload: bytes) -> None:
-        """Never called: a gateway's dispatchers respond to the forwarder."""
-
-    def mismatch(self) -> str:
-        """Return nothing: nobody calls it through ROS."""
-        return ""
-
-    def client(self, name: str, type_name: str) -> RosClient:
-        """Make none.
-
-        Raises:
-            RosError: Always.
-        """
-        raise RosError(f"a gateway calls no ROS service, so not `{name}` either")
-
-    def offered(self) -> Mapping[str, str]:
-        """Return nothing: applications offer nothing here."""
-        return {}
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 def numbers(report: Mapping[str, Any]) -> dict[str, float]:

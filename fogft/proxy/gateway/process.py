@@ -31,7 +31,7 @@ from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.type_definition import RESPONSE
 from fogft.process import Watchdog, notify, start_log, stop_on_signal
 from fogft.proxy.config import read_gateway
-from fogft.proxy.gateway.gateway import Forwarder, NoRos, numbers
+from fogft.proxy.gateway.gateway import Forwarder, numbers
 from fogft.proxy.middleware import fault_of
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
@@ -83,7 +83,7 @@ class _Gateway:
         self._draining = False
         self._forwarder = Forwarder()
         dialer = make_dialer(config)
-        self._proxy = ClientProxy(config.pool_uid, NoRos(), dialer, self._make_dispatcher)
+        self._proxy = ClientProxy(config.pool_uid, None, dialer, self._make_dispatcher)
         self._services = tuple(_passed_on(service) for service in config.services)
         self._proxy.serve(self._services)
         self._following = Following(config)

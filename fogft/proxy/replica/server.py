@@ -328,13 +328,13 @@ class ServerProxy:
             node.close()
 
     def _request(self, incoming: Incoming) -> None:
-        if incoming.service in self._topics:
+        name = incoming.service
+        if name in self._topics:
             self._topics.request(incoming)
-            return
-        if incoming.service in self._goals:
+        elif name in self._goals:
             self._goals.request(incoming)
-            return
-        (self._ordered.get(incoming.service) or self.responder).request(incoming)
+        else:
+            (self._ordered.get(name) or self.responder).request(incoming)
 
     def _answering(self) -> frozenset[str]:
         """Return the services that can answer: found, and in the present state."""

@@ -49,6 +49,7 @@ class ClientProxy:
 
     Args:
         pool_uid: The pool's uid, part of every key.
+        node: The robot's side of ROS; none in a gateway, where requests come from the wire.
         make_dispatcher: Makes the dispatcher of a service, given how to respond.
         define: Returns the definition of a service type here; None to compare none.
         merge: Makes one status of an action of what its replicas say.
@@ -57,7 +58,7 @@ class ClientProxy:
     def __init__(
         self,
         pool_uid: str,
-        node: RosNode,
+        node: RosNode | None,
         dialer: Dialer,
         make_dispatcher: MakeDispatcher,
         *,
@@ -246,7 +247,7 @@ class ClientProxy:
         Raises:
             RosError: The node's thread has ended: nothing would be taken any more.
         """
-        if not self._node.alive:
+        if self._node is not None and not self._node.alive:
             raise RosError("ROS does not go on; the log says why", "start the proxy again")
         self._wake.wait(max(0.0, min(timeout_s, self._next_look - self._clock())))
         self._wake.clear()
@@ -259,8 +260,9 @@ class ClientProxy:
             self._topics.tick()
             looks = [service.dispatcher.tick() for service in self._services.values()]
             now = self._clock()
-            for service in self._services.values():
-                service.advertise(self._node, now)
+            if self._node is not None:
+                for service in self._services.values():
+                    service.advertise(self._node, now)
         self._next_look = min(looks, default=NEVER)
         if len(self._topics):
             self._next_look = min(self._next_look, now + _TICK_S)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 from fogft.link.port import Dialer, GatewayView, Link, LinkEvents, LinkStatus, Peer
@@ -85,12 +86,9 @@ def _report(status: LinkStatus, gateway: str, one: GatewayView) -> dict[str, Any
     rtt_s = None if one.rtt_s is None or status.rtt_s is None else one.rtt_s + status.rtt_s
     heard = status.heard_age_s
     return {
-        "slot": one.slot,
-        "generation": one.generation,
+        **asdict(one),
         "state": state.value,
         "ready": sorted(one.ready) if up else [],
-        "draining": one.draining,
-        "at_risk": one.at_risk,
         "disagrees": False,
         "differs": False,
         "offered": {},
@@ -102,10 +100,6 @@ def _report(status: LinkStatus, gateway: str, one: GatewayView) -> dict[str, Any
         "in_flight": 0,
         "reopened": 0,
         "won": 0,
-        "restarts": one.restarts,
-        "version": one.version,
-        "lease_age_s": one.lease_age_s,
-        "lease_left_s": one.lease_left_s,
         "work": {},
         "detail": one.detail if up else f"gateway `{gateway}`: {status.detail}",
         "through": f"{gateway}/{one.through}" if one.through else gateway,

@@ -74,12 +74,12 @@ class ProxiedService:
         """Whether two proxies can serve it at once: it has no order, and no goals."""
         return self.spec.state is None and self.spec.part is Part.NONE
 
-    def adopt(self, spec: ServiceSpec, node: RosNode) -> None:
+    def adopt(self, spec: ServiceSpec, node: RosNode | None) -> None:
         """Have the dispatcher follow a policy, with a client of its fallback service."""
         name = spec.fallback.service if spec.fallback is not None else ""
         if name != self._fallback_name:
             old, self._fallback, self._fallback_name = self._fallback, None, name
-            if name:
+            if name and node is not None:
                 try:
                     self._fallback = node.client(name, spec.type)
                 except RosError as error:

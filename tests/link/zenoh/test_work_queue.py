@@ -12,7 +12,7 @@ from tests.link.wire_pool import LIMIT_S
 
 def test_jobs_are_done_in_order_and_one_that_fails_stops_none(caplog):
     counters, done, last = Counters(), [], threading.Event()
-    work = WorkQueue(counters)
+    work = WorkQueue("test", counters)
     work.add(lambda: done.append(1))
     work.start()
     work.add(lambda: done.append(1 // 0))
@@ -27,7 +27,7 @@ def test_jobs_are_done_in_order_and_one_that_fails_stops_none(caplog):
 
 def test_only_so_many_wait_but_what_must_be_taken_is():
     counters = Counters()
-    work = WorkQueue(counters)
+    work = WorkQueue("test", counters)
     assert all(work.offer(print) for _ in range(LIMIT))
     assert not work.offer(print)
     work.add(print)

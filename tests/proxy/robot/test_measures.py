@@ -5,7 +5,7 @@ from __future__ import annotations
 from fogft.metrics import proxies
 from fogft.metrics.families import text
 from fogft.model.spec import ServiceSpec
-from fogft.proxy.gateway.gateway import Forwarder, NoRos
+from fogft.proxy.gateway.gateway import Forwarder
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from tests.proxy.fakes import UID, Clock, FakeDialer, FakeLink
@@ -45,7 +45,7 @@ def test_every_outcome_of_a_service_is_told():
 
 def test_a_gateway_tells_of_its_robots_too():
     clock = Clock()
-    proxy = ClientProxy(UID, NoRos(), FakeDialer(), lambda *_: dispatcher(clock)[0], clock=clock)
+    proxy = ClientProxy(UID, None, FakeDialer(), lambda *_: dispatcher(clock)[0], clock=clock)
     proxy.serve([ServiceSpec("/s", "t")])
     told = {**proxy.report(), "forwarded": Forwarder().report(), "listener": {"requests": 3}}
     said = text(proxies.of_gateway(told), {}).splitlines()

@@ -62,58 +62,58 @@ class ControlQueries:
 
     # -- Zenoh's threads ------------------------------------------------------------------
 
-    def open_answers(self, query: zenoh.Query, turn: int) -> None:
+    def open_answers(self, asked: QueryEnd) -> None:
         """A connection that was let in asks for its answers to come."""
         try:
-            greeting = _greeting(query)
+            token = _greeting(asked.query).token
         except FrameError as error:
-            self._malformed(error, query, turn)
+            self._malformed(error, asked)
             return
-        if not self._sessions.admits(greeting.token):
-            self._turn_away(QueryEnd(query, turn, Refusal.NOT_ADMITTED), "it did not greet")
+        if not self._sessions.admits(token):
+            self._turn_away(asked, Refusal.NOT_ADMITTED, "it did not greet")
             return
-        for token, ended in self._streams.opened(
-            greeting.token, query, self._sessions.holder(greeting.token)
-        ):
-            self._queues.end(token, "gone", QueryEnd(ended, turn))
+        holder = self._sessions.holder(token)
+        for gone, query in self._streams.opened(token, asked.query, holder):
+            self._queues.end(gone, "gone", QueryEnd(query, asked.turn))
 
-    def probe(
-        self, on_probe: Callable[[Probe], ProbeAnswer], query: zenoh.Query, turn: int
-    ) -> None:
+    def probe(self, on_probe: Callable[[Probe], ProbeAnswer], asked: QueryEnd) -> None:
         """Somebody greets and asks how we are."""
         self._counters.add("probes")
         try:
-            probe = probe_frames.decode_probe(_content(query))
-            greeting = _greeting(query)
+            probe = probe_frames.decode_probe(_content(asked.query))
+            greeting = _greeting(asked.query)
         except FrameError as error:
-            self._malformed(error, query, turn)
+            self._malformed(error, asked)
             return
-        answer = partial(self._answer_probe, on_probe, probe, greeting, query, turn)
-        self.later(answer, query, turn)
+        self.later(partial(self._answer_probe, on_probe, probe, greeting, asked), asked)
 
-    def records(self, query: zenoh.Query, turn: int) -> None:
+    def records(self, asked: QueryEnd) -> None:
         """Somebody brings what the pool has signed."""
         self._counters.add("records")
         try:
-            greeting = _greeting(query)
-            offered = frames.unpack(_content(query))
+            greeting = _greeting(asked.query)
+            offered = frames.unpack(_content(asked.query))
         except (FrameError, RecordError) as error:
-            self._malformed(error, query, turn)
+            self._malformed(error, asked)
             return
-        self.later(partial(self._take_records, greeting, offered, query, turn), query, turn)
+        self.later(partial(self._take_records, greeting, offered, asked), asked)
 
-    def later(self, job: Callable[[], None], query: zenoh.Query, turn: int) -> None:
+    def later(self, job: Callable[[], None], asked: QueryEnd) -> None:
         """Have the other thread do something; where too much waits for it, the query just ends."""
         if not self._work_queue.offer(job):
-            self._queues.end(_STRANGERS, "strangers", QueryEnd(query, turn))
+            self._end_of_stranger(asked, "")
 
-    def _turn_away(self, refused: QueryEnd, why: str) -> None:
+    def _turn_away(self, asked: QueryEnd, refusal: str, why: str) -> None:
         self._counters.warn(log, "not_admitted", "robot_not_admitted reason=%r", why)
-        self._queues.end(_STRANGERS, "strangers", refused)
+        self._end_of_stranger(asked, refusal)
 
-    def _malformed(self, error: ValueError, query: zenoh.Query, turn: int) -> None:
+    def _malformed(self, error: ValueError, asked: QueryEnd) -> None:
         self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
-        self._queues.end(_STRANGERS, "strangers", QueryEnd(query, turn, Refusal.MALFORMED))
+        self._end_of_stranger(asked, Refusal.MALFORMED)
+
+    def _end_of_stranger(self, asked: QueryEnd, refusal: str) -> None:
+        asked.refusal = refusal
+        self._queues.end(_STRANGERS, "strangers", asked)
 
     # -- the worker thread -----------------------------------------------------------
 
@@ -122,28 +122,28 @@ class ControlQueries:
         on_probe: Callable[[Probe], ProbeAnswer],
         probe: Probe,
         greeting: frame.Greeting,
-        query: zenoh.Query,
-        turn: int,
+        asked: QueryEnd,
     ) -> None:
-        if not self._greeted(greeting, query, turn):
+        if not self._greeted(greeting, asked):
             return
         try:
             answer = replace(on_probe(probe), accepts=ACCEPTED)
             content = probe_frames.encode_probe_answer(answer)
-            query.reply(query.key_expr, content, express=True)
+            asked.query.reply(asked.query.key_expr, content, express=True)
         finally:
-            self._end(greeting, query, turn)
+            # In its robot's own thread: unlike the answer, the end queues behind replies.
+            self._queues.end(greeting.token, "probe", asked)
 
     def _take_records(
-        self, greeting: frame.Greeting, offered: list[SignedRecord], query: zenoh.Query, turn: int
+        self, greeting: frame.Greeting, offered: list[SignedRecord], asked: QueryEnd
     ) -> None:
-        if not self._greeted(greeting, query, turn):
+        if not self._greeted(greeting, asked):
             return
         try:
             self.take(offered)
-            query.reply(query.key_expr, b"")
+            asked.query.reply(asked.query.key_expr, b"")
         finally:
-            self._end(greeting, query, turn)
+            self._queues.end(greeting.token, "probe", asked)
 
     def take(self, offered: Sequence[SignedRecord]) -> None:
         """Judge records by their own signatures, and do what those that are good say."""
@@ -160,18 +160,14 @@ class ControlQueries:
         """Return the newest good record of a kind that the manager writes."""
         return self._records.get(kind)
 
-    def _greeted(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> bool:
+    def _greeted(self, greeting: frame.Greeting, asked: QueryEnd) -> bool:
         """Whether this is somebody who is let in; else it is told why not."""
         try:
             self._sessions.greet(greeting)
         except NotAdmittedError as error:
-            self._turn_away(QueryEnd(query, turn, error.refusal), str(error))
+            self._turn_away(asked, error.refusal, str(error))
             return False
         return True
-
-    def _end(self, greeting: frame.Greeting, query: zenoh.Query, turn: int) -> None:
-        """End a query in its robot's own thread: unlike the answer, that queues behind replies."""
-        self._queues.end(greeting.token, "probe", QueryEnd(query, turn))
 
 
 def _greeting(query: zenoh.Query) -> frame.Greeting:

@@ -31,7 +31,7 @@ from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.connection_reaper import ConnectionReaper
 from fogft.link.zenoh.replica.control_queries import ControlQueries
 from fogft.link.zenoh.replica.incoming import ZenohIncoming
-from fogft.link.zenoh.replica.query_ends import QueryTurns
+from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns
 from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
@@ -92,7 +92,7 @@ class ZenohListener:
         self._counters = Counters()
         self._turns = QueryTurns()
         self._queues = ReplyQueues(self._counters, self._turns)
-        self._work_queue = WorkQueue(self._counters)
+        self._work_queue = WorkQueue("fogft-probes", self._counters)
         self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
@@ -176,9 +176,10 @@ class ZenohListener:
                 log, "handshakes_refused", "handshake_refused reason=%r", str(reason)
             )
 
-    def _declare(
-        self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Query, int], None]
-    ) -> None:
+    def _declare(self, session: zenoh.Session, key: str, asked: Callable[[QueryEnd], None]) -> None:
+        def heard(query: zenoh.Query, turn: int) -> None:
+            asked(QueryEnd(query, turn))
+
         callback = handlers.Callback(self._taken(f"query at {key}", heard), indirect=False)
         self._declared.append(session.declare_queryable(key, callback, complete=True))
 

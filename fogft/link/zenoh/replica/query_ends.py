@@ -43,15 +43,18 @@ class QueryEnd:
 
     Args:
         turn: When it came, by `QueryTurns`.
+
+    Attributes:
         refusal: What is said before; empty for nothing.
     """
 
-    __slots__ = ("_query", "refusal", "turn")
+    __slots__ = ("_ended", "query", "refusal", "turn")
 
-    def __init__(self, query: zenoh.Query, turn: int, refusal: str = "") -> None:
-        self._query: zenoh.Query | None = query
+    def __init__(self, query: zenoh.Query, turn: int) -> None:
+        self.query = query
         self.turn = turn
-        self.refusal = refusal
+        self.refusal = ""
+        self._ended = False
 
     def say(self) -> None:
         """Send the refusal. May block for as long as its robot takes nothing.
@@ -59,14 +62,14 @@ class QueryEnd:
         Raises:
             zenoh.ZError: The session is closed.
         """
-        if self.refusal and self._query is not None:
-            self._query.reply_err(frame.encode_refusal(frame.NO_STAMP, _NO_REQUEST, self.refusal))
+        if self.refusal:
+            self.query.reply_err(frame.encode_refusal(frame.NO_STAMP, _NO_REQUEST, self.refusal))
 
     def end(self) -> None:
         """End the query. May block as `say` does."""
-        query, self._query = self._query, None
-        if query is not None:
-            query.drop()  # type: ignore[no-untyped-call]
+        if not self._ended:
+            self._ended = True
+            self.query.drop()  # type: ignore[no-untyped-call]
 
 
 class Unended:

@@ -18,6 +18,7 @@ import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import zenoh
 from zenoh import handlers
@@ -88,6 +89,7 @@ class Connection:
         )
         greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
+        self._bare = frame.encode_greeting(frame.Greeting(self._token))
         self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
         self._answers_key = names.answers_key(peer.id.pool_uid, peer.id.slot)
         self.lost_because = ""
@@ -141,18 +143,16 @@ class Connection:
         for publisher in self._publishers.values():
             if not publisher.matching_status.matching:  # type: ignore[attr-defined]
                 return False
-        self._session.get(
-            self._answers_key,
-            handlers.Callback(
-                self._heard, lambda: self.lose("the replica ended our answers"), indirect=False
-            ),
-            attachment=frame.encode_greeting(frame.Greeting(self._token)),
-            timeout=_ANSWERS_TIMEOUT_S,
-            target=_ALL,
-            consolidation=_AT_ONCE,
-        )
+        ended = partial(self.lose, "the replica ended our answers")
+        answers = handlers.Callback(self._heard, ended, indirect=False)
+        self._ask(self._answers_key, answers, _ANSWERS_TIMEOUT_S, attachment=self._bare)
         self._begun = True
         return True
+
+    def _ask(self, key: str, answers: Any, timeout_s: float, **how: Any) -> None:
+        self._session.get(
+            key, answers, timeout=timeout_s, target=_ALL, consolidation=_AT_ONCE, **how
+        )
 
     # -- for its attempts -----------------------------------------------------------------
 
@@ -220,25 +220,21 @@ class Connection:
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                self._greeting = bare  # we are known from now on
+                self._greeting = self._bare  # we are known from now on
                 heard(reply.ok.payload.to_bytes())
             elif reply.err is not None:
                 self._probe_refused(reply.err.payload.to_bytes())
 
-        bare = frame.encode_greeting(frame.Greeting(self._token))
-
-        self._session.get(
+        self._ask(
             key,
             handlers.Callback(on_reply, indirect=False),
+            timeout_s,
             payload=payload,
             attachment=self._greeting,
-            timeout=timeout_s,
             # This thread must not wait behind what is stuck: a lost probe is an unanswered one.
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
-            target=_ALL,
-            consolidation=_AT_ONCE,
         )
 
     def _probe_refused(self, content: bytes) -> None:
@@ -262,17 +258,15 @@ class Connection:
             if reply.ok is not None:
                 self.told = records
 
-        self._session.get(
+        self._ask(
             key,
             handlers.Callback(on_reply, indirect=False),
+            _TELL_RECORDS_TIMEOUT_S,
             payload=records,
-            attachment=frame.encode_greeting(frame.Greeting(self._token)),
-            timeout=_TELL_RECORDS_TIMEOUT_S,
+            attachment=self._bare,
             congestion_control=zenoh.CongestionControl.DROP,
             # Not that of the answers: its end at the replica must not wait for room among them.
             priority=zenoh.Priority.DATA_LOW,
-            target=_ALL,
-            consolidation=_AT_ONCE,
         )
 
     def close(self) -> None:

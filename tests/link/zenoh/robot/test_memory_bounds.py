@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from fogft.link.counters import Counters
 from fogft.link.zenoh.replica.control_queries import ControlQueries
-from fogft.link.zenoh.replica.query_ends import QueryTurns
+from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
@@ -89,7 +89,7 @@ class Query:
 def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authority) -> None:
     """A robot that probes without end has its probes dropped and counted, and each query ended."""
     counters, turns, verifier = Counters(), QueryTurns(), LazyVerifier(authority.replica().ca)
-    work = WorkQueue(counters)  # not begun: nothing leaves it
+    work = WorkQueue("test", counters)  # not begun: nothing leaves it
     control = ControlQueries(
         sessions=AuthenticatedSessions(POOL_UID, "replica", verifier),
         records=RecordSet(POOL_UID, verifier),
@@ -100,7 +100,7 @@ def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authorit
     )
     for turn in range(3000):
         turns.came()
-        control.later(lambda: None, Query(), turn)
+        control.later(lambda: None, QueryEnd(Query(), turn))
     dropped = counters.snapshot()["control_queries_dropped"]
     assert 0 < len(work) == 3000 - dropped <= 1024
     wait_for(lambda: Query.ended == dropped)
