@@ -26,11 +26,7 @@ class Cancellations:
         return bool(self._ids)
 
     def add(self, request_id: bytes, sent_at: float, now: float) -> bool:
-        """Note that a request that was sent is no longer wanted; whether to tell at once.
-
-        Args:
-            sent_at: When it was sent, on the caller's clock, in seconds.
-        """
+        """Note that what was sent at `sent_at` is not wanted; whether to tell at once."""
         if len(self._ids) < LIMIT:
             self._ids[request_id] = None
         if now - sent_at < WORTH_S or now - self._told_at < EVERY_S:

@@ -56,11 +56,7 @@ class DeadlineFilter:
         now: float,
         before: Callable[[str], Iterable[OpenAttempt]] = lambda service: (),
     ) -> bool:
-        """Whether an attempt may arrive while there is time, for all that is known.
-
-        Args:
-            before: Returns what leaves before a request to a service.
-        """
+        """Whether an attempt may arrive in time behind what leaves `before` it."""
         rate = self._carries(now)
         if rate is None or attempt.service not in self._timed:
             return True

@@ -255,11 +255,7 @@ def read_reason(said: bytes) -> str:
 
 
 def greeted_bytes(token: bytes, replica: str) -> bytes:
-    """Return what a greeting's signature covers: good for one connection to one replica.
-
-    Args:
-        replica: The replica's common name.
-    """
+    """Return what a greeting's signature covers: one connection, one replica's name."""
     return b"fogft greeting 1\n" + token + replica.encode()
 
 

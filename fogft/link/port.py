@@ -255,11 +255,7 @@ class Dialer(Protocol):
     """Makes links. One for each client proxy."""
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
-        """Start a link; return at once, in state CONNECTING.
-
-        Args:
-            services: Service name -> key (from `names.service_key`).
-        """
+        """Start a link to the keys of these services; return at once, in CONNECTING."""
 
     def adopt(self, options: SendOptions) -> None:
         """Set what services want of their links, from the next connection on."""

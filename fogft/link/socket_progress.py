@@ -36,11 +36,7 @@ class Throughput:
         self._still_s = 0.0  # since something was acknowledged
 
     def look(self, moved: int, lasted_s: float, now: float, *, queued: bool) -> None:
-        """Take what was acknowledged since the last look.
-
-        Args:
-            queued: Whether more than that waited the whole time.
-        """
+        """Take what was acknowledged since; `queued`: more waited the whole time."""
         self._still_s += lasted_s
         if not queued:
             self._open, self._before = False, None

@@ -52,11 +52,7 @@ class ActiveVersion:
         return _most(joined) if self._is_gone else None
 
     def wanted(self, staying: Iterable[str]) -> str | None:
-        """Return which version should take over from the active one; None for no change.
-
-        Args:
-            staying: The versions of those that apply what is sent to them, and are to stay.
-        """
+        """Return which version of those `staying` is to take over; None for no change."""
         counted = Counter(staying)
         best = _most(counted.elements())
         if best is None or self.version is None or best == self.version:

@@ -122,7 +122,6 @@ class OrderedReplica(Generic[T]):
 
     @property
     def _expected(self) -> int:
-        """The next number that can be taken."""
         if self._queue:
             return next(reversed(self._queue)) + 1
         work = self._work
@@ -187,7 +186,6 @@ class OrderedReplica(Generic[T]):
         return self.joined and index < self._expected
 
     def _has_joined(self, to: T) -> Reply[T]:
-        """Return the answer to a join or a restore."""
         return Reply(to, orders.encode_index(self._expected))
 
     def _take_restore(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
@@ -336,7 +334,6 @@ class OrderedReplica(Generic[T]):
         return out
 
     def _give_up(self, reason: Refusal, detail: str = "") -> list[Effect[T]]:
-        """Refuse all that has not begun."""
         out: list[Effect[T]] = [
             Refuse(to, reason, detail) for queued in self._queue.values() for to in queued.waiting
         ]

@@ -145,11 +145,7 @@ class Sequencer:
         versions: Mapping[int, str] | None = None,
         leaving: Iterable[int] = (),
     ) -> None:
-        """Set which replicas can be sent to; new ones are claimed at once.
-
-        Args:
-            versions: What each runs; all the same unless told.
-        """
+        """Set which replicas can be sent to, and what each runs; new ones are claimed."""
         wanted = set(replicas)
         self._versions, self._leaving = versions or {}, frozenset(leaving)
         for replica in [r for r in self._peers if r not in wanted]:

@@ -67,12 +67,7 @@ class OrderMark:
         return f"{word:016x}" if word else None
 
     def new_term(self, nonce: int, *, above: int = 0) -> int:
-        """Return an epoch that was never used, and that the file remembers.
-
-        Args:
-            nonce: 32 random bits.
-            above: An epoch that it must exceed, besides those that the file knows of.
-        """
+        """Return an epoch above `above` and all that the file knows of; it is remembered."""
         epoch = orders.next_epoch(max(self._words[_TERM], above), nonce)
         self._words[_TERM] = epoch
         self._map.flush()

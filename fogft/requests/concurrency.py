@@ -60,11 +60,7 @@ class ConcurrencyLimit:
         return self.limit if self._given is not None or self._tried else 0
 
     def finished(self, level: int, took_s: float, now: float) -> None:
-        """Learn from an answer.
-
-        Args:
-            level: How many were at work when it began, itself included.
-        """
+        """Learn from an answer; at its beginning `level` were at work, itself included."""
         weight = 1.0 if self._mean_s is None else _WEIGHT
         self._mean_s = (self._mean_s or 0.0) * (1 - weight) + weight * took_s
         self.service_s = self.service_s * (1 - weight) + weight * took_s / max(1, level)
@@ -110,12 +106,7 @@ class ConcurrencyLimit:
         self._sum_s = 0.0
 
     def wait_s(self, ahead: int, at_work: int) -> float:
-        """Return how long a request waits for its turn, in seconds, as far as is known.
-
-        Args:
-            ahead: How many are served before it.
-            at_work: How many are at work now.
-        """
+        """Return how long one waits behind those `ahead` and `at_work`, if known."""
         if self._mean_s is None:
             return 0.0
         return max(0, ahead + at_work + 1 - self.limit) * self._mean_s / self.limit

@@ -78,11 +78,7 @@ class Demand:
         return self._asked * math.exp((self._at - now) / _DEMAND_OVER_S)
 
     def replicas(self, able: int, service_s: float, now: float) -> int:
-        """Return how many replicas would do, where those that there are do not; else 0.
-
-        Args:
-            service_s: What a replica takes for a request, divided by how many it has at once.
-        """
+        """Return how many would do, each taking `service_s`, if those able do not; else 0."""
         work = self._lately(now) / _DEMAND_OVER_S * service_s
         return math.ceil(work / _FULL) if work > _TOO_FULL * max(1, able) else 0
 

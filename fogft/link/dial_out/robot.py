@@ -149,7 +149,6 @@ class DialIn:
         return ReplicaId(self._pool_uid, int(holder.name), holder.generation)
 
     def _wait(self, id: ReplicaId, one: _Waiting) -> None:
-        """Hold a connection until it is used, broken, silent, or one too many."""
         with self._lock:
             queue = self._waiting.setdefault(id, deque())
             too_many = len(queue) >= WAITING_LIMIT or len(self._waiting) > REPLICAS_LIMIT

@@ -224,11 +224,7 @@ def _drop_when_closed(connection: socket.socket) -> None:
 
 
 def abort_all(port: int, within_s: float) -> None:
-    """Abort the connections whose own end is at a port, as soon as nothing flows there.
-
-    Args:
-        within_s: Wait no longer for that.
-    """
+    """Abort the connections at a port of ours, once nothing flows or time is up."""
     deadline = time.monotonic() + within_s
     seen: list[Flow | None] = []
     while time.monotonic() < deadline:

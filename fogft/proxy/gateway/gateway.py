@@ -214,11 +214,7 @@ class Forwarder:
     # -- time -----------------------------------------------------------------------------
 
     def tick(self, ready: frozenset[str]) -> None:
-        """Drop what is past its deadline, or has nobody behind to answer it. Call at 50 Hz.
-
-        Args:
-            ready: Services that somebody behind can answer now.
-        """
+        """Drop what is past its deadline, or has none `ready` to answer it. Call at 50 Hz."""
         now = self._clock()
         for name in ready:
             self._unready_since.pop(name, None)

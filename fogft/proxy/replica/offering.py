@@ -45,11 +45,7 @@ class Offering:
         self._seen_since = self._looked_at = float("-inf")
 
     def look(self, node: RosNode, *, complete: bool) -> tuple[ServiceSpec, ...]:
-        """Look at the graph; return services that are new here, to be taken up.
-
-        Args:
-            complete: All services answer: where they are listed there is nothing to look for.
-        """
+        """Return services that are new in the graph. `complete`: all listed ones answer."""
         now = self._clock()
         if now < self._looked_at + LOOK_EVERY_S or (complete and not self._finds_out):
             return ()

@@ -247,7 +247,6 @@ class Responder:
     # -- to the service -------------------------------------------------------------------
 
     def _pass_on(self, service: str) -> None:
-        """Give a service as much of what waits as it may have."""
         queue = self._queues[service]
         while True:
             with self._lock:

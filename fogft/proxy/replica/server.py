@@ -343,7 +343,6 @@ class ServerProxy:
         return self._ready - {name for name, one in self._ordered.items() if not one.ready}
 
     def _passing(self) -> frozenset[str]:
-        """Return the topics that pass now, by their names on the wire."""
         return self._topics.ready() if self._topics and self._supervisor.alive else frozenset()
 
     def _probe(self, probe: Probe) -> ProbeAnswer:

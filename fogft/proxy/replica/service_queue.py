@@ -96,7 +96,6 @@ class ServiceQueue:
 
     @property
     def _has_room(self) -> bool:
-        """Whether the service may have one more beside what it has."""
         return self.at_work < self.limit.limit and not self._alone
 
     def has_free_slot(self, now: float) -> bool:

@@ -131,7 +131,6 @@ class ClientProxy:
         return service
 
     def _adopt(self, service: ProxiedService) -> None:
-        """Have the dispatcher follow its service's spec, with a client of the fallback."""
         service.adopt(self._here(service.spec), self._node)
 
     def _here(self, spec: ServiceSpec) -> ServiceSpec:
@@ -198,7 +197,6 @@ class ClientProxy:
         self._change()
 
     def _keys(self, slot: int) -> dict[str, str]:
-        """Return the keys of all services and topics at a slot."""
         specs = [service.spec for service in self._services.values()]
         services = {s.name: names.service_key(self._pool_uid, slot, s.name, s.type) for s in specs}
         return services | self._topics.keys(self._pool_uid, slot)

@@ -262,7 +262,6 @@ class Dispatcher:
             self.outcomes.late()
 
     def _refused(self, id: ReplicaId, replica: int, answer: Answer, refusal: Refusal) -> None:
-        """A replica has refused an attempt, or its link has lost it."""
         attempt, replication = answer.request_id, self._replication
         with self._lock:
             request = attempt if replication is None else replication.request_of(attempt)
@@ -356,11 +355,7 @@ class Dispatcher:
         self._sender.route(links, versions, leaving, hanging)
 
     def began_anew(self, replica: int, about: Callable[[bytes], bool]) -> None:
-        """Have a replica asked again: it has begun anew what some requests are about.
-
-        Args:
-            about: Whether the bytes of a request are about it.
-        """
+        """Have a replica asked again: it has begun anew what some requests are `about`."""
         with self._lock:
             self._requests.welcome(replica, lambda item: about(item.payload))
         self._wake()

@@ -138,7 +138,6 @@ class Following:
                 self._from_file = read
 
     def _reached(self, membership: Membership) -> tuple[Member, ...]:
-        """Return the members that can be reached, with the door in place of no endpoint."""
         door = self.door
         dialling = [m for m in membership.members if not m.endpoint]
         if door is None:

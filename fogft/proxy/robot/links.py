@@ -32,12 +32,7 @@ _ORDER = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 def link_report(
     link: Link, dispatchers: Collection[Dispatcher], differ: Mapping[str, str], *, draining: bool
 ) -> dict[str, Any]:
-    """Return what is reported of a link.
-
-    Args:
-        differ: Services that its replica cannot answer for us, and why.
-        draining: Its replica is to be left alone.
-    """
+    """Return what is reported of a link; `differ`: what it cannot answer for us, and why."""
     status, id = link.status(), link.peer.id
     answer = status.probe_answer
     ours = next(iter(differ.values()), "") if link.usable else ""

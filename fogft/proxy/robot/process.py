@@ -153,7 +153,6 @@ def _forget_participant(status: Path) -> None:
 def _make_visible(
     joined: middleware.Joined, name: str, judge: Callable[[Mapping[str, Any]], str]
 ) -> VisibleNode | None:
-    """Make the node that people see. Without it requests flow all the same."""
     try:
         return joined.make_visible(name, judge)
     except FogftError as error:

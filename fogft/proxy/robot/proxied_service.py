@@ -36,11 +36,7 @@ class Advertising:
         self._unable_since: float | None = None
 
     def wanted(self, spec: ServiceSpec, *, able: bool, waiting: int, now: float) -> bool:
-        """Return whether it is to be offered now.
-
-        Args:
-            spec: Its policy and its `timeout_s`.
-        """
+        """Return whether a service with this policy is to be offered now."""
         at_once = spec.fallback is not None and spec.fallback.while_none_ready
         if able or at_once or spec.advertised is Advertise.ALWAYS:
             self._offered, self._unable_since = True, None
@@ -89,11 +85,7 @@ class ProxiedService:
         self.dispatcher.adopt(spec, self._fallback)
 
     def may_ask(self, links: Sequence[Link], leaving: Collection[ReplicaId]) -> list[Link]:
-        """Return the links by which its requests may go.
-
-        Args:
-            links: Those whose replicas have the service's type as we have it.
-        """
+        """Return those of the links with our type by which its requests may go."""
         if self.spec.state is not None:  # replicas are brought to readiness by what is sent
             return [link for link in links if link.usable]
         ready = [link for link in links if self.spec.name in link.ready]

@@ -108,7 +108,6 @@ class Sender:
                 full.add(replica)
 
     def _offer(self, request: bytes, replica: int, link: Link, *, skip: bool) -> bool:
-        """Offer a request to a replica; return whether that has room."""
         now = self._ledger.clock()
         with self._ledger.lock:
             requests = self._ledger.requests
@@ -154,7 +153,6 @@ class Sender:
             self._ledger.outcomes.count["sent"] += taken
 
     def _declined(self, id: bytes, replica: int, *, is_copy: bool) -> None:
-        """A link did not take an attempt."""
         with self._ledger.lock:
             pending = self._ledger.requests.get(id)
             if pending is not None and pending.item.trace is not None:

@@ -155,7 +155,6 @@ class ServiceOrder(Decide):
             self._term.declined(replica, current[0], current[2], now)
 
     def _current(self, id: bytes) -> OrderId | None:
-        """Return an order of the present term; None for any other."""
         try:
             order = decode(id)
         except OrderError:

@@ -40,11 +40,7 @@ class Door:
     def look(
         self, strangers: Collection[Address], linked: Collection[Address], now: float
     ) -> Address | None:
-        """Take who is connected; return the stranger that is to be ended now, if there is one.
-
-        Args:
-            linked: Whose links are authenticated.
-        """
+        """Take who is connected, linked or not; return the stranger to be ended now."""
         self._first_seen = {peer: self._first_seen.get(peer, now) for peer in strangers}
         known = {host for host, _ in linked}
         self._until = {
@@ -71,11 +67,7 @@ def full(strangers: Collection[Address]) -> set[str]:
 
 
 def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
-    """Return which strangers have to go, oldest first: who is too old, or one of too many.
-
-    Args:
-        strangers: When each was first seen.
-    """
+    """Return which strangers (when each was first seen) have to go, oldest first."""
     by_age = sorted(strangers, key=lambda peer: strangers[peer])
     surplus = set(by_age[: max(0, len(by_age) - STRANGERS_LIMIT)])
     for host in full(strangers):  # who shares its address is to have a turn

@@ -233,7 +233,6 @@ class Attempts:
                 self._end(attempt, Refusal.LOST)
 
     def _before(self, service: str) -> list[OpenAttempt]:
-        """Return what leaves before an attempt that comes now."""
         if self._queue.overtakes(service):
             return []
         return [one for one in self.window.attempts() if one.payload is not None]
@@ -378,11 +377,7 @@ class Attempts:
     # -- what came (Zenoh's threads) ------------------------------------------------------
 
     def heard(self, stamp: bytes, answers: Iterable[Answer], *, packed: bool = False) -> None:
-        """Take answers to requests, and the stamp that they came with.
-
-        Args:
-            packed: The payload is compressed; then there is one.
-        """
+        """Take answers and their stamp; `packed`: one, whose payload is compressed."""
         self._seen = stamp
         for answer in answers:
             self._take_answer(answer, packed=packed)

@@ -93,7 +93,6 @@ class ZenohDialer:
         return signer.common_name if used <= {signer.certificate} else ""
 
     def _closed(self, link: ZenohLink) -> None:
-        """Forget a link that was closed."""
         with self._lock:
             if link in self._links:
                 self._links.remove(link)
