@@ -30,9 +30,8 @@ from fogft.link.zenoh import sockets, threads
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.connection_reaper import ConnectionReaper
 from fogft.link.zenoh.replica.control_queries import ControlQueries
-from fogft.link.zenoh.replica.incoming import ZenohIncoming
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns
-from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueues
+from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueues, ZenohIncoming
 from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
@@ -91,8 +90,10 @@ class ZenohListener:
         )
         self._counters = Counters()
         self._turns = QueryTurns()
-        self._queues = ReplyQueues(self._counters, self._turns)
         self._work_queue = WorkQueue("fogft-probes", self._counters)
+        self._queues = ReplyQueues(
+            self._counters, self._turns, thin=self._thin, later=self._work_queue.add
+        )
         self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
@@ -261,15 +262,7 @@ class ZenohListener:
             self._malformed("a payload that cannot be decompressed")
             self._refuse(header, stream, Refusal.MALFORMED)
             return
-        incoming = ZenohIncoming(
-            service,
-            header,
-            request,
-            stream=stream,
-            queues=self._queues,
-            work=self._work_queue,
-            thin=self._thin,
-        )
+        incoming = ZenohIncoming(service, header, request, stream, self._queues)
         try:
             on_request(incoming)
         except Exception:  # the others that came with it go on

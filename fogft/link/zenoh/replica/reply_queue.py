@@ -1,4 +1,7 @@
-"""Replies on their way out: a queue and a thread for each connection of a robot.
+"""Requests that came over Zenoh until they are answered, and their replies on the way out.
+
+A request is answered once, or refused where it is forgotten. Each connection of a robot has a queue
+and a thread.
 
 A reply to a frozen robot blocks until Zenoh gives that robot's session up. So each
 connection has its own thread; it ends when it has had nothing to do for a while. What cannot
@@ -6,7 +9,8 @@ block (`reply_streams`) leaves at once, from the thread that brings it, unless t
 
 Queries that are to be ended take the same way: that sends something, too.
 
-Owns: how replies become messages, their order and bounds. Not here: what is replied (`incoming`).
+Owns: that there is one answer; how replies become messages, their order and bounds. Not here: what
+is replied (`fogft.proxy.replica`).
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
 from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.model.refusal import Refusal
+from fogft.requests.load import Load
 
 log = logging.getLogger(__name__)
 
@@ -143,12 +148,21 @@ class ReplyQueues:
 
     Args:
         counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
+        thin: Whether the link of a connection was seen to be thin, by its token.
+        later: Has something done by a thread that may block; the collector of garbage calls it.
         idle_s: A thread that had nothing to send for so long ends.
     """
 
     def __init__(
-        self, counters: Counters, turns: QueryTurns | None = None, *, idle_s: float = _IDLE_S
+        self,
+        counters: Counters,
+        turns: QueryTurns | None = None,
+        *,
+        thin: Callable[[bytes], bool] = lambda token: False,
+        later: Callable[[Callable[[], None]], None] = lambda job: job(),
+        idle_s: float = _IDLE_S,
     ) -> None:
+        self.thin, self.later = thin, later
         self._counters = counters
         self._turns = turns or QueryTurns()
         self._idle_s = idle_s
@@ -270,3 +284,62 @@ class ReplyQueues:
         for queue in queues:
             if queue.thread is not None:
                 queue.thread.join(timeout_s / max(len(queues), 1))
+
+
+class ZenohIncoming:
+    """A request that came over Zenoh; see `port.Incoming`."""
+
+    __slots__ = (
+        *("_header", "_queues", "_streams"),
+        *("handling", "payload", "remaining_s", "request_id", "robot", "service"),
+    )
+
+    def __init__(
+        self,
+        service: str,
+        header: frame.RequestHeader,
+        payload: bytes,
+        stream: Stream,
+        queues: ReplyQueues,
+    ) -> None:
+        self._header = header
+        self.service = service
+        self.payload = payload
+        self.request_id = header.request_id
+        self.robot = header.robot
+        self.remaining_s = header.remaining_s
+        self.handling = header.handling
+        self._streams = [stream]  # taken by the first answer; list.pop is atomic
+        self._queues = queues
+
+    def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
+        """Send the serialised response. Never blocks. With `more`, others will soon follow."""
+        self._send(payload, "", load, more=more)
+
+    def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
+        """Send a refusal. Never blocks."""
+        self._send(b"", reason.text(detail), load, more=True)
+
+    def _send(self, payload: bytes, refusal: str, load: Load | None, *, more: bool) -> None:
+        try:
+            stream = self._streams.pop()
+        except IndexError:
+            return  # answered before
+        self.payload = b""
+        header = self._header
+        packs = header.may_pack or (header.reads_packed and self._queues.thin(header.token))
+        said = frame.encode_load(load)
+        reply = Reply(stream, header.request_id, payload, refusal, said, may_pack=packs)
+        self._queues.put(header.token, header.robot, reply, more=more)
+
+    def __del__(self) -> None:
+        """Refuse what its owner forgot: the robot must not wait for it until its deadline.
+
+        The collector may call this anywhere, even while a lock of ours is held; a
+        `SimpleQueue` may be put into from here.
+        """
+        if self._streams:
+            forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)
+            header = self._header
+            refuse = partial(self._queues.put, header.token, header.robot, forgotten, more=True)
+            self._queues.later(refuse)
