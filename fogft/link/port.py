@@ -11,17 +11,47 @@ Implementations: `fogft.link.zenoh.robot.link` and `replica.listener`, `tests.fa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
-from fogft.link.send_options import SendOptions
+from fogft.model.choices import Compression, Freshness
 from fogft.model.plain import Count, Line, Seconds
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
+from fogft.model.spec import ServiceSpec
 from fogft.model.type_definition import Definition
 from fogft.records.record import Record, SignedRecord
 from fogft.requests.load import Handling, Load
+
+
+@dataclass(frozen=True)
+class SendOptions:
+    """Which services want the newest first, no compression, or a deadline on the way.
+
+    Attributes:
+        latest: Those of which the newest request goes first.
+        plain: Those whose payloads are never compressed.
+        timed: Those whose requests nobody wants after their time. Of others, such as topics and the
+            orders of a stateful service, it only says when they are sent again.
+    """
+
+    latest: frozenset[str] = frozenset()
+    plain: frozenset[str] = frozenset()
+    timed: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, services: Iterable[ServiceSpec]) -> SendOptions:
+        """Return what these services want."""
+        known = tuple(services)
+        return cls(
+            frozenset(s.name for s in known if s.freshness is Freshness.LATEST),
+            frozenset(s.name for s in known if s.compression is Compression.OFF),
+            frozenset(s.name for s in known if s.state is None),
+        )
+
+
+DEFAULT_OPTIONS = SendOptions()
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fogft.link.port import Answer, Dialer, Link, LinkEvents, LinkStatus, Peer
-from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
+from fogft.link.port import (
+    DEFAULT_OPTIONS,
+    Answer,
+    Dialer,
+    Link,
+    LinkEvents,
+    LinkStatus,
+    Peer,
+    SendOptions,
+)
 from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec

@@ -4,7 +4,7 @@ An ordinary rclpy node on an executor and a thread of its own, in the context of
 takes requests. Other threads only put work into its queue, so nothing here ever stands in a
 request's way, and whatever goes wrong here is logged and ends there.
 
-Owns: that node and its thread. Not here: what is said (`fogft.proxy.robot.diagnostics_node`),
+Owns: that node and its thread. Not here: what is said (`fogft.proxy.robot.diagnostics`),
 the log (`ros_log`).
 """
 

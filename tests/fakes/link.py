@@ -14,8 +14,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from fogft.errors import WireError
-from fogft.link.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnswer
-from fogft.link.send_options import SendOptions
+from fogft.link.port import Answer, Incoming, LinkEvents, Peer, Probe, ProbeAnswer, SendOptions
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.records.record import Record, SignedRecord

@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest import mock
 
 from fogft.link.deadline_filter import DeadlineFilter
-from fogft.link.send_options import SendOptions
+from fogft.link.port import SendOptions
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import (

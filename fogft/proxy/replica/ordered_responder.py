@@ -78,11 +78,6 @@ class OrderedResponder:
         """Requests that are held and not yet answered."""
         return self._machine.in_flight
 
-    @property
-    def used(self) -> bool:
-        """Whether the service's state may be any other than its first."""
-        return self._machine.busy or self._machine.position != orders.START
-
     def use(self, clients: Clients | None) -> None:
         """Set the clients of the local services; None while ROS is left."""
         with self._lock:

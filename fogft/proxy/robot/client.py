@@ -24,11 +24,10 @@ from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.proxy.robot.links import Links
+from fogft.proxy.robot.links import Define, Links, TypeCheck
 from fogft.proxy.robot.proxied_service import ProxiedService
 from fogft.proxy.robot.sending import key_of
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
-from fogft.proxy.robot.type_check import Define, TypeCheck
 from fogft.records.record import SignedRecord
 from fogft.requests.load import NEVER
 from fogft.ros.port import RosNode, RosTopics

@@ -1,19 +1,28 @@
-"""What ``/diagnostics`` says of a pool, of each service, topic and replica. Pure.
+"""What people see of a client proxy in ROS, and what they change there.
 
-Made of the client proxy's report. Requests that got no answer are worth a warning for a while,
-so the counters of the last half minute are remembered.
+What ``/diagnostics`` says of the pool, of each service, topic and replica is made of the proxy's
+report. Requests that got no answer are worth a warning for a while, so the counters of half a
+minute are remembered.
 
-Owns: levels, sentences, and the values below them. Not here: publishing (`fogft.ros.visible`).
+Owns: levels, sentences, and the values below them; when they are told. Not here: publishing
+(`fogft.ros.visible`), the policies that parameters set (`fogft.poolfile.policy_parameters`).
 """
 
 from __future__ import annotations
 
+import logging
+import threading
 from collections import deque
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
+from fogft.model.spec import ServiceSpec
 from fogft.model.topic import PREFIX
+from fogft.poolfile.policy_parameters import FieldCheck, Policies
 from fogft.ros.port import Level, Status
+
+if TYPE_CHECKING:
+    from fogft.ros.visible import VisibleNode
 
 WINDOW_S = 30.0
 CREDENTIALS_SOON_S = 3600.0
@@ -191,3 +200,68 @@ def _told(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+log = logging.getLogger(__name__)
+
+_DIAGNOSE_EVERY_S = 1.0
+
+
+class SeenFromRos:
+    """The proxied services and the pool, as ROS's tools see them.
+
+    Args:
+        make_visible: Makes the visible node, given who judges parameters; returns None where
+            there is none, and then nothing is shown or set.
+        check_field: Says why a type's response has no boolean field of that name.
+    """
+
+    def __init__(
+        self,
+        pool: str,
+        robot: str,
+        make_visible: Callable[[Callable[[Mapping[str, Any]], str]], VisibleNode | None],
+        check_field: FieldCheck,
+    ) -> None:
+        self._policies = Policies(check_field)
+        self._lock = threading.Lock()
+        self._was_set = threading.Event()
+        self._diagnosis = Diagnosis(pool, robot)
+        self._diagnosed = float("-inf")
+        self._visible = make_visible(self._set)
+
+    def follow(self, specs: Iterable[ServiceSpec]) -> tuple[ServiceSpec, ...]:
+        """Take the pool file's services; return them as they are to be proxied."""
+        with self._lock:
+            self._policies.follow(specs)
+            return self._take()
+
+    def changed(self) -> tuple[ServiceSpec, ...] | None:
+        """Return the services as they are to be proxied if a parameter was set since; else None."""
+        if not self._was_set.is_set():
+            return None
+        with self._lock:
+            self._was_set.clear()
+            return self._take()
+
+    def _take(self) -> tuple[ServiceSpec, ...]:
+        if self._visible is not None:
+            self._visible.show(self._policies.parameters())
+        return self._policies.services()
+
+    def _set(self, values: Mapping[str, Any]) -> str:
+        """Judge what somebody sets (the visible node's thread)."""
+        with self._lock:
+            try:
+                self._policies.set(values)
+            except ValueError as error:
+                return str(error)
+        log.info("policy_set values=%s", dict(values))
+        self._was_set.set()
+        return ""
+
+    def diagnose(self, report: Callable[[], Mapping[str, Any]], now: float) -> None:
+        """Publish the statuses of a report, once a second."""
+        if self._visible is not None and now >= self._diagnosed + _DIAGNOSE_EVERY_S:
+            self._diagnosed = now
+            self._visible.diagnose(self._diagnosis.of(report(), now))

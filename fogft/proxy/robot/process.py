@@ -35,7 +35,7 @@ from fogft.proxy.order_mark import OrderMark
 from fogft.proxy.robot import standby as in_line
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy
-from fogft.proxy.robot.diagnostics_node import SeenFromRos
+from fogft.proxy.robot.diagnostics import SeenFromRos
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.manager_restart import ManagerRestart

@@ -22,8 +22,7 @@ from fogft.link.compression import Compression
 from fogft.link.credit import Credit
 from fogft.link.deadline_filter import DeadlineFilter
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
-from fogft.link.port import Answer
-from fogft.link.send_options import SendOptions
+from fogft.link.port import Answer, SendOptions
 from fogft.link.window import (
     ATTEMPTS_LIMIT,
     BatchBuffer,

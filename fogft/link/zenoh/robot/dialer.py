@@ -11,8 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from fogft.errors import CredentialError, WireError
-from fogft.link.port import LinkEvents, Peer
-from fogft.link.send_options import SendOptions
+from fogft.link.port import LinkEvents, Peer, SendOptions
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.settings import LinkSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from fogft.link.large_send_gate import LargeSendGate
-from fogft.link.send_options import DEFAULT_OPTIONS, SendOptions
+from fogft.link.port import DEFAULT_OPTIONS, SendOptions
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.records.signing import Signer

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from fogft.link import batch_frames, frame
 from fogft.link.cancellations import Cancellations
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
-from fogft.link.port import Answer
-from fogft.link.send_options import DEFAULT_OPTIONS
+from fogft.link.port import DEFAULT_OPTIONS, Answer
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import unpacking
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks

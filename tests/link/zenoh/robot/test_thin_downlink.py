@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fogft.link.send_options import SendOptions
+from fogft.link.port import SendOptions
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
