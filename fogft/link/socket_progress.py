@@ -111,12 +111,8 @@ class SocketProgress:
         self._last_at = 0.0
         self._progress_at: float | None = None  # None: nothing is outstanding
         self._waited_s = 0.0  # with a queue, since the last look that found it moved
-        self._rate: float | None = None
-
-    @property
-    def bytes_per_s(self) -> float | None:
-        """Measured while more waited than the kernel could send at once; None before that."""
-        return self._rate
+        # Measured while more waited than the kernel could send at once; None before that
+        self.bytes_per_s: float | None = None
 
     def look(self, flow: Flow, now: float, sending_for_s: float = 0.0) -> float:
         """Take a new count; return for how many of the seconds since the last one bulk moved.
@@ -152,8 +148,8 @@ class SocketProgress:
         return 0.0
 
     def _measured(self, rate: float) -> None:
-        old = self._rate
-        self._rate = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
+        old = self.bytes_per_s
+        self.bytes_per_s = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
 
     def left_bytes(self, now: float, bytes_per_s: float) -> float:
         """Return what of the outstanding bytes will not have arrived yet."""

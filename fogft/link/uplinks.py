@@ -56,7 +56,7 @@ class UplinksLink:
         self, dialer: UplinkDialer, peer: Peer, services: Mapping[str, str], events: LinkEvents
     ) -> None:
         self._dialer = dialer
-        self._peer = peer
+        self.peer = peer
         self._events = events
         self._lock = threading.Lock()
         self._attempts: dict[bytes, _Attempt] = {}
@@ -65,16 +65,12 @@ class UplinksLink:
         self._current: int | None = None
         self._closed = False
         self._links: list[Link] = []
-        for interface in dialer.interfaces:
+        self._interfaces = dialer.interfaces
+        for interface in self._interfaces:
             one = replace(peer, interface=interface)
-            self._links.append(dialer.inner.dial(one, services, _Events(self, len(self._links))))
+            self._links.append(dialer.inner.dial(one, services, self))
 
     # -- port.Link ------------------------------------------------------------------------
-
-    @property
-    def peer(self) -> Peer:
-        """Whom it talks to."""
-        return self._peer
 
     @property
     def usable(self) -> bool:
@@ -209,8 +205,9 @@ class UplinksLink:
 
     # -- events of the uplinks' links (their threads) -------------------------------------
 
-    def ended(self, index: int, answer: Answer) -> None:
+    def answered(self, link: Link, answer: Answer) -> None:
         """Take the end of an attempt on one uplink: the first answer, or the last refusal."""
+        index = self._interfaces.index(link.peer.interface)
         with self._lock:
             attempt = self._attempts.get(answer.request_id)
             if attempt is None:
@@ -241,36 +238,16 @@ class UplinksLink:
             self._links[index].forget(request_id)
         self._events.answered(self, answer)
 
-    def late(self, answer: Answer) -> None:
+    def late(self, link: Link, answer: Answer) -> None:
         """Tell of work in vain; a second copy of an answer is none: the replica ran it once."""
         with self._lock:
             copy = answer.request_id in self._answered
         if not copy:
             self._events.late(self, answer)
 
-    def changed(self) -> None:
+    def changed(self, link: Link) -> None:
         """Tell that an uplink has changed."""
         self._events.changed(self)
-
-
-class _Events:
-    """Tells a link of several uplinks what one of them says."""
-
-    def __init__(self, owner: UplinksLink, index: int) -> None:
-        self._owner = owner
-        self._index = index
-
-    def answered(self, link: Link, answer: Answer) -> None:
-        """One attempt on this uplink has ended."""
-        self._owner.ended(self._index, answer)
-
-    def late(self, link: Link, answer: Answer) -> None:
-        """An attempt has ended that was forgotten."""
-        self._owner.late(answer)
-
-    def changed(self, link: Link) -> None:
-        """This uplink's state, or room, has changed."""
-        self._owner.changed()
 
 
 class UplinkDialer:

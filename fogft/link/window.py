@@ -56,17 +56,12 @@ class LinkWindow:
         self._limit_bytes = limit_bytes
         self._lock = threading.Lock()
         self._open: dict[bytes, OpenAttempt] = {}
-        self._bytes = 0
+        self.held_bytes = 0  # bytes of all open attempts
         self._closed = False
         self._declined = False
 
     def __len__(self) -> int:
         return len(self._open)
-
-    @property
-    def held_bytes(self) -> int:
-        """Bytes of all open attempts."""
-        return self._bytes
 
     def admit(self, attempt: OpenAttempt) -> bool:
         """Take an attempt in; False when full, closed, or its request is open already."""
@@ -74,12 +69,12 @@ class LinkWindow:
         with self._lock:
             if self._closed or attempt.request_id in self._open:
                 return False
-            full = len(self._open) >= self._limit or self._bytes + size > self._limit_bytes
+            full = len(self._open) >= self._limit or self.held_bytes + size > self._limit_bytes
             if full and self._open:
                 self._declined = True
                 return False
             self._open[attempt.request_id] = attempt
-            self._bytes += size
+            self.held_bytes += size
             return True
 
     def attempts(self) -> list[OpenAttempt]:
@@ -97,7 +92,7 @@ class LinkWindow:
             if self._open.get(attempt.request_id) is not attempt:
                 return False
             del self._open[attempt.request_id]
-            self._bytes -= attempt.size
+            self.held_bytes -= attempt.size
             return True
 
     def forget(self, request_id: bytes) -> OpenAttempt | None:
@@ -105,7 +100,7 @@ class LinkWindow:
         with self._lock:
             attempt = self._open.pop(request_id, None)
             if attempt is not None:
-                self._bytes -= attempt.size
+                self.held_bytes -= attempt.size
             return attempt
 
     def regained_room(self) -> bool:
@@ -115,7 +110,7 @@ class LinkWindow:
         with self._lock:
             # A quarter free: a window that is full to the brim is not announced for each slot.
             roomy = len(self._open) <= self._limit * 3 // 4
-            if roomy and self._bytes <= self._limit_bytes * 3 // 4:
+            if roomy and self.held_bytes <= self._limit_bytes * 3 // 4:
                 self._declined = False
                 return True
             return False
@@ -126,7 +121,7 @@ class LinkWindow:
             self._closed = True
             ended = list(self._open.values())
             self._open.clear()
-            self._bytes = 0
+            self.held_bytes = 0
             return ended
 
 

@@ -32,7 +32,7 @@ class OrderedLog:
         self.start = start
         self.checkpoint: Checkpoint | None = None
         self._entries: deque[bytes] = deque()
-        self._bytes = 0
+        self.held_bytes = 0  # bytes of all entries, without the checkpoint
         self._entries_limit = entries_limit
         self._bytes_limit = bytes_limit
 
@@ -45,20 +45,16 @@ class OrderedLog:
         return self.start + len(self._entries)
 
     @property
-    def held_bytes(self) -> int:
-        """Bytes of all entries, without the checkpoint."""
-        return self._bytes
-
-    @property
     def half_full(self) -> bool:
         """Whether it is time for a checkpoint."""
-        return 2 * len(self._entries) >= self._entries_limit or 2 * self._bytes >= self._bytes_limit
+        full = len(self._entries) / self._entries_limit, self.held_bytes / self._bytes_limit
+        return max(full) >= 0.5
 
     def has_room(self, size: int) -> bool:
         """Whether a request of this size can be appended."""
         if not self._entries:
             return True
-        within = self._bytes + size <= self._bytes_limit
+        within = self.held_bytes + size <= self._bytes_limit
         return within and len(self._entries) < self._entries_limit
 
     def append(self, payload: bytes) -> int:
@@ -70,7 +66,7 @@ class OrderedLog:
         if not self.has_room(len(payload)):
             raise ValueError("the log is full")
         self._entries.append(payload)
-        self._bytes += len(payload)
+        self.held_bytes += len(payload)
         return self.last
 
     def get(self, index: int) -> bytes:
@@ -98,7 +94,7 @@ class OrderedLog:
     def drop(self, index: int) -> None:
         """Drop everything up to a number. A checkpoint before it is of no use any more."""
         while self._entries and self.start < index:
-            self._bytes -= len(self._entries.popleft())
+            self.held_bytes -= len(self._entries.popleft())
             self.start += 1
         if self.checkpoint is not None and self.checkpoint.index < self.start:
             self.checkpoint = None

@@ -56,22 +56,17 @@ class TokenBucket:
     def __init__(self, share: float, capacity: float) -> None:
         self._share = share
         self._capacity = capacity
-        self._tokens = capacity
-
-    @property
-    def tokens(self) -> float:
-        """What is there now."""
-        return self._tokens
+        self.tokens = capacity  # what is there now
 
     def request(self) -> None:
         """Count a request."""
-        self._tokens = min(self._capacity, self._tokens + self._share)
+        self.tokens = min(self._capacity, self.tokens + self._share)
 
     def take(self) -> bool:
         """Take a token, if there is one."""
-        if self._tokens < 1.0:
+        if self.tokens < 1.0:
             return False
-        self._tokens -= 1.0
+        self.tokens -= 1.0
         return True
 
 

@@ -63,23 +63,18 @@ class Server:
         self._fault = fault
         self._token = token
         self._on_request = on_request
-        self._open = True
+        self.is_open = True  # whether it is offered
         self._faces: dict[str, tuple[Any, Any]] = {}
         self.name, self.type = token("").service, token("").type
         self._worker = _worker(self.name)
         self._declare(hash)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it is offered."""
-        return self._open
 
     def clients_hash(self, hash: str) -> None:
         """Offer it to a client whose type has this hash, too."""
         self._worker.add(partial(self._declare, hash))
 
     def _declare(self, hash: str) -> None:
-        if not self._open or hash in self._faces:
+        if not self.is_open or hash in self._faces:
             return
         if not all(naming.may_be_same(hash, known) for known in self._faces):
             log.error(
@@ -98,7 +93,7 @@ class Server:
         self._faces[hash] = (queryable, self._session.liveliness().declare_token(str(token)))
 
     def _heard(self, query: Any) -> None:
-        if not self._open or query.payload is None or query.attachment is None:
+        if not self.is_open or query.payload is None or query.attachment is None:
             return  # dropped: who asks is told that no answer comes
         try:
             attachment = query.attachment.to_bytes()
@@ -117,11 +112,11 @@ class Server:
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send the serialised response. Nothing happens once the service is withdrawn."""
         _check(self._fault(payload), payload)
-        if self._open:
+        if self.is_open:
             self._pacer.respond(handle, payload)
 
     def _reply(self, handle: _Handle, payload: bytes) -> None:
-        if self._open:
+        if self.is_open:
             self._answered_ns[handle.client] = time.time_ns()
             if len(self._answered_ns) > _CLIENTS_KEPT:
                 self._answered_ns.popitem(last=False)
@@ -141,8 +136,8 @@ class Server:
 
     def close(self) -> None:
         """Withdraw the service. Repeatable."""
-        if self._open:
-            self._open = False
+        if self.is_open:
+            self.is_open = False
             self._pacer.close()
             self._worker.add(self._undeclare)
             self._worker.close()
@@ -181,14 +176,9 @@ class Client:
         self._waiting: dict[int, _Waiting] = {}
         self._asked = 0
         self._errors = 0
-        self._open = True
+        self.is_open = True  # whether it may still be called with
         self._lock = threading.Lock()
         self._worker = _worker(self._name)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it may still be called with."""
-        return self._open
 
     def available(self) -> bool:
         """Whether anybody offers this service."""
@@ -200,14 +190,14 @@ class Client:
 
     def servers(self) -> int:
         """Count those who offer it."""
-        return len(self._hashes()) if self._open else 0
+        return len(self._hashes()) if self.is_open else 0
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         """Send a serialised request; return its ticket. Raises RosError: nobody offers it."""
         _check(self._fault(payload), payload)
         hashes = self._hashes()
         with self._lock:
-            if not self._open:
+            if not self.is_open:
                 raise RosError(f"the client of `{self._name}` is closed")
             if not hashes:
                 raise RosError(f"nobody offers `{self._name}`")
@@ -276,9 +266,9 @@ class Client:
     def close(self) -> None:
         """Withdraw the client. Repeatable."""
         with self._lock:
-            if not self._open:
+            if not self.is_open:
                 return
-            self._open = False
+            self.is_open = False
             left, self._waiting = self._waiting, {}
         for waiting in left.values():
             self._worker.add(waiting.cancellation.cancel)

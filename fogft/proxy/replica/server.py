@@ -84,7 +84,7 @@ class ServerProxy:
         self._lease = HeldLease(clock)
         self._topics = TopicsOnReplica(topics, clock)
         self._incarnation = secrets.token_hex(8)
-        self._ready: frozenset[str] = frozenset()
+        self.ready: frozenset[str] = frozenset()  # services that can answer now
         self._node: RosNode | None = None
         self._clients: dict[str, RosClient] = {}
         self._revoked: frozenset[str] = frozenset()
@@ -94,9 +94,9 @@ class ServerProxy:
             if service.state is not None and make_state is not None:
                 state = make_state(service.state)
                 self._ordered[service.name] = OrderedResponder(service.name, state, clock)
-        self._draining = self._at_risk = False
+        self.draining = self._at_risk = False  # as the machine was told by its cloud
         self.responder = Responder(
-            lambda name: name in self._ready,
+            lambda name: name in self.ready,
             max_in_flight=max_in_flight,
             limits=limits_of(services),
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
@@ -105,7 +105,7 @@ class ServerProxy:
         )
         self._goals = GoalsOnce(
             [s.name for s in services if s.part is Part.GOAL],
-            lambda name: name in self._ready,
+            lambda name: name in self.ready,
             clock=clock,
         )
 
@@ -135,7 +135,7 @@ class ServerProxy:
         self.renew(() if lease is None else (lease,))
         died = self._supervisor.poll(at_work=self.responder.at_work > 0)
         if died or self._node is None or not self._node.alive:
-            self._ready = frozenset()
+            self.ready = frozenset()
             if died:
                 self._goals.crashed()
             self._crashed()
@@ -154,7 +154,7 @@ class ServerProxy:
         if self._node is None or not self._supervisor.alive:
             self._offering.reset()
             return
-        complete = len(self._ready) == len(self._offering.services)
+        complete = len(self.ready) == len(self._offering.services)
         for service in self._offering.look(self._node, complete=complete):
             name, type_name = service.name, service.type
             log.info("service_found replica=%s service=%s type=%s", self._id, name, type_name)
@@ -169,10 +169,10 @@ class ServerProxy:
     def _look_for_services(self) -> None:
         there = {name for name, client in self._clients.items() if self._can_call(name, client)}
         ready = frozenset(there if self._supervisor.alive else ())
-        gone = self._ready - ready
-        if ready != self._ready:
+        gone = self.ready - ready
+        if ready != self.ready:
             log.info("services_ready replica=%s ready=%s", self._id, sorted(ready))
-            self._ready = ready
+            self.ready = ready
         for name in gone | self._replaced():
             log.warning("service_lost replica=%s service=%s", self._id, name)
             if name in self._ordered and self._supervisor.alive:
@@ -220,23 +220,13 @@ class ServerProxy:
         return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
 
     @property
-    def ready(self) -> frozenset[str]:
-        """Services that can answer now."""
-        return self._ready
-
-    @property
     def idle(self) -> bool:
         """Whether all can answer, and nobody waits for it."""
         return (
-            len(self._ready) == len(self._offering.services) > 0
+            len(self.ready) == len(self._offering.services) > 0
             and not self.responder.in_flight
             and not (self._topics or self._goals or self._ordered)
         )
-
-    @property
-    def draining(self) -> bool:
-        """Whether the replica is draining."""
-        return self._draining
 
     @property
     def endpoint(self) -> str:
@@ -267,7 +257,7 @@ class ServerProxy:
         replica; a rebalance is a hint, and the replica serves on as before.
         """
         if notice.kind is NoticeKind.PREEMPTION:
-            self._draining = True
+            self.draining = True
         else:
             self._at_risk = True
 
@@ -279,7 +269,7 @@ class ServerProxy:
             "limits": self.responder.limits,
             "refused": {r.value: n for r, n in self.responder.refused.items()},
             "services": {s.name: s.name in answering for s in self._offering.services},
-            "draining": self._draining,
+            "draining": self.draining,
             "lease_left_s": self._lease.left_s,
             "restarts": max(self._supervisor.restarts, 0),
             "wire": dict(self._listener.counters()),
@@ -339,8 +329,8 @@ class ServerProxy:
     def _answering(self) -> frozenset[str]:
         """Return the services that can answer: found, and in the present state."""
         if not self._ordered:
-            return self._ready
-        return self._ready - {name for name, one in self._ordered.items() if not one.ready}
+            return self.ready
+        return self.ready - {name for name, one in self._ordered.items() if not one.ready}
 
     def _passing(self) -> frozenset[str]:
         return self._topics.ready() if self._topics and self._supervisor.alive else frozenset()
@@ -352,7 +342,7 @@ class ServerProxy:
             generation=self._id.generation,
             incarnation=self._incarnation,
             ready=self._answering() | self._passing(),
-            draining=self._draining,
+            draining=self.draining,
             at_risk=self._at_risk,
             restarts=max(self._supervisor.restarts, 0),
             in_flight=self.responder.in_flight
@@ -371,7 +361,7 @@ class ServerProxy:
 
     def _detail(self) -> str:
         services = self._offering.services
-        if services and len(self._ready) == len(services):
+        if services and len(self.ready) == len(services):
             return self._state_detail() or self._topics.trouble or self._hanging_detail()
         for why in self._not_usable.values():
             return why
@@ -381,7 +371,7 @@ class ServerProxy:
             if not self._supervisor.last_exit:
                 return "`run` has not started"
             return f"`run` {self._supervisor.last_exit}: see `fogft logs {self._id.slot}`"
-        return self._offering.missing(self._ready)
+        return self._offering.missing(self.ready)
 
     def _state_detail(self) -> str:
         for name, ordered in self._ordered.items():
@@ -396,7 +386,7 @@ class ServerProxy:
 
     def close(self) -> None:
         """Stop the command, leave the wire and ROS."""
-        self._ready = frozenset()
+        self.ready = frozenset()
         self._supervisor.stop()
         self._goals.crashed()
         self._crashed()

@@ -77,12 +77,12 @@ class ZenohListener:
         handshakes: HandshakeLog | None = None,
         certificate_name: str = "",
     ) -> None:
-        self._endpoint = _with_port(listen)
+        self.endpoint = _with_port(listen)  # ``host:port`` as bound
         self._handshakes = handshakes
         self._reaper: ConnectionReaper | None = None
         self._id = id
         self._settings = settings or LinkSettings()
-        self._config = replica_settings(self._endpoint, id, credentials, self._settings)
+        self._config = replica_settings(self.endpoint, id, credentials, self._settings)
         self._sessions = AuthenticatedSessions(
             id.pool_uid,
             certificate_name or id.certificate_name,
@@ -110,12 +110,7 @@ class ZenohListener:
 
     @property
     def _port(self) -> int:
-        return int(self._endpoint.rpartition(":")[2])
-
-    @property
-    def endpoint(self) -> str:
-        """``host:port`` as bound."""
-        return self._endpoint
+        return int(self.endpoint.rpartition(":")[2])
 
     def serve(
         self,
@@ -133,7 +128,7 @@ class ZenohListener:
             session = self._session = zenoh.open(to_zenoh(self._config))
         except zenoh.ZError as error:
             raise WireError(
-                f"cannot listen at `{self._endpoint}`: {str(error).split(' at /')[0]}",
+                f"cannot listen at `{self.endpoint}`: {str(error).split(' at /')[0]}",
                 "see that the port is free and that the certificate, its key and the CA exist",
             ) from error
         self._work_queue.start()

@@ -49,7 +49,7 @@ class AuthenticatedSessions:
         self._lock = threading.Lock()
         self._tokens: dict[bytes, str] = {}
         self._holders: OrderedDict[str, OrderedDict[bytes, None]] = OrderedDict()
-        self._revoked: frozenset[str] = frozenset()
+        self.revoked: frozenset[str] = frozenset()  # common names that are let in no more
 
     def greet(self, greeting: Greeting) -> None:
         """Let a connection in, or find that it was let in before.
@@ -83,7 +83,7 @@ class AuthenticatedSessions:
     def _admit(self, token: bytes, holder: Holder) -> None:
         name = holder.common_name
         with self._lock:
-            if name in self._revoked:
+            if name in self.revoked:
                 raise NotAdmittedError(Refusal.REVOKED, f"`{name}` is revoked")
             if self._tokens.get(token, name) != name:
                 raise NotAdmittedError(Refusal.NOT_ADMITTED, "a token that is another's")
@@ -112,14 +112,9 @@ class AuthenticatedSessions:
     def revoke(self, names: Collection[str]) -> None:
         """Let these holders in no more. Names that were revoked before stay so."""
         with self._lock:
-            self._revoked |= frozenset(names)
-            for name in self._revoked & self._holders.keys():
+            self.revoked |= frozenset(names)
+            for name in self.revoked & self._holders.keys():
                 self._forget(name)
-
-    @property
-    def revoked(self) -> frozenset[str]:
-        """Common names that are let in no more."""
-        return self._revoked
 
     @property
     def names(self) -> list[str]:

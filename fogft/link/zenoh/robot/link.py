@@ -55,7 +55,7 @@ class ZenohLink:
     ) -> None:
         self._shared = shared
         self._on_close = on_close
-        self._peer = peer
+        self.peer = peer
         self._services = dict(services)
         self._events = events
         self._suspect_after_s = shared.suspect_after_s
@@ -75,7 +75,8 @@ class ZenohLink:
         # Written by the link's thread only; `_live` is set exactly while the state is UP.
         self._live: Connection | None = None
         self._state = LinkState.CONNECTING
-        self._ready: frozenset[str] = frozenset()
+        # Services that the last probe answer called ready; empty unless UP
+        self.ready: frozenset[str] = frozenset()
         self._detail = "not reached yet"
         self._opening = Opening(peer, shared.settings)
         self._opened = 0
@@ -90,11 +91,6 @@ class ZenohLink:
     # -- port.Link ------------------------------------------------------------------------
 
     @property
-    def peer(self) -> Peer:
-        """Whom it talks to."""
-        return self._peer
-
-    @property
     def usable(self) -> bool:
         """Whether requests may be offered."""
         return self._live is not None
@@ -104,11 +100,6 @@ class ZenohLink:
         """Whether an attempt is just being handed to the network."""
         live = self._live
         return live is not None and live.attempts.sending
-
-    @property
-    def ready(self) -> frozenset[str]:
-        """Services that the last probe answer called ready; empty unless UP."""
-        return self._ready
 
     @property
     def draining(self) -> bool:
@@ -183,7 +174,7 @@ class ZenohLink:
         join_at_exit(self._thread)
         self._wake.set()
         live, self._live = self._live, None
-        self._ready = frozenset()
+        self.ready = frozenset()
         if live is not None:
             live.close()
         self._on_close(self)
@@ -225,7 +216,7 @@ class ZenohLink:
                     break
                 connection = self._succeed(connection)  # it makes way for one with new credentials
         except Exception as error:  # a mistake of ours must not end the link for good
-            log.exception("link_failed replica=%s", self._peer.id.short)
+            log.exception("link_failed replica=%s", self.peer.id.short)
             if connection is not None:
                 connection.lost_because = f"{type(error).__name__}: {error}"
         if connection is not None:
@@ -246,7 +237,7 @@ class ZenohLink:
         new = self._open()
         if new is not None and self._attend(new, until_up=True) and new is self._live:
             self._retiring.append(old)
-            log.info("link_renewed replica=%s", self._peer.id.short)
+            log.info("link_renewed replica=%s", self.peer.id.short)
             return new
         if new is not None:
             self._say(new.lost_because)
@@ -270,7 +261,7 @@ class ZenohLink:
                 settings.to_zenoh(
                     {**self._config, **settings.open_within(self._opening.timeout_s)}
                 ),
-                self._peer,
+                self.peer,
                 self._services,
                 self._shared,
                 self._tell,
@@ -343,14 +334,14 @@ class ZenohLink:
         late, left_s = self._probing.late(now)
         if late and self._live is not None:
             silent_s = self._probing.silent_s(now)
-            log.info("link_doubted replica=%s silent_s=%.2f", self._peer.id.short, silent_s)
+            log.info("link_doubted replica=%s silent_s=%.2f", self.peer.id.short, silent_s)
             self._changed()
         return left_s
 
     def _next_probe_in_s(self, *, up: bool) -> float:
         if not up:
             return _FIRST_PROBES_EVERY_S
-        if self._services.keys() <= self._ready:
+        if self._services.keys() <= self.ready:
             return self._probe_every_s
         return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
 
@@ -359,7 +350,7 @@ class ZenohLink:
         records = self._shared.records
         if records == connection.told:
             return
-        id = self._peer.id
+        id = self.peer.id
         try:
             connection.tell_records(names.records_key(id.pool_uid, id.slot), records)
         except zenoh.ZError as error:
@@ -403,16 +394,16 @@ class ZenohLink:
     ) -> None:
         """A connection's replica has answered: from now on it is the live one."""
         news = self._live is not connection or answer != known
-        self._ready = answer.ready
+        self.ready = answer.ready
         connection.attempts.packs = ZLIB in answer.accepts
         connection.attempts.packs_answers = ZLIB_ANSWERS in answer.accepts
         if self._live is not connection:
             self._state = LinkState.UP
             self._detail = ""
             self._live = connection
-            log.info("link_up replica=%s rtt_s=%.4f", self._peer.id.short, self._probing.rtt_s)
+            log.info("link_up replica=%s rtt_s=%.4f", self.peer.id.short, self._probing.rtt_s)
         if self._closed:  # by another thread, just now
-            self._live, self._ready = None, frozenset()
+            self._live, self.ready = None, frozenset()
         elif news:
             self._changed()
 
@@ -420,11 +411,11 @@ class ZenohLink:
         """Let go of a connection: nothing more is offered to it, what is open there is lost."""
         was_up = self._live is not None
         self._live = None
-        self._ready = frozenset()
+        self.ready = frozenset()
         self._renew.clear()  # the next one begins with what there is now
         if was_up:
             self._state = LinkState.SUSPECT
-            log.warning("link_lost replica=%s reason=%r", self._peer.id.short,
+            log.warning("link_lost replica=%s reason=%r", self.peer.id.short,
                         connection.lost_because)  # fmt: skip
         if not self._closed:
             self._probing.nobody_to_ask(time.monotonic())
@@ -445,7 +436,7 @@ class ZenohLink:
     def _say(self, detail: str) -> None:
         if detail != self._detail:
             self._detail = detail
-            log.info("link_detail replica=%s detail=%r", self._peer.id.short, detail)
+            log.info("link_detail replica=%s detail=%r", self.peer.id.short, detail)
             self._changed()
 
     # -- to the owner (any thread) --------------------------------------------------------
@@ -464,4 +455,4 @@ class ZenohLink:
         try:
             self._events.changed(self)
         except Exception:
-            log.exception("change_not_taken replica=%s", self._peer.id.short)
+            log.exception("change_not_taken replica=%s", self.peer.id.short)
