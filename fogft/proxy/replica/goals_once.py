@@ -285,11 +285,13 @@ class GoalsOnce:
                 incoming.refuse(reason if known.begun_at is not None else Refusal.NOT_READY)
 
 
-def for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool]:
-    """Return what says whether an answer holds for the moment only.
+def for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool] | None:
+    """Return what says whether an answer holds for the moment only; None where none does.
 
     A replica that comes later is asked for a result as soon as it is given the goal: it may answer
     that before it knows the goal.
     """
     results = {s.name for s in services if s.part is Part.RESULT}
+    if not results:
+        return None
     return lambda service, answer: service in results and goals.is_unknown(answer)

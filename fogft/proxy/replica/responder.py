@@ -45,7 +45,8 @@ class Responder:
         outstanding: Requests passed on to one service at once, where no limit is given.
         limits: How many may be at work, by service, where it is not to be learned.
         latest: Services of which the newest request goes first.
-        passing: Whether a service's answer holds for the moment only: a copy is run anew.
+        passing: Whether a service's answer holds for the moment only: a copy is run anew; None
+            where none does.
         kept_bytes, kept_ids: As for `KnownRequests`.
 
     Attributes:
@@ -65,7 +66,7 @@ class Responder:
         outstanding: int = OUTSTANDING,
         limits: Mapping[str, int] | None = None,
         latest: Collection[str] = (),
-        passing: Callable[[str, bytes], bool] = lambda service, answer: False,
+        passing: Callable[[str, bytes], bool] | None = None,
         kept_bytes: int = 16 << 20,
         kept_ids: int = 32768,
         clock: Callable[[], float] = time.monotonic,
@@ -287,7 +288,7 @@ class Responder:
             waiting, job.waiting = job.waiting or [], None
             if waiting:
                 self._known.release(job)
-                if self._passing(job.service, payload):
+                if self._passing is not None and self._passing(job.service, payload):
                     self._known.forget(job)
                 elif not job.unwanted:
                     self._known.keep(job, payload)
