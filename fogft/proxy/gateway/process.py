@@ -138,7 +138,7 @@ class _Gateway:
 
     def _probed(self, probe: Probe) -> ProbeAnswer:
         behind = self._proxy.behind()
-        ready = self._proxy.ready
+        ready = self._proxy.links.ready
         return ProbeAnswer(
             slot=names.gateway_slot(self._holder.name),
             generation=self._holder.generation,
@@ -149,7 +149,7 @@ class _Gateway:
             work=numbers(self._forwarder.report()),
             detail="" if ready else "no replica behind it answers",
             behind=behind,
-            types=self._proxy.types_behind() if probe.describe else {},
+            types=self._proxy.links.types() if probe.describe else {},
         )
 
     # -- the loop -------------------------------------------------------------------------
@@ -164,7 +164,7 @@ class _Gateway:
         while not stop.is_set():
             watchdog.work()
             self._proxy.run_once()
-            self._forwarder.tick(self._proxy.ready)
+            self._forwarder.tick(self._proxy.links.ready)
             try_step(self._follow, self._config.membership)
             if self._certificate.changed():
                 self._renew()

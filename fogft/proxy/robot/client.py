@@ -22,7 +22,6 @@ from fogft.model import names
 from fogft.model.replica import Membership, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
-from fogft.model.type_definition import Definition
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.links import Define, Links, TypeCheck
 from fogft.proxy.robot.proxied_service import ProxiedService
@@ -73,7 +72,7 @@ class ClientProxy:
         self._clock = clock
         self._lock = threading.RLock()
         self._services: dict[str, ProxiedService] = {}
-        self._links = Links(dialer, self, self._keys)
+        self.links = Links(dialer, self, self._keys)  # to whom it talks
         self._version = (0, 0)
         self._membership: Membership | None = None
         self._through_gateways = False
@@ -106,14 +105,14 @@ class ClientProxy:
                 self._services[spec.name] = self._new_service(spec)
                 keys_changed = True
             if keys_changed:
-                self._links.redial()
+                self.links.redial()
         self._change()
 
     def pass_topics(self, topics: Iterable[TopicSpec], node: RosTopics) -> None:
         """Pass these topics and no others; `node` publishes and subscribes on the robot's side."""
         with self._lock:
             if self._topics.serve(topics, node):
-                self._links.redial()
+                self.links.redial()
         self._change()
 
     def _new_service(self, spec: ServiceSpec) -> ProxiedService:
@@ -159,10 +158,10 @@ class ClientProxy:
                 self._through_gateways = through
                 for service in self._services.values():
                     self._adopt(service)
-            for id in self._links.missing(members):
+            for id in self.links.missing(members):
                 self._drop(id)
             for member in members.values():
-                self._links.reach(member)
+                self.links.reach(member)
         self._change()
         return True
 
@@ -192,7 +191,7 @@ class ClientProxy:
     def redial(self) -> None:
         """Dial everybody anew, by other uplinks; what is in flight is sent again."""
         with self._lock:
-            self._links.redial()
+            self.links.redial()
         self._change()
 
     def _keys(self, slot: int) -> dict[str, str]:
@@ -201,7 +200,7 @@ class ClientProxy:
         return services | self._topics.keys(self._pool_uid, slot)
 
     def _drop(self, id: ReplicaId) -> None:
-        link = self._links.remove(id)
+        link = self.links.remove(id)
         self._type_check.forget(id)
         self._route()  # first out of every route, then closed: what was open there is LOST
         link.close()
@@ -252,7 +251,7 @@ class ClientProxy:
         with self._lock:
             if changed:
                 self._route()
-            for link in self._links:
+            for link in self.links:
                 link.flush()
             self._topics.tick()
             looks = [service.dispatcher.tick() for service in self._services.values()]
@@ -269,12 +268,12 @@ class ClientProxy:
         return self._type_check.differences(link, [s.spec for s in self._services.values()])
 
     def _route(self) -> None:
-        links = list(self._links)
+        links = list(self.links)
         self._topics.route({key_of(link): link for link in links})
         differ = {link.peer.id: self._differences(link) for link in links}
-        versions = self._links.versions()
-        leaving = frozenset(link.peer.id for link in links if self._links.draining(link))
-        hanging = self._links.hanging()
+        versions = self.links.versions()
+        leaving = frozenset(link.peer.id for link in links if self.links.draining(link))
+        hanging = self.links.hanging()
         for service in self._services.values():
             name = service.spec.name
             fit = [link for link in links if name not in differ[link.peer.id]]
@@ -287,11 +286,6 @@ class ClientProxy:
     def idle(self) -> bool:
         """Whether nothing has to be seen to, for all that is known."""
         return self._next_look == NEVER
-
-    @property
-    def uplink_suspected(self) -> bool:
-        """Whether all links that ever answered (two at least) have fallen silent together."""
-        return self._links.silent_together
 
     def report(self) -> dict[str, Any]:
         """Return links and services as `proxy-status.json` has them."""
@@ -306,29 +300,20 @@ class ClientProxy:
             "gateways": gateways,
             "services": services,
             "topics": self._topics.report(),
-            "uplink_suspected": self.uplink_suspected,
+            "uplink_suspected": self.links.silent_together,
             "certificate": self._dialer.certificate(),
         }
 
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
         dispatchers = [service.dispatcher for service in self._services.values()]
-        return self._links.reports(dispatchers, self._differences)
+        return self.links.reports(dispatchers, self._differences)
 
     def behind(self) -> tuple[GatewayView, ...]:
         """Return what is seen of each replica, as a gateway tells its robots."""
         with self._lock:
             links, _ = self._link_reports()
         return tuple(GatewayView.of(report) for report in links)
-
-    def types_behind(self) -> dict[str, Definition]:
-        """Return the definitions of types as replicas told them, as a gateway passes them on."""
-        return self._links.types()
-
-    @property
-    def ready(self) -> frozenset[str]:
-        """Services that at least one link calls ready."""
-        return self._links.ready
 
     @property
     def offered(self) -> list[str]:
@@ -362,7 +347,7 @@ class ClientProxy:
     def close(self) -> None:
         """Close every link. The ROS node is its owner's to close."""
         with self._lock:
-            for link in self._links:
+            for link in self.links:
                 self._drop(link.peer.id)
             self._topics.close()
 

@@ -20,8 +20,7 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import Any
 
 from fogft.errors import RosError
@@ -109,6 +108,7 @@ class Dispatcher:
         self._lock = self._ledger.lock
         self.outcomes = self._ledger.outcomes
         self._sender = Sender(self._ledger)
+        self.route, self.burst = self._sender.route, self._sender.burst
         self._delivery = Delivery(self._ledger, respond, empty_response, self._sender.forget)
 
     @property
@@ -168,10 +168,6 @@ class Dispatcher:
         if worth_logging(count["turned_away"]):
             log.warning("request_turned_away service=%s reason=%r count=%d",
                         self.spec.name, "pending is full", count["turned_away"])  # fmt: skip
-
-    def burst(self, begins: bool) -> None:
-        """Have what is submitted until the burst ends leave together, in few messages."""
-        self._sender.burst(begins)
 
     def cancel(self, request: bytes) -> None:
         """End a request that its caller no longer wants; unknown ids are fine."""
@@ -338,22 +334,6 @@ class Dispatcher:
                 log.info("hedging_changed service=%s to=%s", spec.name, spec.hedging.value)
         self._wake()
 
-    def route(
-        self,
-        links: Sequence[Link],
-        versions: Mapping[ReplicaId, str] = MappingProxyType({}),
-        leaving: Collection[ReplicaId] = (),
-        hanging: Collection[ReplicaId] = (),
-    ) -> None:
-        """Set the links that may be asked now, and offer them what they lack.
-
-        Args:
-            links: Those whose replica is ready; where replicas are brought to readiness, all.
-            versions: What each replica of the pool runs.
-            hanging: Those that say that the service answers nothing of what it has.
-        """
-        self._sender.route(links, versions, leaving, hanging)
-
     def began_anew(self, replica: int, about: Callable[[bytes], bool]) -> None:
         """Have a replica asked again: it has begun anew what some requests are `about`."""
         with self._lock:
@@ -403,7 +383,11 @@ class Dispatcher:
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, where that is traced."""
         with self._lock:
-            return self._ledger.take_trace()
+            trace = self.outcomes.trace
+            found = list(trace or ())
+            if trace:
+                trace.clear()
+            return found
 
     def report(self) -> dict[str, Any]:
         """Return counters and latency quantiles (seconds; None before the first answer)."""

@@ -95,7 +95,7 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
         _node_name("fogft_proxy", config.pool),
         config.domain_id,
         early=early,
-        told=lambda: made[0].types_behind() if made else {},
+        told=lambda: made[0].links.types() if made else {},
         noticed=lambda: made[0].types_changed() if made else None,
     )
     make = functools.partial(

@@ -106,11 +106,3 @@ class Ledger:
             refused=trace.refused,
             replica=replica,
         )
-
-    def take_trace(self) -> list[dict[str, Any]]:
-        """Return how requests ended since the last call."""
-        trace = self.outcomes.trace
-        found = list(trace or ())
-        if trace:
-            trace.clear()
-        return found

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
 
 from fogft.link.port import Link
 from fogft.model.choices import Freshness
@@ -69,11 +70,17 @@ class Sender:
     def route(
         self,
         links: Sequence[Link],
-        versions: Mapping[ReplicaId, str],
-        leaving: Collection[ReplicaId],
-        hanging: Collection[ReplicaId],
+        versions: Mapping[ReplicaId, str] = MappingProxyType({}),
+        leaving: Collection[ReplicaId] = (),
+        hanging: Collection[ReplicaId] = (),
     ) -> None:
-        """Set the links that may be asked now, and offer them what they lack."""
+        """Set the links that may be asked now, and offer them what they lack.
+
+        Args:
+            links: Those whose replica is ready; where replicas are brought to readiness, all.
+            versions: What each replica of the pool runs.
+            hanging: Those that say that the service answers nothing of what it has.
+        """
         routed = {key_of(link): link for link in links}
         replication, now = self._replication, self._ledger.clock()
         hang = {key for key, link in routed.items() if link.peer.id in hanging}

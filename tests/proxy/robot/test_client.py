@@ -223,10 +223,10 @@ def test_all_links_silent_together_is_the_uplink():
     scene = Scene()
     scene.follow(member(0), member(1))
     scene.ready(*scene.dialer.links)
-    assert not scene.proxy.uplink_suspected
+    assert not scene.proxy.links.silent_together
     for link in scene.dialer.links:
         link.ready = frozenset()
-    assert scene.proxy.uplink_suspected
+    assert scene.proxy.links.silent_together
     assert scene.proxy.report()["uplink_suspected"]
 
 

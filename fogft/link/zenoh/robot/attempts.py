@@ -448,9 +448,5 @@ class Attempts:
             self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
 
     def end(self) -> None:
-        """Have the sender thread end, once it is through with what it sends."""
+        """Have the sender thread end, once it is through with what it sends: 11 s at the most."""
         self._queue.put(None)
-
-    def join(self, timeout_s: float) -> None:
-        """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
-        self._thread.join(timeout_s)

@@ -284,10 +284,6 @@ class Connection:
         finally:
             attempts.end()
 
-    def join(self, timeout_s: float) -> None:
-        """Wait for the sender thread, which ends within 11 s even where the peer is frozen."""
-        self.attempts.join(timeout_s)
-
 
 def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer], bool]:
     """Return a reply's stamp, what it answers to each request, and whether the payload is packed.
