@@ -120,14 +120,15 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     scrape.at(config.metrics)
     log.info("proxy_started pool=%s robot=%s pid=%d standby=%s start_s=%.2f", config.pool,
              config.robot, os.getpid(), early is not None, time.monotonic() - began)  # fmt: skip
+    running = _Running(
+        config_path, metrics, config, lock, proxy, following, dialer, seen, scrape, joined, managing
+    )
     try:
-        parts = _Parts(proxy, following, dialer, seen, scrape, metrics, joined, managing)
         start.settle()
         notify("READY=1")
-        _loop(config_path, config, parts, stop)
+        running.loop(stop)
         if stop.is_set():
-            release = functools.partial(_release, parts, config, lock)
-            in_line.hand_over(config, proxy, parts.callers, release)
+            in_line.hand_over(config, proxy, running.callers, running.release)
     finally:
         managing.close()
         scrape.close()
@@ -136,18 +137,6 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
         joined.node.close()
         lock.release()
         log.info("proxy_stopped pool=%s", config.pool)
-
-
-def _release(parts: _Parts, config: ClientProxyConfig, lock: disk.Lock) -> None:
-    """Let another proxy work: it must not take us for dead, and needs our ports."""
-    parts.scrape.close()
-    parts.following.close()
-    try_step(functools.partial(_forget_participant, config.status), config.status)
-    lock.release()
-
-
-def _forget_participant(status: Path) -> None:
-    disk.write_json(status, {**(disk.read_json(status) or {}), "participant": ""}, durable=False)
 
 
 def _make_visible(
@@ -234,13 +223,18 @@ def _replica_disagrees(service: str, replica: int, count: int) -> None:
               service, replica >> 32, replica & 0xFFFFFFFF, count)  # fmt: skip
 
 
-class _Parts(NamedTuple):
+class _Running(NamedTuple):
+    """A client proxy that runs, with all that its thread sees to."""
+
+    config_path: Path
+    metrics: str | None
+    config: ClientProxyConfig
+    lock: disk.Lock
     proxy: ClientProxy
     following: Following
     dialer: UplinkDialer
     seen: SeenFromRos
     scrape: Scrape
-    metrics: str | None
     joined: middleware.Joined
     managing: ManagerRestart
 
@@ -248,72 +242,111 @@ class _Parts(NamedTuple):
         """Count who may call each service that is offered, as far as discovery knows."""
         return {name: self.joined.callers(name) for name in self.proxy.offered}
 
-    def participant(self) -> bytes:
+    def _participant(self) -> bytes:
         """Return the id of this process in DDS, once it offers a service."""
         return next(filter(None, map(self.joined.participant, self.proxy.offered)), b"")
 
+    def release(self) -> None:
+        """Let another proxy work: it must not take us for dead, and needs our ports."""
+        self.scrape.close()
+        self.following.close()
+        try_step(self._forget_participant, self.config.status)
+        self.lock.release()
 
-def _diagnosed(proxy: ClientProxy, config: ClientProxyConfig) -> dict[str, Any]:
-    """Return the report with what the manager beside it, if there is one, says of credentials."""
-    told: Any = None
-    with contextlib.suppress(FogftError):
-        told = disk.read_json(config.lock.parent / "status.json")
-    ends_at = told.get("credentials_end_at") if isinstance(told, dict) else None
-    left_s = ends_at - time.time() if isinstance(ends_at, (int, float)) else None
-    return {**proxy.report(), "credentials_left_s": left_s}
+    def _forget_participant(self) -> None:
+        status = self.config.status
+        told = {**(disk.read_json(status) or {}), "participant": ""}
+        disk.write_json(status, told, durable=False)
 
+    def loop(self, stop: threading.Event) -> None:
+        """Serve until told to stop, or until the pool's folder is gone."""
+        proxy, config, folder = self.proxy, self.config, self.config_path.parent
+        memory, watchdog = memory_tuning.Trimmer(), Watchdog()
+        watched_config = Watched(self.config_path)
+        watched_config.changed()
+        watched_certificate = Watched(config.credentials.certificate)  # written after its key
+        watched_certificate.changed()
+        announcements = Watched(config.announcements) if config.announcements else None
+        started = reported = busy = time.monotonic()
+        looked = 0.0
+        changed = False  # since the last report
+        participant = b""
+        while not stop.is_set():
+            changed = proxy.run_once() or changed
+            now = time.monotonic()
+            if not proxy.idle:
+                busy = now
+            if now - looked < _LOOK_EVERY_S:  # requests' own deadlines are seen to by `run_once`
+                continue
+            looked = now
+            memory.look()
+            watchdog.work()
+            try_step(self.managing.look, config.lock)
+            if watched_config.changed():
+                try_step(self._reconfigure, self.config_path)
+            try_step(self._follow_parameters, self.config_path)
+            try_step(self._follow, config.membership)
+            if watched_certificate.changed():
+                proxy.renew()
+                self.following.renew()
+            if announcements is not None and announcements.changed():
+                try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
+            self.seen.diagnose(self._diagnosed, now)
+            idle = now - busy > _REPORT_IDLE_EVERY_S
+            every_s = _REPORT_IDLE_EVERY_S if idle else _REPORT_EVERY_S
+            if now - reported > (_REPORT_AFTER_CHANGE_S if changed else every_s):
+                reported, changed = now, False
+                if not folder.exists():  # the pool's: its end is the pool's
+                    log.warning("folder_gone path=%s", folder)
+                    return
+                participant = participant or self._participant()
+                told = {"uptime_s": now - started, "participant": participant.hex()}
+                try_step(functools.partial(self._report, told), config.status)
+                trace = config.status.with_name(TRACE_NAME)
+                try_step(functools.partial(_write_trace, trace, proxy), trace)
 
-def _loop(
-    config_path: Path,
-    config: ClientProxyConfig,
-    parts: _Parts,
-    stop: threading.Event,
-) -> None:
-    proxy, following, seen = parts.proxy, parts.following, parts.seen
-    memory, watchdog = memory_tuning.Trimmer(), Watchdog()
-    watched_config = Watched(config_path)
-    watched_config.changed()
-    watched_certificate = Watched(config.credentials.certificate)  # written after its key
-    watched_certificate.changed()
-    announcements = Watched(config.announcements) if config.announcements else None
-    started = reported = busy = time.monotonic()
-    looked = 0.0
-    changed = False  # since the last report
-    participant = b""
-    while not stop.is_set():
-        changed = proxy.run_once() or changed
-        now = time.monotonic()
-        if not proxy.idle:
-            busy = now
-        if now - looked < _LOOK_EVERY_S:  # requests' own deadlines are seen to by `run_once`
-            continue
-        looked = now
-        memory.look()
-        watchdog.work()
-        try_step(parts.managing.look, config.lock)
-        if watched_config.changed():
-            try_step(functools.partial(_reconfigure, config_path, config, parts), config_path)
-        try_step(functools.partial(_follow_parameters, parts), config_path)
-        try_step(functools.partial(_follow, following, proxy), config.membership)
-        if watched_certificate.changed():
-            proxy.renew()
-            following.renew()
-        if announcements is not None and announcements.changed():
-            try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
-        seen.diagnose(functools.partial(_diagnosed, proxy, config), now)
-        idle = now - busy > _REPORT_IDLE_EVERY_S
-        every_s = _REPORT_IDLE_EVERY_S if idle else _REPORT_EVERY_S
-        if now - reported > (_REPORT_AFTER_CHANGE_S if changed else every_s):
-            reported, changed = now, False
-            if not config_path.parent.exists():  # the pool's folder: its end is the pool's
-                log.warning("folder_gone path=%s", config_path.parent)
-                return
-            participant = participant or parts.participant()
-            report = {**proxy.report(), **following.report(), "participant": participant.hex()}
-            report["callers"] = parts.callers()
-            try_step(functools.partial(_report, config, report, now - started), config.status)
-            trace = config.status.with_name(TRACE_NAME)
-            try_step(functools.partial(_write_trace, trace, proxy), trace)
+    def _reconfigure(self) -> None:
+        path = self.config_path
+        new = _same(self.config, read_client(path, self.metrics), path)
+        if self.dialer.use(new.uplinks, new.services):
+            self.proxy.redial()
+        self.proxy.serve(self.seen.follow(new.services))
+        self.proxy.pass_topics(new.topics, cast(RosTopics, self.joined.node))
+        self.following.apply(new)
+        self.scrape.at(new.metrics)
+        log.info("config_applied services=%d", len(new.services))
+
+    def _follow_parameters(self) -> None:
+        services = self.seen.changed()
+        if services is not None:
+            self.proxy.serve(services)
+
+    def _follow(self) -> None:
+        membership = self.following.look()
+        if membership is not None:
+            self.proxy.follow(membership)
+
+    def _diagnosed(self) -> dict[str, Any]:
+        """Return the report, with what a manager beside it says of credentials."""
+        told: Any = None
+        with contextlib.suppress(FogftError):
+            told = disk.read_json(self.config.lock.parent / "status.json")
+        ends_at = told.get("credentials_end_at") if isinstance(told, dict) else None
+        left_s = ends_at - time.time() if isinstance(ends_at, (int, float)) else None
+        return {**self.proxy.report(), "credentials_left_s": left_s}
+
+    def _report(self, told: Mapping[str, Any]) -> None:
+        report = {
+            "pid": os.getpid(),
+            "written_at": time.time(),
+            "robot": self.config.robot,
+            "version": __version__,
+            **told,
+            **self.proxy.report(),
+            **self.following.report(),
+            "callers": self.callers(),
+        }
+        disk.write_json(self.config.status, report, durable=False)
 
 
 _troubles: dict[Path, str] = {}
@@ -330,17 +363,6 @@ def try_step(step: Callable[[], None], path: Path) -> None:
             log.error("file_failed path=%s reason=%r", path, reason)
     else:
         _troubles.pop(path, None)
-
-
-def _reconfigure(path: Path, old: ClientProxyConfig, parts: _Parts) -> None:
-    new = _same(old, read_client(path, parts.metrics), path)
-    if parts.dialer.use(new.uplinks, new.services):
-        parts.proxy.redial()
-    parts.proxy.serve(parts.seen.follow(new.services))
-    parts.proxy.pass_topics(new.topics, cast(RosTopics, parts.joined.node))
-    parts.following.apply(new)
-    parts.scrape.at(new.metrics)
-    log.info("config_applied services=%d", len(new.services))
 
 
 def _same(old: ClientProxyConfig, new: ClientProxyConfig, path: Path) -> ClientProxyConfig:
@@ -360,33 +382,10 @@ def _bury(config: ClientProxyConfig) -> None:
             middleware.declare_gone(said, config.domain_id)
 
 
-def _follow_parameters(parts: _Parts) -> None:
-    services = parts.seen.changed()
-    if services is not None:
-        parts.proxy.serve(services)
-
-
-def _follow(following: Following, proxy: ClientProxy) -> None:
-    membership = following.look()
-    if membership is not None:
-        proxy.follow(membership)
-
-
 def _tell(path: Path, proxy: ClientProxy) -> None:
     from fogft.records import cache
 
     proxy.tell(cache.read(path))
-
-
-def _report(config: ClientProxyConfig, report: Mapping[str, Any], uptime_s: float) -> None:
-    header = {
-        "pid": os.getpid(),
-        "written_at": time.time(),
-        "uptime_s": uptime_s,
-        "robot": config.robot,
-        "version": __version__,
-    }
-    disk.write_json(config.status, {**header, **report}, durable=False)
 
 
 def _write_trace(path: Path, proxy: ClientProxy) -> None:
