@@ -3,7 +3,8 @@
 Three replicas of a service that does one thing at a time; callers that do not wait. All systems
 take turns in one run, for some rounds. `haproxy` is HAProxy with ``leastconn``, `round robin` the
 same with ``roundrobin``, both before three HTTP servers that sleep as the service does and that
-are started again when they die.
+are started again when they die. `ray serve` is Ray Serve with three replicas, where ``--ray`` names
+the Python of an environment that has it.
 
 Prints tables, and writes them into docs/measurements.md.
 """
@@ -35,6 +36,7 @@ from tests.bench.load import (
     asking,
     haproxy,
     offer,
+    ray_serve,
 )
 from tests.bench.machine import cpu_s
 from tests.bench.rig import ROOT, Replica, Rig
@@ -44,8 +46,11 @@ from tests.estimates import percentile
 PAGE = ROOT / "docs" / "measurements.md"
 HEADING = "## Beside other load balancers: `scripts/compare`"
 BALANCES = {"haproxy": "leastconn", "round robin": "roundrobin"}
-FAULT_S, FAULT_LOAD = 6.0, 0.7
+POISONED_S = 6.0
+# So slow that the machine, which all processes share, is not what limits them.
+FAULT_S, FAULT_LOAD, FAULT_MEDIAN_S = 12.0, 0.7, 0.06
 Rows = list[list[str]]
+Peer = Callable[[Path, str], contextlib.AbstractContextManager[Balanced]]
 
 
 @dataclass
@@ -65,7 +70,9 @@ class Result:
         return [f"{p50:.0f} / {p99:.0f}", f"{lost} of {self.asked}", *each]
 
 
-def ours(rig: Rig, caller: Caller, policy: str) -> Callable[[float, float], Result]:
+def ours(
+    rig: Rig, caller: Caller, policy: str, median_s: float = MEDIAN_S
+) -> Callable[[float, float], Result]:
     """Return what measures fogft under a policy at a load, for so many seconds."""
     proxies = [rig.proxy.pid, *(replica.process.pid for replica in rig.replicas)]
 
@@ -73,7 +80,7 @@ def ours(rig: Rig, caller: Caller, policy: str) -> Callable[[float, float], Resu
         rig.change(hedging=policy, timeout_s=TIMEOUT_S)
         before = rig.report(after=time.time())["services"][FLAG[0]]["sent"]
         used = sum(map(cpu_s, proxies))
-        asked, took = offer(asking(caller), share, seconds)
+        asked, took = offer(asking(caller), share, seconds, median_s)
         used = sum(map(cpu_s, proxies)) - used
         sent = rig.report(after=time.time())["services"][FLAG[0]]["sent"] - before
         return Result(asked, took, sent, used)
@@ -81,22 +88,33 @@ def ours(rig: Rig, caller: Caller, policy: str) -> Callable[[float, float], Resu
     return measured
 
 
+def peers(ray: str) -> dict[str, Peer]:
+    """Return what starts each other system in a folder, by its name."""
+    starts: dict[str, Peer] = {
+        name: lambda folder, words, balance=balance: haproxy(folder, words, balance)
+        for name, balance in BALANCES.items()
+    }
+    if ray:
+        starts["ray serve"] = lambda folder, words: ray_serve(folder, words, ray)
+    return starts
+
+
 def theirs(peer: Balanced) -> Callable[[float, float], Result]:
     """Return the same for a load balancer."""
 
     def measured(share: float, seconds: float) -> Result:
-        used = cpu_s(peer.pid)
+        used = peer.used_s()
         asked, took = offer(peer.ask, share, seconds)
-        return Result(asked, took, float(asked), cpu_s(peer.pid) - used)
+        return Result(asked, took, float(asked), peer.used_s() - used)
 
     return measured
 
 
 @contextlib.contextmanager
-def pool(folder: Path, service: str) -> Iterator[tuple[Rig, Caller]]:
+def pool(folder: Path, service: str, median_s: float = MEDIAN_S) -> Iterator[tuple[Rig, Caller]]:
     """Start three replicas and a caller."""
     folder.mkdir(parents=True)
-    words = words_of(service)
+    words = words_of(service, median_s)
     rig = Rig(
         folder, REPLICAS, services=[words] * REPLICAS, relayed=[0], policy={"timeout_s": TIMEOUT_S}
     )
@@ -107,23 +125,22 @@ def pool(folder: Path, service: str) -> Iterator[tuple[Rig, Caller]]:
         yield rig, caller
 
 
-def words_of(service: str) -> str:
+def words_of(service: str, median_s: float = MEDIAN_S) -> str:
     """Return how a service is started: median, sigma, share of stalls, their length, threads."""
-    return " ".join(map(str, (MEDIAN_S, *SERVICES[service], 1)))
+    return " ".join(map(str, (median_s, *SERVICES[service], 1)))
 
 
-def loads(folder: Path, shares: Sequence[float], seconds: float, rounds: int) -> Rows:
+def loads(folder: Path, shares: Sequence[float], seconds: float, rounds: int, ray: str) -> Rows:
     """Compare systems at several loads."""
     rows = []
     for service in SERVICES:
         with contextlib.ExitStack() as stack:
             rig, caller = stack.enter_context(pool(folder / service, service))
             systems = {policy: ours(rig, caller, policy) for policy in ("auto", "all")}
-            for name, balance in BALANCES.items():
-                below = folder / f"{service}-{balance}"
+            for name, starts in peers(ray).items():
+                below = folder / f"{service}-{name.replace(' ', '-')}"
                 below.mkdir()
-                peer = stack.enter_context(haproxy(below, words_of(service), balance))
-                systems[name] = theirs(peer)
+                systems[name] = theirs(stack.enter_context(starts(below, words_of(service))))
             for share in shares:
                 found = {name: Result() for name in systems}
                 for _ in range(rounds):
@@ -175,8 +192,8 @@ def faults(folder: Path, rounds: int) -> Rows:
     rows = []
     healthy, at_fault = Result(), {name: Result() for name in FAULTS}
     for number in range(rounds):
-        with pool(folder / f"faults-{number}", "constant") as (rig, caller):
-            measure = ours(rig, caller, "auto")
+        with pool(folder / f"faults-{number}", "constant", FAULT_MEDIAN_S) as (rig, caller):
+            measure = ours(rig, caller, "auto", FAULT_MEDIAN_S)
             for name, harm in FAULTS.items():
                 measure(FAULT_LOAD, 3.0)  # it knows its replicas
                 rig.follow([1, 2])
@@ -186,7 +203,7 @@ def faults(folder: Path, rounds: int) -> Rows:
                 rig.wait_ready([0, 1, 2])
                 measure(FAULT_LOAD, 3.0)
                 harm(rig.replicas[0])
-                asked, took = offer(asking(caller), FAULT_LOAD, FAULT_S)
+                asked, took = offer(asking(caller), FAULT_LOAD, FAULT_S, FAULT_MEDIAN_S)
                 add(at_fault[name], Result(asked, took))
                 MENDS[name](rig.replicas[0])
                 if name != "killed":
@@ -198,10 +215,10 @@ def faults(folder: Path, rounds: int) -> Rows:
     return rows
 
 
-def poison(folder: Path, rounds: int) -> Rows:
+def poison(folder: Path, rounds: int, ray: str) -> Rows:
     """Ask at 30 %, with one request among them that ends whatever process serves it."""
-    rows = []
-    for name in ("auto", *BALANCES):
+    rows, others = [], peers(ray)
+    for name in ("auto", *others):
         result, deaths = Result(), 0
         for number in range(rounds):
             below = folder / f"poison-{name.replace(' ', '-')}-{number}"
@@ -212,12 +229,11 @@ def poison(folder: Path, rounds: int) -> Rows:
                     )
                 else:
                     below.mkdir(parents=True)
-                    balance = BALANCES[name]
-                    peer = stack.enter_context(haproxy(below, words_of("constant"), balance))
+                    peer = stack.enter_context(others[name](below, words_of("constant")))
                     asks, kills, died = peer.ask, peer.poison, peer.deaths
                 offer(asks, 0.3, 3.0)
                 kills()
-                add(result, Result(*offer(asks, 0.3, FAULT_S)))
+                add(result, Result(*offer(asks, 0.3, POISONED_S)))
                 deaths += died()
         rows.append([name, *result.cells()[:2], f"{deaths / rounds:.1f}"])
     return rows
@@ -249,18 +265,20 @@ def text(measured: Mapping[str, Rows], rounds: int, seconds: float) -> str:
 (`constant`) or for lognormal times of which one in a hundred is 200 ms longer (`stalling`). Callers
 do not wait; a request has failed after 2 s. Load is a share of what three can do. `haproxy` is
 HAProxy with `leastconn`, `round robin` the same with `roundrobin`, before HTTP servers that sleep
-alike. Systems in turns, {rounds} rounds of {seconds:.0f} s. Processor time is that of the proxies,
-or of the balancer, a request.
+alike; `ray serve` is Ray Serve with three replicas. Systems in turns, {rounds} rounds of
+{seconds:.0f} s. Processor time is that of the proxies, or of the balancer, a request; of Ray Serve
+all its processes count.
 
 {table(["service", "load", "system", *cost], measured["loads"])}
 
 From a fault of one of three replicas on, for {FAULT_S:.0f} s, under `auto` at {FAULT_LOAD:.0%} of
-what three can do, which is more than two can do: beside two healthy replicas at that load.
+what three can do, which is more than two can do: beside two healthy replicas at that load. The
+service takes {FAULT_MEDIAN_S * 1000:.0f} ms here, so that the machine does not limit it.
 
 {table(["fault", "p50 / p99 ms", "failed", "p99 ratio"], measured["faults"])}
 
-One request that ends whatever process serves it, at 30 %; the others in the {FAULT_S:.0f} s after
-it. HTTP servers are started again when they die, as replicas' services are.
+One request that ends whatever process serves it, at 30 %; the others in the {POISONED_S:.0f} s
+after it. HTTP servers are started again when they die, as replicas' services are.
 
 {table(["system", "p50 / p99 ms", "failed", "deaths"], measured["poison"])}
 
@@ -271,6 +289,9 @@ def main() -> int:
     """Measure, print, and write the page; return the exit status."""
     parser = argparse.ArgumentParser(prog="scripts/compare", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one round, and the page as it was")
+    parser.add_argument(
+        "--ray", default="", metavar="PYTHON", help="of an environment with ray[serve]"
+    )
     options = parser.parse_args()
     if not shutil.which("haproxy"):
         print("scripts/compare: install haproxy (apt-get install haproxy)", file=sys.stderr)
@@ -287,8 +308,8 @@ def main() -> int:
         measured = {}
         for part, measure in (
             ("faults", lambda: faults(folder, rounds)),
-            ("poison", lambda: poison(folder, rounds)),
-            ("loads", lambda: loads(folder, shares, seconds, rounds)),
+            ("poison", lambda: poison(folder, rounds, options.ray)),
+            ("loads", lambda: loads(folder, shares, seconds, rounds, options.ray)),
         ):
             measured[part] = measure()
             print(table([part], measured[part]), file=sys.stderr, flush=True)

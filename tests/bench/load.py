@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.caller import Caller, milliseconds, payloads
-from tests.bench.machine import cpu_s
+from tests.bench.machine import cpu_s, family
 from tests.bench.rig import Rig, free_ports
 from tests.bench.service import FLAG
 from tests.estimates import percentile
@@ -104,13 +104,15 @@ def asking(caller: Caller) -> Ask:
     return lambda answered: caller.ask(FLAG[0], payload, answered)
 
 
-def offer(ask: Ask, share: float, seconds: float) -> tuple[int, list[float]]:
+def offer(
+    ask: Ask, share: float, seconds: float, median_s: float = MEDIAN_S
+) -> tuple[int, list[float]]:
     """Ask at random moments without waiting.
 
     Returns:
         How many requests there were, and how many seconds each took that was answered in time.
     """
-    per_s = share * REPLICAS / MEDIAN_S
+    per_s = share * REPLICAS / median_s
     source, took = random.Random(1), list[float]()
     count, at = int(per_s * seconds), time.perf_counter()
     for _ in range(count):
@@ -133,26 +135,30 @@ def _row(count: int, answered: list[float]) -> dict[str, Any]:
 
 
 class Balanced:
-    """HTTP requests through HAProxy, each in a thread, over connections that stay open.
+    """HTTP requests through a load balancer, each in a thread, over connections that stay open.
 
     Args:
         port: Where it listens.
-        pid: Its process.
+        pid: Its process; those below it are counted, too.
         folder: Where servers note their deaths.
     """
 
     def __init__(self, port: int, pid: int, folder: Path) -> None:
         self._port = port
-        self.pid = pid
+        self._pid = pid
         self._folder = folder
         self._idle: list[http.client.HTTPConnection] = []
 
     def row(self, share: float, seconds: float) -> dict[str, Any]:
         """Return what became of requests at a load."""
-        used = cpu_s(self.pid)
+        used = self.used_s()
         row = _row(*offer(self.ask, share, seconds))
-        row["cpu_ms_per_request"] = (cpu_s(self.pid) - used) * 1000 / row["requests"]
+        row["cpu_ms_per_request"] = (self.used_s() - used) * 1000 / row["requests"]
         return {**row, "copies": 1.0}
+
+    def used_s(self) -> float:
+        """Return the processor time that it has used."""
+        return sum(map(cpu_s, family(self._pid)))
 
     def ask(self, answered: Callable[[], None]) -> None:
         """Send a request, and wait for nothing."""
@@ -213,6 +219,30 @@ def haproxy(folder: Path, words: str, balance: str = "leastconn") -> Iterator[Ba
         for process in processes:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+
+
+@contextlib.contextmanager
+def ray_serve(folder: Path, words: str, python: str) -> Iterator[Balanced]:
+    """Start Ray Serve with three replicas, by a Python that has it."""
+    [port] = free_ports(1)
+    script = str(Path(__file__).with_name("ray_serve.py"))
+    environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    process = subprocess.Popen(
+        [python, script, str(port), str(folder), *words.split()],
+        env=environ,
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert process.stdout is not None
+        if process.stdout.readline() != b"ready\n":
+            raise RuntimeError(f"Ray Serve has not started: status {process.wait()}")
+        yield Balanced(port, process.pid, folder)
+    finally:
+        for pid in family(process.pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        process.wait()
 
 
 async def serve(port: int, median_s: float, sigma: float, stalled: float, stall_s: float) -> None:
