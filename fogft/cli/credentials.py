@@ -6,7 +6,6 @@ shown.
 
 from __future__ import annotations
 
-import datetime
 import sys
 import time
 from pathlib import Path
@@ -85,6 +84,7 @@ def list_(
     pool: PoolOption = None,
 ) -> None:
     """List the certificates that the pool's CA has issued, without their keys."""
+    from fogft.cli.status_text import utc
     from fogft.cli.table import table
     from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import certificates
@@ -95,7 +95,7 @@ def list_(
         output.json_data([_as_data(entry, now) for entry in entries])
         return
     rows = [
-        (e.holder.role.value, e.holder.short, e.state(now), _utc(e.not_after), e.serial[:16])
+        (e.holder.role.value, e.holder.short, e.state(now), utc(e.not_after), e.serial[:16])
         for e in entries
     ]
     names = ("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL")
@@ -253,7 +253,3 @@ def _as_data(entry: Entry, now: float) -> dict[str, object]:
         "not_after": entry.not_after,
         "revoked_at": entry.revoked_at,
     }
-
-
-def _utc(seconds: float) -> str:
-    return f"{datetime.datetime.fromtimestamp(seconds, datetime.timezone.utc):%Y-%m-%d %H:%M} UTC"

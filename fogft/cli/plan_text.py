@@ -27,7 +27,10 @@ def show(shown: PlanShown, *, everything: bool = False) -> None:
     """Print the plan: the table of offers and a summary."""
     from fogft.cli.table import table
 
-    found = sorted(shown.explanation.considered, key=_order)
+    found = sorted(
+        shown.explanation.considered,
+        key=lambda x: (not x.slots, x.slots, x.offer.usd_per_hour, x.offer.placement.location),
+    )
     listed = found if everything else _best_of_regions(found)
     rows = [_row(shown, one) for one in listed]
     folds = ("LOCATION", "PRICE", "WHY NOT")
@@ -101,12 +104,6 @@ def _traffic_json(shown: PlanShown, service: ServiceSpec) -> dict[str, Any]:
         "source": "measured" if measured else source,
         "measured_over_s": measured.over_s if measured else None,
     }
-
-
-def _order(one: Considered) -> tuple[bool, tuple[int, ...], float, str]:
-    return (
-        not one.slots, one.slots, one.offer.usd_per_hour, one.offer.placement.location
-    )  # fmt: skip
 
 
 def _best_of_regions(found: Iterable[Considered]) -> list[Considered]:

@@ -296,6 +296,11 @@ def _gateway(gateway: Mapping[str, Any], link: Mapping[str, Any] | None) -> Text
     return _joined(words)
 
 
+def utc(seconds: float) -> str:
+    """Return a moment as ``2026-11-23 18:05 UTC``."""
+    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(seconds))
+
+
 def price(usd: float) -> str:
     """Return an amount as ``$0.021``."""
     return f"${usd:.3f}"

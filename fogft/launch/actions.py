@@ -70,8 +70,8 @@ class CloudNode(Node):  # type: ignore[misc]
     def command(self, context: LaunchContext) -> NodeCommand:
         """Return how the node is started, all substitutions made."""
         self._perform_substitutions(context)
-        name, namespace = self._given_name(context), self.expanded_node_namespace
-        specific = {"name": f"__node:={name}"} if name else {}
+        name, namespace = self.node_name.rpartition("/")[2], self.expanded_node_namespace
+        specific = {"name": f"__node:={name}"} if "unspecified" not in name else {}
         if namespace and "unspecified" not in namespace:
             specific["ns"] = f"__ns:={namespace}"
         context.extend_locals({"ros_specific_arguments": specific})
@@ -92,10 +92,6 @@ class CloudNode(Node):  # type: ignore[misc]
             environ,
             files,
         )
-
-    def _given_name(self, context: LaunchContext) -> str:
-        name = self.node_name.rpartition("/")[2]
-        return "" if "unspecified" in name else name
 
     def execute(self, context: LaunchContext) -> list[Action] | None:
         """Run it on this machine, in a fog pool that stays here."""

@@ -148,7 +148,8 @@ def sign_record(record: Record, sign: Sign) -> SignedRecord:
     Raises:
         ValueError: It could not be read back: too large, or not JSON data.
     """
-    body = _encode(record)
+    value = {"v": VERSION, **plain.to_plain(record)}
+    body = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     if _decode(body) != record:
         raise ValueError("a record that does not survive its own encoding")
     certificate, signature = sign(signed_bytes(body))
@@ -190,11 +191,6 @@ def expected_writer(record: Record) -> Holder:
 
 
 # -- bytes ----------------------------------------------------------------------------------
-
-
-def _encode(record: Record) -> bytes:
-    value = {"v": VERSION, **plain.to_plain(record)}
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def _decode(body: bytes) -> Record:

@@ -69,9 +69,10 @@ class RecordSet:
         try:
             verdict = self._judge(signed)
         except RecordError as error:
-            verdict = self._refuse(error)
-        else:
-            self.counts[verdict.value] += 1
+            self.counts[f"refused_{error.reason}"] += 1
+            self.last_refusal = str(error)
+            return Verdict.REFUSED
+        self.counts[verdict.value] += 1
         return verdict
 
     def restore(self, signed: SignedRecord, verify: Verify) -> Verdict:
@@ -81,11 +82,6 @@ class RecordSet:
             return self.offer(signed)
         finally:
             self._verify = usual
-
-    def _refuse(self, error: RecordError) -> Verdict:
-        self.counts[f"refused_{error.reason}"] += 1
-        self.last_refusal = str(error)
-        return Verdict.REFUSED
 
     def _judge(self, signed: SignedRecord) -> Verdict:
         record = read_body(signed)

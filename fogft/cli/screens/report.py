@@ -58,7 +58,7 @@ def _page(store: Any, now: float) -> str:
     import sys
 
     from fogft.cli.overview import event_rows
-    from fogft.cli.status_text import milliseconds
+    from fogft.cli.status_text import milliseconds, utc
     from fogft.pool.commands.status import read
     from fogft.pool.folder.costs import read_all
     from fogft.pool.folder.paths import home
@@ -76,7 +76,7 @@ def _page(store: Any, now: float) -> str:
     parts = [
         f"<h1>Pool {html.escape(status.pool)}</h1>",
         f"<p>{status.ready} of {status.target} replicas ready on {html.escape(status.cloud)}; "
-        f"${sum(one.usd for one in costs):.2f} spent; written {_utc(now)}.</p>",
+        f"${sum(one.usd for one in costs):.2f} spent; written {utc(now)}.</p>",
         "<h2>Availability</h2>",
         f"<p>At least one replica was ready for {up_s / known_s:.4%} of {known_s / 3600:.1f} h "
         "of which events are kept.</p>"
@@ -183,7 +183,3 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
     body = "".join(f"<tr>{cells('td', row)}</tr>\n" for row in rows)
     return f'<div class="wide"><table><tr>{cells("th", header)}</tr>\n{body}</table></div>'
-
-
-def _utc(at: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(at))

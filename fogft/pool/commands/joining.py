@@ -176,7 +176,8 @@ def join(
             token = claiming.own_token(root / "joined" / "claims.json", label.id, now)
             with _on_disk(root / "joined", files, holder) as credentials:
                 claim(holder, token, endpoints, credentials)
-        folder = root / "joined" / _folder_name(label.pool, holder)
+        pool = "".join(c for c in label.pool if c.isalnum() or c == "-")
+        folder = root / "joined" / f"{pool}.{holder.role.value}.{holder.name}"
         for name, text in files.items():
             place = folder / name
             disk.make_folder(place.parent)
@@ -237,11 +238,6 @@ def checked_files(content: dict[str, Any]) -> dict[str, str]:
         if len(text) > FILE_LIMIT:
             raise CredentialError(f"the bundle holds a file that is too large: {name!r:.60}")
     return files
-
-
-def _folder_name(pool: str, holder: Holder) -> str:
-    safe = "".join(c for c in pool if c.isalnum() or c == "-")
-    return f"{safe}.{holder.role.value}.{holder.name}"
 
 
 def _destroy(file: Path, size: int) -> None:

@@ -79,7 +79,8 @@ def claim(
     speaker.start()
     hearer.start()
     try:
-        said = _content(holder.role, token)
+        about = SlotState() if holder.role is Role.REPLICA else DialIn()
+        said = {**to_plain(about), _KEY: token}
         # The second makes it stand above any other claim that comes later.
         for sequence, pause_s in ((1, settle_s), (2, 0.0)):
             kind, generation = _KINDS[holder.role], holder.generation
@@ -95,11 +96,6 @@ def claim(
     finally:
         speaker.close()
         hearer.close()
-
-
-def _content(role: Role, token: str) -> dict[str, object]:
-    said = SlotState() if role is Role.REPLICA else DialIn()
-    return {**to_plain(said), _KEY: token}
 
 
 def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record | None:

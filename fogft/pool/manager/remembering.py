@@ -10,8 +10,8 @@ import logging
 from collections.abc import Callable
 
 from fogft.model.reason import Reason
-from fogft.model.replica import LinkState, Observed, ReplicaId
-from fogft.planning.observed.health import Assessment, Health, Verdict
+from fogft.model.replica import Observed, ReplicaId
+from fogft.planning.observed.health import Health, Verdict
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.pool.folder.store import Store
 from fogft.reason_words import words
@@ -81,13 +81,9 @@ class Remembering:
                 if record.first_ready_at is None or record.unready_since:
                     log.info("replica_ready replica=%s zone=%s", id.short, record.location)
                     self.add(EventKind.READY, id, at=now)
-            elif record.first_ready_at and not record.unready_since and _answers(judged):
+            elif record.first_ready_at and not record.unready_since and judged.answers:
                 log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
                 self.add(EventKind.UNREADY, id, at=now)
             if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
                 log.warning("replica_failed replica=%s reason=%r", id.short, words(judged.why))
                 self.add(EventKind.FAILED, id, reason=judged.why, at=now)
-
-
-def _answers(judged: Assessment) -> bool:
-    return judged.link is not None and judged.link.state is LinkState.UP

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from fogft.metrics.families import counter, gauge, histogram
 from fogft.metrics.proxies import by_event
-from fogft.model.reason import Cause, Reason
+from fogft.model.reason import Cause
 from fogft.model.replica import Phase
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.manager.status import PoolStatus, ReplicaStatus
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 # Upper bounds of buckets, seconds: from the local cloud to a VM with a long `setup`.
 BUCKETS_S = (1.0, 5.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1200.0, 3600.0)
+_NOTICES = (Cause.NOTICE, Cause.DRAINS_ITSELF)
 _PHASES = ("provisioning", "starting", "total")
 
 
@@ -46,8 +47,9 @@ class Tally:
         if event.kind is EventKind.LAUNCH:
             self._launches["on_demand" if event.on_demand else "spot"] += 1
             self._ordered[replica] = event.at, not event.on_demand
-            if event.reason is not None and _is_notice(event.reason):
-                self._preempt(event.reason.replica)
+            why = event.reason
+            if why is not None and any(one.cause in _NOTICES for one in why.because):
+                self._preempt(why.replica)
         elif event.kind is EventKind.REFUSED:
             self._refused[_cause(event)] += 1
         elif event.kind is EventKind.FAILED:
@@ -113,10 +115,6 @@ def _buckets(took: list[float]) -> list[int]:
 
 def _cause(event: Event) -> str:
     return event.reason.cause.value if event.reason is not None else Cause.ERROR.value
-
-
-def _is_notice(reason: Reason) -> bool:
-    return any(one.cause in (Cause.NOTICE, Cause.DRAINS_ITSELF) for one in reason.because)
 
 
 def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
