@@ -29,7 +29,6 @@ from fogft.model.keys import (
 )
 from fogft.model.names import is_endpoint
 from fogft.model.ros_names import absolute_service_name
-from fogft.model.scoring import Weights
 
 MAX_REPLICAS = 16
 MAX_USD_PER_HOUR = 1_000_000
@@ -334,7 +333,11 @@ class PlacementSpec:
         rtt_s: ``cloud/region`` or ``cloud`` -> round trip in seconds; goes before measurements.
     """
 
-    weights: Weights = within(Weights)
+    latency_weight: float = key(
+        Number(100, "times", from_zero=True),
+        "Weight of a percent of round trip against a percent of price; 0 to ignore distance.",
+        default=1.0,
+    )
     robot_at: tuple[float, float] | None = key(
         Special(
             "latitude and longitude",

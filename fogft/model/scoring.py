@@ -1,6 +1,6 @@
 """Weigh a location's price against its distance. Pure.
 
-    score = price * ln(usd_per_hour) + latency * ln(round trip)
+    score = ln(usd_per_hour) + weight * ln(round trip)
 
 The lower the better. In logarithms only ratios count: with equal weights, half the price
 makes up for twice the round trip. So the order of two offers depends on those two alone,
@@ -13,7 +13,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from fogft.model.keys import Number, key
 from fogft.model.replica import Offer, Placement
 
 # Below these, less no longer matters.
@@ -24,23 +23,10 @@ UNKNOWN_RTT_S = 0.150
 
 
 @dataclass(frozen=True)
-class Weights:
-    """How much a percent of price and of round trip count; 0 for not at all."""
-
-    price: float = 1.0
-    latency: float = key(
-        Number(100, "times", from_zero=True),
-        "Weight of a percent of round trip against a percent of price; 0 to ignore distance.",
-        name="latency_weight",
-        default=1.0,
-    )
-
-
-@dataclass(frozen=True)
 class Scale:
-    """Weights with what is known of distances: seconds from the robot, by ``cloud/region``."""
+    """The weight of round trips and what is known of them: seconds, by ``cloud/region``."""
 
-    weights: Weights = field(default_factory=Weights)
+    weight: float = 1.0
     rtt_s: Mapping[str, float] = field(default_factory=dict)
 
     def latency(self, placement: Placement) -> float | None:
@@ -57,12 +43,12 @@ class Scale:
 
     def of_price(self, usd_per_hour: float) -> float:
         """Return a price's part of the score."""
-        return self.weights.price * math.log(max(usd_per_hour, PRICE_FLOOR_USD))
+        return math.log(max(usd_per_hour, PRICE_FLOOR_USD))
 
     def of_distance(self, rtt_s: float | None) -> float:
         """Return a round trip's part of the score."""
         known = UNKNOWN_RTT_S if rtt_s is None else rtt_s
-        return self.weights.latency * math.log(max(known, LATENCY_FLOOR_S))
+        return self.weight * math.log(max(known, LATENCY_FLOOR_S))
 
 
 def gain(before: float, after: float) -> float:

@@ -138,7 +138,7 @@ def explain(
     intent = replace(intent, stopping=False)
     planned = plan(NO_POOL, spec, intent, world, history)
     sized = size(spec, intent, world)
-    scale = Scale(spec.placement.weights, observed.rtt_s)
+    scale = Scale(spec.placement.latency_weight, observed.rtt_s)
     reasons = _Reasons(
         spec,
         intent,

@@ -102,7 +102,7 @@ class Catalogue:
             scale: How price and distance are weighed.
         """
         far = tuple(sorted(scale.rtt_s.items()))
-        key = group, spot, frozenset(excluded), scale.weights, far
+        key = group, spot, frozenset(excluded), scale.weight, far
         if key not in self._listings:
             mine = [
                 o

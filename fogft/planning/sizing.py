@@ -154,7 +154,7 @@ def _for_target(
         one = 1.0 - unavailability_of(asked.assumed, spot=True)
         needed = replicas_needed(one, asked.target, limit=10_000)
         return min(MAX_REPLICAS, max(spec.replicas, running, needed)), None
-    scale = Scale(spec.placement.weights, observed.rtt_s)
+    scale = Scale(spec.placement.latency_weight, observed.rtt_s)
     markets = Markets(observed.offers, scale, intent.excluded)
     laid = [o for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
     best = Expected(0.0, 0.0)

@@ -321,7 +321,7 @@ def targets() -> dict[str, Target]:
         ),
         "bundle": Target(bundle.read_label, (CredentialError,), (_bundle(),)),
         "bundle's files": Target(
-            lambda data: joining.checked_files(_object(data)),
+            lambda data: joining.read_content(_object(data)),
             (CredentialError, RecordError),
             (b'{"files": {"a/b": "c"}}',),
         ),

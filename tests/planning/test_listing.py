@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model.replica import Offer, Placement
-from fogft.model.scoring import Scale, Weights
+from fogft.model.scoring import Scale
 from fogft.planning.listing import Catalogue, catalogue
 
 offers = st.lists(
@@ -34,7 +34,7 @@ questions = st.lists(
         st.sampled_from([(), ("a",), ("b/r", "a/s/1")]),
         st.builds(
             Scale,
-            st.builds(Weights, st.sampled_from([0.0, 1.0]), st.just(1.0)),
+            st.sampled_from([0.0, 1.0, 2.0]),
             st.sampled_from([{}, {"a/r": 0.01}, {"a/r": 0.2, "b/s": 0.1}]),
         ),
     ),

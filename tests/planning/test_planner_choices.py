@@ -21,7 +21,6 @@ from fogft.model.choices import (
 )
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
-from fogft.model.scoring import Weights
 from fogft.model.spec import PoolSpec
 from fogft.planning.availability import Assumption, Correlation, expected
 from fogft.planning.observed.history import Event, EventKind
@@ -114,14 +113,14 @@ def test_distance_and_price_are_weighed():
     near, far = offer("a/near/1", 0.30), offer("a/far/1", 0.10)
     rtt_s = {"a/near": 0.02, "a/far": 0.04}
 
-    def first(weights: Weights) -> str:
-        asked = spec(1, placement=PlacementSpec(weights))
+    def first(weight: float) -> str:
+        asked = spec(1, placement=PlacementSpec(weight))
         [launch] = World(asked, offers=(near, far), rtt_s=rtt_s).plan().launches
         return launch.offer.placement.region
 
-    assert first(Weights(1, 1)) == "far"
-    assert first(Weights(1, 2)) == "near"
-    assert first(Weights(0, 1)) == "near"
+    assert first(1.0) == "far"
+    assert first(2.0) == "near"
+    assert first(0.0) == "far"
 
 
 @pytest.mark.parametrize("price", [-0.1, math.nan, math.inf])

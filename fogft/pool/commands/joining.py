@@ -16,18 +16,18 @@ import contextlib
 import os
 import secrets
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
 
 from fogft import disk
 from fogft.errors import CredentialError, FogftError
 from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.membership import Found, to_dict
-from fogft.model.names import is_endpoint
-from fogft.model.plain import stored
+from fogft.model.names import Endpoint
+from fogft.model.plain import from_plain, stored
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.pool.credentials import bundle, claiming
@@ -38,7 +38,6 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
 from fogft.pool.manager import configuration
 
-FILE_LIMIT = 512 << 10
 _USED_LIMIT = 10_000
 # All others: `proxy`.
 _COMMANDS = {Role.REPLICA: "serve", Role.RENDEZVOUS: "rendezvous", Role.GATEWAY: "gateway"}
@@ -161,7 +160,8 @@ def join(
     """
     data = read(file)
     label, content = bundle.open_sealed(data, passphrase, now)
-    files, endpoints = checked_files(content), _rendezvous(content)
+    brought = read_content(content)
+    files, endpoints = brought.files, list(brought.rendezvous)
     holder = label.holder
     disk.make_folder(root / "joined")
     used = root / "joined" / "used.json"
@@ -190,27 +190,15 @@ def join(
 
 
 @contextlib.contextmanager
-def _on_disk(folder: Path, files: dict[str, str], holder: Holder) -> Iterator[CredentialPaths]:
+def _on_disk(folder: Path, files: Mapping[str, str], holder: Holder) -> Iterator[CredentialPaths]:
     """Have credentials in files of their own before they are put where a proxy sees them."""
-    stem, named = (
-        holder.role.value,
-        {PurePosixPath(name).name: text for name, text in files.items()},
-    )
+    stem = holder.role.value
+    named = {PurePosixPath(name).name: text for name, text in files.items()}
     with tempfile.TemporaryDirectory(dir=folder) as made:
         place = CredentialPaths(*(Path(made) / n for n in ("ca.crt", f"{stem}.crt", f"{stem}.key")))
         for path in (place.ca, place.certificate, place.key):
             disk.write_whole(path, named.get(path.name, ""))
         yield place
-
-
-def _rendezvous(content: dict[str, Any]) -> list[str]:
-    """Return the rendezvous that a bundle names; older bundles name none."""
-    listed = content.get("rendezvous", [])
-    if not isinstance(listed, list) or not all(
-        isinstance(one, str) and is_endpoint(one) for one in listed
-    ):
-        raise CredentialError("the bundle names a rendezvous that is none")
-    return listed
 
 
 def read(file: Path) -> bytes:
@@ -225,19 +213,27 @@ def read(file: Path) -> bytes:
         ) from None
 
 
-def checked_files(content: dict[str, Any]) -> dict[str, str]:
-    """Return the files that a bundle brings, once their names are found to be harmless."""
-    files = content.get("files")
-    if not isinstance(files, dict) or not files:
-        raise CredentialError("the bundle holds no files")
-    for name, text in files.items():
-        parts = PurePosixPath(name).parts
-        safe = parts and all(part.strip(".") and "\0" not in part for part in parts)
-        if not safe or len(parts) > 2 or name.startswith("/") or not isinstance(text, str):
-            raise CredentialError(f"the bundle holds a file with an odd name: {name!r:.60}")
-        if len(text) > FILE_LIMIT:
-            raise CredentialError(f"the bundle holds a file that is too large: {name!r:.60}")
-    return files
+def _check_name(name: str) -> None:
+    parts = PurePosixPath(name).parts
+    safe = parts and all(part.strip(".") and "\0" not in part for part in parts)
+    if not safe or len(parts) > 2 or name.startswith("/"):
+        raise ValueError(f"a file with an odd name: {name!r:.60}")
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a bundle brings: files by their harmless names, and where a rendezvous is."""
+
+    files: Mapping[Annotated[str, _check_name], str]
+    rendezvous: tuple[Endpoint, ...] = ()
+
+
+def read_content(content: dict[str, Any]) -> Content:
+    """Return what a bundle brings."""
+    try:
+        return from_plain(Content, content)
+    except ValueError as error:
+        raise CredentialError(f"the bundle holds what cannot be used: {error}") from error
 
 
 def _destroy(file: Path, size: int) -> None:
