@@ -25,7 +25,6 @@ from fogft.model.keys import (
     Whole,
     key,
     only,
-    within,
 )
 from fogft.model.names import is_endpoint
 from fogft.model.ros_names import absolute_service_name
@@ -127,13 +126,14 @@ class Assumption:
 
 
 @dataclass(frozen=True)
-class AvailabilitySpec:
+class AvailabilitySpec(Assumption):
     """How available the pool shall be, and what is assumed of machines."""
 
     target: float = key(
-        Number(0.99999, "one"), "Fraction of time that at least one replica answers."
+        Number(0.99999, "one"),
+        "Fraction of time that at least one replica answers.",
+        kw_only=True,
     )
-    assumed: Assumption = within(Assumption)
 
 
 def _metrics(default_port: int) -> Text:

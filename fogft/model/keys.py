@@ -12,7 +12,7 @@ that.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
@@ -218,9 +218,9 @@ class Key:
 
 
 class Entry(NamedTuple):
-    """One key of a dataclass; `path` is its field's name, within another field both names."""
+    """One key of a dataclass, and the name of its field."""
 
-    path: tuple[str, ...]
+    field: str
     name: str
     key: Key
     default: Any
@@ -237,6 +237,7 @@ def key(
     *,
     default: Any = MISSING,
     default_factory: Any = MISSING,
+    kw_only: bool = False,
     **more: Any,
 ) -> Any:
     """Return a dataclass's field that is a key of the pool file; `more` is the rest of `Key`."""
@@ -245,31 +246,21 @@ def key(
         return field(default_factory=default_factory, metadata=said)
     if default is not MISSING:
         return field(default=default, metadata=said)
-    return field(metadata=said)
+    return field(metadata=said, kw_only=kw_only)
 
 
 _KNOWN: dict[type, tuple[Entry, ...]] = {}
 
 
-def within(of: type) -> Any:
-    """Return a field that holds a dataclass whose keys stand among this one's."""
-    return field(default_factory=of, metadata={"within": of})
-
-
 def keys_of(cls: type) -> tuple[Entry, ...]:
-    """Return the keys of a dataclass, in order."""
-    if cls not in _KNOWN:
-        _KNOWN[cls] = tuple(_entries(cls))
-    return _KNOWN[cls]
-
-
-def _entries(cls: type) -> Iterator[Entry]:
+    """Return the keys of a dataclass, in order; those that must be there first."""
+    if cls in _KNOWN:
+        return _KNOWN[cls]
+    found = []
     for one in dataclasses.fields(cls):
-        said: Key | None = one.metadata.get("key")
-        if said is not None:
-            default = one.default
-            if one.default_factory is not MISSING:
-                default = one.default_factory()
-            yield Entry((one.name,), said.name or one.name, said, default)
-        for below in keys_of(one.metadata["within"]) if "within" in one.metadata else ():
-            yield below._replace(path=(one.name, *below.path))
+        if "key" in one.metadata:
+            said: Key = one.metadata["key"]
+            made = one.default if one.default_factory is MISSING else one.default_factory()
+            found.append(Entry(one.name, said.name or one.name, said, made))
+    _KNOWN[cls] = tuple(sorted(found, key=lambda entry: not entry.required))
+    return _KNOWN[cls]

@@ -148,7 +148,7 @@ def explain(
         scale=scale,
         cap=sized.max_usd_per_hour,
     )
-    assumed = spec.availability.assumed if spec.availability else Assumption()
+    assumed: Assumption = spec.availability or Assumption()
     if recovery_s is not None and assumed.recovery_s == Assumption().recovery_s:
         assumed = replace(assumed, recovery_s=recovery_s)
     cheapest = min(

@@ -151,7 +151,7 @@ def _for_target(
     if asked is None:
         return spec.replicas, None
     if not observed.offers:
-        one = 1.0 - unavailability_of(asked.assumed, spot=True)
+        one = 1.0 - unavailability_of(asked, spot=True)
         needed = replicas_needed(one, asked.target, limit=10_000)
         return min(MAX_REPLICAS, max(spec.replicas, running, needed)), None
     scale = Scale(spec.placement.latency_weight, observed.rtt_s)
@@ -159,7 +159,7 @@ def _for_target(
     laid = [o for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
     best = Expected(0.0, 0.0)
     for count in range(max(1, spec.replicas), len(laid) + 1):
-        best = expected([o.placement for o in laid[:count]], asked.assumed)
+        best = expected([o.placement for o in laid[:count]], asked)
         if best.correlated >= asked.target - 1e-12:
             return count, None
     # Not below what runs: near the cap, prices that waver would make the number waver.

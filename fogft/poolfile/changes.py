@@ -16,7 +16,7 @@ def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
     """Return one sentence for each difference, in the file's order; empty when there is none."""
     found = _task(before, after) + _services(before, after)
     for entry in keys_of(PoolSpec):
-        old, new = getattr(before, entry.path[0]), getattr(after, entry.path[0])
+        old, new = getattr(before, entry.field), getattr(after, entry.field)
         if entry.name == "health":
             found += _fields("health.{}", old, new)
         elif old == new or entry.name == "services":

@@ -7,7 +7,6 @@ first mistake ends it, as one `SpecError` that begins with ``file:line: key:``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any, TypeVar
 
 from fogft.errors import SpecError
@@ -35,7 +34,7 @@ class Reader:
         known = [e.name for e in entries if not e.key.advanced]
         allowed = [*known, ADVANCED] if below else known
         hints, elsewhere = removed.hints(cls), removed.places(cls)
-        values: dict[tuple[str, ...], Any] = {}
+        values: dict[str, Any] = {}
         with self._mistakes.whole():
             self._mistakes.add(section.unknown(allowed, hints=hints, elsewhere=elsewhere))
             advanced = section.section(ADVANCED if below else "")
@@ -46,10 +45,10 @@ class Reader:
                 here = advanced if is_below else section
                 with self._mistakes.step():
                     if entry.name in here.children:
-                        values[entry.path] = self._value(entry, here)
+                        values[entry.field] = self._value(entry, here)
                     elif entry.required:
                         raise here.error(entry.name, "is missing", _hint(entry))
-        made: T = _build(cls, values)
+        made = cls(**values)
         rule = self._rules.get(cls)
         return made if rule is None else rule(section, made)
 
@@ -169,14 +168,3 @@ def _hint(entry: Entry) -> str:
     if isinstance(form, keys.Listed):
         return form.of.hint
     return f"add `{entry.name}`: {keys.words(form)}"
-
-
-def _build(cls: type[T], values: Mapping[tuple[str, ...], Any]) -> T:
-    """Make a dataclass of values by their paths; a field within a field is set in its default."""
-    made = cls(**{path[0]: value for path, value in values.items() if len(path) == 1})
-    for path, value in values.items():
-        if len(path) == 2:
-            outer, inner = path
-            changed = replace(getattr(made, outer), **{inner: value})
-            made = replace(made, **{outer: changed})  # type: ignore[type-var]
-    return made

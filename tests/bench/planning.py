@@ -30,7 +30,7 @@ def planning(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     *known* ones were planned with before, as at every other tick of a manager.
     """
     service = (ServiceSpec("/plan", "nav_msgs/srv/GetPlan"),)
-    target = AvailabilitySpec(0.99999)
+    target = AvailabilitySpec(target=0.99999)
     pools = {
         "16 replicas": PoolSpec("bench", service, replicas=REPLICAS),
         "16 replicas under a cap": PoolSpec(
