@@ -10,7 +10,7 @@ Not here: sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
 from fogft.model.refusal import Effect, Refusal
@@ -45,6 +45,7 @@ class PendingRequests(Generic[T]):
         counts_deaths: Whether a request may be blamed for the death of a service that has it.
 
     Attributes:
+        table: They.
         held_bytes: Their bytes.
         choose: Which replicas are asked.
         decide: What answers mean.
@@ -52,7 +53,7 @@ class PendingRequests(Generic[T]):
     """
 
     def __init__(self, choose: Choose, decide: Decide, *, counts_deaths: bool = False) -> None:
-        self._table: FirstResponse[T] = FirstResponse()
+        self.table: FirstResponse[T] = FirstResponse()
         self.held_bytes = 0
         self.choose = choose
         self.decide = decide
@@ -61,20 +62,14 @@ class PendingRequests(Generic[T]):
         self._cautious_until = -NEVER
         self._alarms = Alarms()
 
-    def __len__(self) -> int:
-        return len(self._table)
-
-    def __contains__(self, request: bytes) -> bool:
-        return request in self._table
-
     def get(self, request: bytes | None) -> Pending[T] | None:
         """Return a request that still awaits its answer."""
-        return None if request is None else self._table.get(request)
+        return None if request is None else self.table.get(request)
 
     def use(self, choose: Choose) -> None:
         """Have another policy choose from now on; each request is put before it."""
         self.choose = choose
-        self._table.reconsider()
+        self.table.reconsider()
 
     # -- a request begins, and is sent to replicas ----------------------------------------
 
@@ -90,7 +85,7 @@ class PendingRequests(Generic[T]):
         if len(chosen) == len(able) > 1 and now < self._cautious_until:
             *chosen, spared = chosen
             self.choose.declined(request, spared, full=False)
-        pending = self._table.register(
+        pending = self.table.register(
             request,
             deadline=deadline,
             item=item,
@@ -115,14 +110,14 @@ class PendingRequests(Generic[T]):
         choose, steps = self.choose, []
         if choose.news:
             choose.news = False
-            self._table.reconsider()
-        short, soonest = self._table.short(now)
+            self.table.reconsider()
+        short, soonest = self.table.short(now)
         for request, pending in short[::-1] if newest_first else short:
             choose.look_at = NEVER
             chosen, again_at = self._next_for(request, pending, able, now)
             steps += [(request, replica) for replica in chosen]
             if again_at > now:
-                self._table.look_at(request, again_at)
+                self.table.look_at(request, again_at)
                 soonest = min(soonest, again_at)
         choose.look_at = now if choose.news else soonest
         return steps
@@ -131,7 +126,7 @@ class PendingRequests(Generic[T]):
         self, request: bytes, pending: Pending[T], able: Sequence[int], now: float
     ) -> tuple[Sequence[int], float]:
         """Return whom a request goes to now, and when to look at it again if nothing happens."""
-        candidates, rests_until = self._table.candidates(pending, able, now)
+        candidates, rests_until = self.table.candidates(pending, able, now)
         room = len(able)
         if pending.deaths:  # alone
             room = 0 if pending.open else 1
@@ -148,7 +143,7 @@ class PendingRequests(Generic[T]):
 
     def attempt(self, request: bytes, replica: int, now: float) -> Pending[T] | None:
         """Enter a further attempt; None where it is not wanted any more."""
-        pending = self._table.attempt(request, replica, now)
+        pending = self.table.attempt(request, replica, now)
         if pending is None:
             self.choose.declined(request, replica, full=False)
         elif pending.deaths:
@@ -161,23 +156,19 @@ class PendingRequests(Generic[T]):
 
     def declined(self, request: bytes, replica: int) -> None:
         """A replica's link did not take an attempt."""
-        self._table.declined(request, replica)
+        self.table.declined(request, replica)
         self.choose.declined(request, replica, full=True)
 
     def came(self, replicas: Iterable[int]) -> None:
         """These replicas can be asked (again)."""
         for replica in replicas:
-            self._table.came(replica)
+            self.table.came(replica)
             self.choose.forget(replica)
 
     def left(self, replicas: Iterable[int]) -> None:
         """These replicas cannot be asked for now."""
         for replica in replicas:
             self.choose.forget(replica)
-
-    def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
-        """A replica has begun anew what some requests are about: what it said before is void."""
-        self._table.welcome(replica, about)
 
     # -- how its attempts end -------------------------------------------------------------
 
@@ -204,12 +195,12 @@ class PendingRequests(Generic[T]):
         """
         if load is not None and request is not None:
             self.choose.heard(request, replica, load, now)
-        pending = None if request is None else self._table.get(request)
+        pending = None if request is None else self.table.get(request)
         means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
             return means, None, (), Verdict.LATE
         if means is Means.SUCCESS:
-            pending = self._table.succeeded(request, now)
+            pending = self.table.succeeded(request, now)
             if pending is None:
                 self.choose.late(request, replica, now, answered=True)
                 return means, None, (), Verdict.LATE
@@ -220,12 +211,12 @@ class PendingRequests(Generic[T]):
             return means, pending, losers, Verdict.WON
         verdict = Verdict.LATE
         if means is Means.UNDECIDED:
-            verdict = self._table.failed(request, replica, now, counts=False, bar=True)
+            verdict = self.table.failed(request, replica, now, counts=False, bar=True)
             verdict = verdict if pending is None else Verdict.WAIT
         elif means is Means.REJECTION or means is Means.WEAKER_REJECTION:
             weaker = means is Means.WEAKER_REJECTION
             kept = pending.rejection if weaker and pending is not None else None
-            verdict = self._table.rejected(request, replica, payload if kept is None else kept)
+            verdict = self.table.rejected(request, replica, payload if kept is None else kept)
             if verdict is Verdict.LATE:
                 self.choose.late(request, replica, now, answered=True)
             else:
@@ -235,7 +226,7 @@ class PendingRequests(Generic[T]):
 
     def refused(self, request: bytes, replica: int, refusal: Refusal, now: float) -> Verdict:
         """Take a refusal; return POISON where so many services died that it is sent no more."""
-        pending = self._table.get(request)
+        pending = self.table.get(request)
         crashed = refusal is Refusal.CRASHED and self._counts_deaths
         if crashed and self._alarms.believed(replica, now):
             self._cautious_until = now + CAUTIOUS_S
@@ -244,7 +235,7 @@ class PendingRequests(Generic[T]):
                 alone = replica == pending.alone_at
                 pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
                 pending.died_at.add(replica)
-        verdict = self._table.failed(
+        verdict = self.table.failed(
             request,
             replica,
             now,
@@ -262,36 +253,36 @@ class PendingRequests(Generic[T]):
 
     def settle(self, request: bytes, able: Iterable[int]) -> Pending[T] | None:
         """Take a request out whose rejection is the answer: nobody else can be asked."""
-        pending = self._table.get(request)
+        pending = self.table.get(request)
         if pending is None or pending.open or pending.rejection is None:
             return None
         if any(replica not in pending.barred for replica in able):
             return None
-        self._table.close(request)
+        self.table.close(request)
         self._closed(request, pending)
         return pending
 
     def idle(self) -> list[bytes]:
         """Return the requests that nobody works on, where some were answered, if not well."""
-        return self._table.idle() if self._table.has_rejected else []
+        return self.table.idle() if self.table.has_rejected else []
 
     def stop(self, request: bytes, now: float) -> Pending[T] | None:
         """Take a request out that its caller does not want any more."""
-        pending = self._table.close(request)
+        pending = self.table.close(request)
         if pending is not None:
             self._stopped(request, pending, now)
         return pending
 
     def expire(self, now: float) -> list[tuple[bytes, Pending[T]]]:
         """Take out every request whose deadline has come, oldest first."""
-        expired = self._table.expire(now)
+        expired = self.table.expire(now)
         for request, pending in expired:
             self._given_up(request, pending, now, expired=True)
         return expired
 
     def give_up(self, request: bytes, now: float) -> Pending[T] | None:
         """Take a request out that no replica is to have any more; the fallback still may."""
-        pending = self._table.close(request)
+        pending = self.table.close(request)
         if pending is not None:
             self._alarms.were_right(pending.died_at)
             self._given_up(request, pending, now, expired=False)
@@ -313,7 +304,7 @@ class PendingRequests(Generic[T]):
         overdue = self.fallback.answered(request)
         if overdue is not None or not ok:
             return overdue, True
-        pending = self._table.succeeded(request, now)
+        pending = self.table.succeeded(request, now)
         if pending is not None:
             self._stopped(request, pending, now)
         return pending, False

@@ -59,7 +59,7 @@ def test_the_first_success_ends_a_request_and_names_who_stops():
     means, pending, losers, _ = answer(requests, 1, OK)
     assert (means, list(losers)) == (Means.SUCCESS, [2])
     assert pending is not None
-    assert (len(requests), requests.held_bytes, spy.ended) == (0, 0, [A])
+    assert (len(requests.table), requests.held_bytes, spy.ended) == (0, 0, [A])
     assert answer(requests, 2, OK)[1] is None  # too late
     assert spy.ended == [A]
 
@@ -91,7 +91,7 @@ def test_an_answer_that_is_about_no_request_changes_nothing():
         (),
         Verdict.LATE,
     )
-    assert (len(requests), spy.ended) == (1, [])
+    assert (len(requests.table), spy.ended) == (1, [])
 
 
 def test_the_fallback_ends_a_request_once():

@@ -16,13 +16,15 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from queue import SimpleQueue
 from typing import Any
 
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
+from fogft.proxy.replica.known_requests import KnownRequests
+from fogft.proxy.replica.service_queue import Job
 from fogft.proxy.robot.dispatcher import Dispatcher
 
 log = logging.getLogger(__name__)
@@ -30,19 +32,6 @@ log = logging.getLogger(__name__)
 # As long as a link takes to come back by itself, and no longer.
 UNREADY_S = 0.5
 _COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
-
-
-class Forwarded:
-    """A request that passes through: who awaits its answer, and until when."""
-
-    __slots__ = ("copies", "deadline", "id", "robot", "service")
-
-    def __init__(self, incoming: Incoming, deadline: float) -> None:
-        self.copies = [incoming]
-        self.deadline = deadline
-        self.id = incoming.request_id
-        self.robot = incoming.robot
-        self.service = incoming.service
 
 
 class Forwarder:
@@ -68,17 +57,14 @@ class Forwarder:
     ) -> None:
         self._held = held
         self._of_one = of_one
-        self._kept_limit = kept_bytes
         self._clock = clock
         self._lock = threading.Lock()
         self._dispatchers: dict[str, Dispatcher] = {}
         self._ready: frozenset[str] = frozenset()
         self._unready_since: dict[str, float] = {}
-        self._open: dict[bytes, Forwarded] = {}
+        self._known = KnownRequests(kept_bytes, 4 * held)
         self._by_robot: Counter[str] = Counter()
-        self._kept: OrderedDict[bytes, tuple[float, bytes]] = OrderedDict()
-        self.kept_bytes = 0
-        self._queue: SimpleQueue[Forwarded | None] = SimpleQueue()
+        self._queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
         self.joined = 0
         self.refused: Counter[Refusal] = Counter()
@@ -94,40 +80,45 @@ class Forwarder:
     @property
     def in_flight(self) -> int:
         """Requests under way."""
-        return len(self._open)
+        return self._known.held
 
     # -- from robots (the wire's threads) -------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
         """Take a request from the wire. Never blocks."""
-        now = self._clock()
+        answer = reason = None
         with self._lock:
-            known = self._open.get(incoming.request_id)
-            kept = self._kept.get(incoming.request_id)
-            if known is not None or kept is not None:
+            known = self._known.get(incoming.request_id)
+            if known is not None and known.waiting is None and known.answer is None:
+                self._known.forget(known)  # its replica knows the answer
+                known = None
+            if known is None:
+                reason = self._reason_to_refuse(incoming)
+                if reason is None:
+                    self._take_up(Job(self._clock(), incoming))
+                    return
+            else:
                 self.joined += 1
-            if known is not None:
-                known.copies.append(incoming)
-                if len(known.copies) > _COPIES_LIMIT:
-                    del known.copies[0]  # refused as lost: its link is long gone
-                return
-            reason = None if kept is not None else self._reason_to_refuse(incoming)
-            if kept is None and reason is None:
-                forwarded = Forwarded(incoming, now + incoming.remaining_s)
-                self._open[forwarded.id] = forwarded
-                self._by_robot[forwarded.robot] += 1
-                self._queue.put(forwarded)
-        if kept is not None:
-            incoming.reply(kept[1])
+                answer = known.answer
+                if known.waiting is not None:
+                    known.waiting.append(incoming)
+                    del known.waiting[:-_COPIES_LIMIT]  # refused as lost: its link is long gone
+        if answer is not None:
+            incoming.reply(answer)
         elif reason is not None:
             self._refuse(incoming, reason)
+
+    def _take_up(self, job: Job) -> None:
+        self._known.add(job)
+        self._by_robot[job.robot] += 1
+        self._queue.put(job)
 
     def _reason_to_refuse(self, incoming: Incoming) -> Refusal | None:
         if incoming.remaining_s <= 0:
             return Refusal.EXPIRED
         if incoming.service not in self._ready:
             return Refusal.NOT_READY
-        full = len(self._open) >= self._held or self._by_robot[incoming.robot] >= self._of_one
+        full = self._known.held >= self._held or self._by_robot[incoming.robot] >= self._of_one
         return Refusal.OVERLOADED if full else None
 
     def _refuse(self, incoming: Incoming, reason: Refusal) -> None:
@@ -141,75 +132,70 @@ class Forwarder:
 
     def _stop(self, id: bytes, reason: Refusal) -> None:
         with self._lock:
-            forwarded = self._take(id)
-        if forwarded is None:
-            return
-        self._dispatchers[forwarded.service].cancel(id)
-        for incoming in forwarded.copies:
+            job = self._known.get(id)
+            if job is None or job.waiting is None:
+                return
+            waiting = self._release(job)
+            self._known.forget(job)
+        self._dispatchers[job.service].cancel(id)
+        for incoming in waiting:
             self._refuse(incoming, reason)
 
-    def _take(self, id: bytes) -> Forwarded | None:
-        """Take a request out. Under the lock."""
-        forwarded = self._open.pop(id, None)
-        if forwarded is not None:
-            self._by_robot[forwarded.robot] -= 1
-            if not self._by_robot[forwarded.robot]:
-                del self._by_robot[forwarded.robot]
-        return forwarded
+    def _release(self, job: Job) -> list[Incoming]:
+        """End a request; return who waits for it. Under the lock."""
+        waiting, job.waiting = job.waiting or [], None
+        self._known.release(job)
+        self._by_robot[job.robot] -= 1
+        if not self._by_robot[job.robot]:
+            del self._by_robot[job.robot]
+        return waiting
 
     # -- to replicas ----------------------------------------------------------------------
 
     def _pass_on(self) -> None:
-        while (forwarded := self._queue.get()) is not None:
+        while (job := self._queue.get()) is not None:
             try:
-                self._forward(forwarded)
+                self._forward(job)
             except Exception:  # in this thread nobody else would tell of it
-                log.exception("request_not_passed_on request=%s", forwarded.id.hex())
-                self._stop(forwarded.id, Refusal.LOST)
+                log.exception("request_not_passed_on request=%s", job.id.hex())
+                self._stop(job.id, Refusal.LOST)
 
-    def _forward(self, forwarded: Forwarded) -> None:
-        if self._open.get(forwarded.id) is not forwarded:
+    def _forward(self, job: Job) -> None:
+        if job.waiting is None:
             return  # stopped meanwhile
-        payload = forwarded.copies[-1].payload
-        left_s = forwarded.deadline - self._clock()
+        payload, job.payload = job.payload, b""
+        left_s = job.deadline - self._clock()
         if left_s <= 0:
-            self._stop(forwarded.id, Refusal.EXPIRED)
+            self._stop(job.id, Refusal.EXPIRED)
             return
-        dispatcher = self._dispatchers[forwarded.service]
-        if not dispatcher.forward(forwarded.id, payload, forwarded, left_s):
-            self._stop(forwarded.id, Refusal.OVERLOADED)
+        dispatcher = self._dispatchers[job.service]
+        if not dispatcher.forward(job.id, payload, job, left_s):
+            self._stop(job.id, Refusal.OVERLOADED)
             return
         self.passed += 1
-        if self._open.get(forwarded.id) is not forwarded:
-            dispatcher.cancel(forwarded.id)  # stopped in between; answered is fine, too
+        if job.waiting is None:
+            dispatcher.cancel(job.id)  # stopped in between; answered is fine, too
 
     def pass_on_waiting(self) -> None:
         """Pass on what was taken; for tests without a thread."""
         while not self._queue.empty():
-            forwarded = self._queue.get()
-            if forwarded is not None:
-                self._forward(forwarded)
+            job = self._queue.get()
+            if job is not None:
+                self._forward(job)
 
     # -- from replicas (their links' threads) ---------------------------------------------
 
     def respond(self, handle: Any, payload: bytes) -> None:
         """Give an answer to all that await it, and keep it for copies that come later."""
-        forwarded: Forwarded = handle
+        job: Job = handle
         with self._lock:
-            if self._open.get(forwarded.id) is not forwarded:
+            if job.waiting is None:
                 return
-            self._take(forwarded.id)
-            self._keep(forwarded, payload)
-            more = bool(self._open)
-        for incoming in forwarded.copies:
+            waiting = self._release(job)
+            self._known.keep(job, payload)
+            more = self._known.held > 0
+        for incoming in waiting:
             incoming.reply(payload, more=more)
-
-    def _keep(self, forwarded: Forwarded, payload: bytes) -> None:
-        self._kept[forwarded.id] = (forwarded.deadline, payload)
-        self.kept_bytes += len(payload)
-        while self.kept_bytes > self._kept_limit or len(self._kept) > 4 * self._held:
-            _, (_, oldest) = self._kept.popitem(last=False)
-            self.kept_bytes -= len(oldest)
 
     # -- time -----------------------------------------------------------------------------
 
@@ -223,15 +209,12 @@ class Forwarder:
         self._ready = ready
         hopeless = {n for n, since in self._unready_since.items() if now - since >= UNREADY_S}
         with self._lock:
-            all_forwarded = list(self._open.values())
-            while self._kept and next(iter(self._kept.values()))[0] <= now:
-                _, (_, payload) = self._kept.popitem(last=False)
-                self.kept_bytes -= len(payload)
-        for forwarded in all_forwarded:
-            if forwarded.deadline <= now:
-                self._stop(forwarded.id, Refusal.EXPIRED)
-            elif forwarded.service in hopeless:
-                self._stop(forwarded.id, Refusal.NOT_READY)
+            late = self._known.expired(now)
+            lost = [job.id for job in self._known.unanswered(None) if job.service in hopeless]
+        for id in late:
+            self._stop(id, Refusal.EXPIRED)
+        for id in lost:
+            self._stop(id, Refusal.NOT_READY)
 
     def report(self) -> dict[str, Any]:
         """Return counters since the start."""
@@ -244,8 +227,10 @@ class Forwarder:
 
     def close(self) -> None:
         """Refuse what is under way, and stop."""
-        for id in list(self._open):
-            self._stop(id, Refusal.LOST)
+        with self._lock:
+            left = self._known.unanswered(None)
+        for job in left:
+            self._stop(job.id, Refusal.LOST)
         self._queue.put(None)
 
 

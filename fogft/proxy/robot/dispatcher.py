@@ -119,7 +119,7 @@ class Dispatcher:
     @property
     def waiting(self) -> int:
         """How many requests have no answer yet."""
-        return len(self._requests)
+        return len(self._requests.table)
 
     @property
     def able(self) -> bool:
@@ -142,7 +142,7 @@ class Dispatcher:
         with self._lock:
             outcomes.received(len(payload))
             over = requests.held_bytes + len(payload) > self.max_pending_bytes
-            if over or len(requests) >= self.max_pending:
+            if over or len(requests.table) >= self.max_pending:
                 self._turn_away(request)
                 return False
             links, able = self._sender.links, self._sender.able
@@ -337,7 +337,7 @@ class Dispatcher:
     def began_anew(self, replica: int, about: Callable[[bytes], bool]) -> None:
         """Have a replica asked again: it has begun anew what some requests are `about`."""
         with self._lock:
-            self._requests.welcome(replica, lambda item: about(item.payload))
+            self._requests.table.welcome(replica, lambda item: about(item.payload))
         self._wake()
 
     def tick(self) -> float:
@@ -361,7 +361,7 @@ class Dispatcher:
         look_at = min(self._sender.next_look, self._delivery.tick(now, able=self.able))
         look_at = max(look_at, now + _SHORTEST_S)
         self._sender.next_look = look_at
-        if len(self._requests):  # after that was set: who comes later sees it, and wakes
+        if len(self._requests.table):  # after that was set: who comes later sees it, and wakes
             self._busy_until = max(self._busy_until, now + _LINGERS_S)
         if now < self._busy_until:
             self._sender.next_look = look_at = min(look_at, now + _TICK_S)
@@ -395,7 +395,7 @@ class Dispatcher:
         with self._lock:
             return {
                 **self.outcomes.report(),
-                "pending": len(requests) + len(requests.fallback or ()),
+                "pending": len(requests.table) + len(requests.fallback or ()),
                 "pending_bytes": requests.held_bytes,
                 "hedging": requests.choose.report(),
                 "needed_replicas": requests.choose.needed(len(self._sender.able), self._clock()),

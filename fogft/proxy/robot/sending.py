@@ -63,7 +63,7 @@ class Sender:
             else:
                 self._declined(request, replica, is_copy=True)
         self._count(taken)
-        if len(chosen) > 1 and request not in self._ledger.requests:
+        if len(chosen) > 1 and request not in self._ledger.requests.table:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)
 
@@ -134,7 +134,7 @@ class Sender:
             self._declined(request, replica, is_copy=True)
             return False
         self._count(1)
-        if request not in requests:  # it was answered meanwhile
+        if request not in requests.table:  # it was answered meanwhile
             self.forget(request, (replica,))
         return True
 
