@@ -1,4 +1,4 @@
-"""The requests that a replica, or a gateway, knows: each id once, with its answer for a while. Pure.
+"""Requests that a replica, or a gateway, knows: each id once, with its answer for a while. Pure.
 
 A robot that lost its link sends what was in flight again, under the same id. So an id is known
 until its deadline, and its answer is kept for copies as long as there is room.
