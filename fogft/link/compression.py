@@ -35,7 +35,6 @@ class Compression:
 
     Attributes:
         ratio: Compressed against plain size, as last seen; None before the first trial.
-        saved_bytes: What was not sent.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:

@@ -31,9 +31,6 @@ class DeadlineFilter:
             not known.
         left: Returns how many bytes sent before have not arrived, by the clock and that rate.
         packs: Returns a service's compression; None where its payloads leave as they are.
-
-    Attributes:
-        declined: How often there was not enough time.
     """
 
     def __init__(

@@ -55,9 +55,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
         request_id: 16 bytes, made by the client proxy.
         remaining_s: Time left when it was sent, in seconds.
         token: Names the robot's connection, so that replies queue apart.
-        robot: Who asks.
         seen: The stamp of the last answer that its connection has seen.
-        packed: The payload is compressed.
         may_pack: The answer may be.
         reads_packed: It may be where the replica itself finds the link to be thin.
         handling: What the replica is asked to do with it.

@@ -116,13 +116,11 @@ class ProbeAnswer:
         draining: It asks to be left alone: its machine will be taken.
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
         restarts: How often it restarted the user's `run` command.
-        in_flight: Requests that it holds.
         work: What became of requests since its start, by name (`Responder.report`).
         detail: Why it is not ready, in words; empty when it is.
         offered: Service name -> type of what `run` offers, where it is to be found out.
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
-        behind: The replicas behind a gateway.
         version: Of fogft on the replica; empty before 0.2.0.
         lease_age_s: Since it last heard of the pool's manager; None for never.
         lease_left_s: Until it shuts down unless it hears of it again; None for never.
@@ -310,12 +308,10 @@ class Incoming(Protocol):
     """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing.
 
     Attributes:
-        service: Name of the service asked for.
         request_id: 16 bytes, made by the client proxy.
         robot: Who asks; replies to one robot never wait for another.
         remaining_s: Time that was left when the robot sent it.
         handling: What this replica is asked to do with it.
-        payload: The serialised request (CDR).
     """
 
     service: str

@@ -27,7 +27,6 @@ class OpenAttempt:
 
     Attributes:
         payload: None once it was sent, or is not wanted.
-        size: Bytes of its payload.
         offered: When, and until when it is of use, in monotonic seconds.
         mark: What the connection had sent once this was sent (`credit`).
         reads_packed: The answer may be compressed.

@@ -35,7 +35,6 @@ class Handover:
     Attributes:
         version: The one that becomes active.
         at: The state that it takes over: every number given before has been applied there.
-        state: Its bytes.
     """
 
     version: str

@@ -28,7 +28,6 @@ class Announcer:
 
     Args:
         endpoint: ``host:port`` as it was told; empty if it was not.
-        port: The port that it listens at.
         dials_out: It cannot be reached.
     """
 

@@ -32,7 +32,6 @@ class ConcurrencyLimit:
         given: The limit, where it is not to be learned.
 
     Attributes:
-        limit: How many may be at work.
         service_s: What a request took lately, divided by how many were at work, seconds; 0
             before the first.
     """

@@ -41,7 +41,6 @@ class Send(NamedTuple):
     """Something to be sent to a replica.
 
     Attributes:
-        id: Of the attempt.
         timeout_s: How long it is good for.
         is_copy: It is a copy of a caller's request, and counted as one.
     """
@@ -89,12 +88,7 @@ class Decide:
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
-        """Return what an answer means.
-
-        Args:
-            reading: What `read` returned.
-            pending: The request, while it awaits its answer.
-        """
+        """Return what an answer means."""
         return Means.SUCCESS if reading else Means.REJECTION
 
     def refused(
@@ -131,12 +125,7 @@ class Decide:
         versions: Mapping[int, str],
         leaving: Collection[int],
     ) -> None:
-        """Note which replicas can be sent to.
-
-        Args:
-            come: Those that could not be before.
-            versions: All of them, and what each runs.
-        """
+        """Note which replicas can be sent to."""
 
     def take(self, now: float, timeout_s: float) -> Sequence[Send]:
         """Return what is to be sent now, in this order; requests have `timeout_s`."""

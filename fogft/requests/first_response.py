@@ -46,7 +46,6 @@ class Pending(Generic[T]):
     """A request that awaits its answer.
 
     Attributes:
-        deadline: On the caller's clock, seconds.
         item: What the caller keeps with it (payload, handle).
         open: Replicas that work on it now, each with the moment when it was asked.
         barred: Replicas that must not be asked again.
@@ -56,7 +55,6 @@ class Pending(Generic[T]):
         deaths: How often a service died while it worked on this: those that died together over
             copies of it, and of other requests, count as one.
         alone_at: The replica that works on it with nothing beside it, since a service has died.
-        died_at: The replicas where one has.
     """
 
     deadline: float

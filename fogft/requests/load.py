@@ -90,7 +90,6 @@ class ReplicaLoad:
         latencies: Of its answers, as the robot saw them.
         doubted: An attempt is overdue, and it has ended none since that one began.
         ended_at: When it last ended an attempt, with an answer or too late for one.
-        asked_at: When it was last asked.
     """
 
     __slots__ = (

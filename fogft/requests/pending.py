@@ -45,10 +45,6 @@ class PendingRequests(Generic[T]):
         counts_deaths: Whether a request may be blamed for the death of a service that has it.
 
     Attributes:
-        table: They.
-        held_bytes: Their bytes.
-        choose: Which replicas are asked.
-        decide: What answers mean.
         fallback: When the fallback is asked; None where there never was one.
     """
 
@@ -186,7 +182,6 @@ class PendingRequests(Generic[T]):
 
         Args:
             request: What it is about; None for no request.
-            reading: What `Decide.read` makes of them.
             load: What the replica has to do, if it says so.
 
         Returns:

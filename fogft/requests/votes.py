@@ -48,9 +48,6 @@ class Quorum(Decide):
     Args:
         newly_flagged: Called with a replica that has disagreed once too often, and how often.
         kept: Final answers kept to judge late ballots by.
-
-    Attributes:
-        disagreed: How often replicas did.
     """
 
     def __init__(

@@ -48,7 +48,6 @@ class Server:
     part of the key.
 
     Args:
-        token: How it is told, without a hash.
         probes: Asks the clients' nodes whether they take what they got.
     """
 
@@ -159,7 +158,6 @@ class Client:
     """A client of a service (`fogft.ros.port.RosClient`).
 
     Args:
-        token: How it is told, without a hash.
         servers: Returns the type hash of each server that is there now.
     """
 

@@ -36,12 +36,9 @@ class Token:
     """A liveliness token of a node, or of a service's server or client.
 
     Attributes:
-        domain: The ROS domain.
-        session: Identifier of the Zenoh session.
         node_id: Number of the node in its session.
         id: Number of the entity in its session.
         kind: `NODE`, `SERVER` or `CLIENT`.
-        node: The node's name.
         namespace: The node's namespace, with its slash.
         service: The service's name, with its slash; empty for a node.
         type: ``package/srv/Name``; empty for a node.

@@ -40,14 +40,12 @@ class RmwZenohNode:
     """Serialised services and clients among the `rmw_zenoh` nodes of one ROS domain.
 
     Args:
-        name: The node's name: letters, digits and underscores.
         domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
         hash_of: Returns the hash of a service type, as known from elsewhere; empty where it is
             not. A client's own goes before it.
         fault_of: Returns what says why bytes are no request, or response, of a service type; no
             others are passed on.
         noticed: Called, from Zenoh's thread, when a client has come. Must not block.
-        environ: Where the variables of ROS and Zenoh are.
 
     Raises:
         RosError: Zenoh cannot be configured or opened as the variables say.

@@ -19,11 +19,7 @@ _QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
 
 
 class FlowWatch:
-    """Watches one connection's socket. For one thread, but for `end_when_safe`.
-
-    Attributes:
-        progress: What was measured with the last look.
-    """
+    """Watches one connection's socket. For one thread, but for `end_when_safe`."""
 
     def __init__(self, own: Address, peer: Address) -> None:
         self._socket = OwnSocket(own, peer)
@@ -58,11 +54,6 @@ class FlowWatch:
 
         Zenoh's thread and a sender may wait for each other where an end meets a flow: see
         `docs/design/links.md`. So what flows fast is let through, and what is stuck is ended.
-
-        Args:
-            sending: Whether something large is being sent.
-            asked: Whether answers may come.
-            within_s: Wait no longer.
         """
         deadline = time.monotonic() + within_s
         received, quiet_since = -1, 0.0

@@ -24,7 +24,6 @@ class WorkQueue:
     """A thread that does what it is given, in order. Only `join` blocks.
 
     Args:
-        name: Of the thread.
         counters: Count ``control_queries_dropped`` and ``failed``.
     """
 

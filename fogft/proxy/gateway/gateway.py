@@ -44,7 +44,6 @@ class Forwarder:
 
     Attributes:
         joined: Copies of requests that were known.
-        refused: Refusals by reason.
     """
 
     def __init__(

@@ -31,10 +31,6 @@ class KnownRequests:
     Args:
         kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
         kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
-
-    Attributes:
-        held: How many are not answered yet.
-        held_bytes: Their bytes.
     """
 
     def __init__(self, kept_bytes: int, kept_ids: int) -> None:

@@ -45,11 +45,7 @@ class Clients(NamedTuple):
 
 
 class OrderedResponder:
-    """Applies the requests of one stateful service, in their order.
-
-    Args:
-        state: How its state travels.
-    """
+    """Applies the requests of one stateful service, in their order."""
 
     def __init__(
         self,

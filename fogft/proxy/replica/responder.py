@@ -54,7 +54,6 @@ class Responder:
         joined: Copies of requests that were known.
         saved, interrupted: Requests dropped unbegun, or told to stop, that nobody wanted any more.
         wasted, wasted_s: Requests that were run for nobody: too late, or unwanted.
-        refused: Refusals by kind.
     """
 
     def __init__(

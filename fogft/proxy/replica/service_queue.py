@@ -65,7 +65,6 @@ class ServiceQueue:
     Args:
         most: What the service's own queue holds: never is more passed on, unless `given`.
         given: How many may be at work; None to learn it.
-        latest: The newest request goes first.
     """
 
     def __init__(self, most: int, given: int | None = None, *, latest: bool = False) -> None:

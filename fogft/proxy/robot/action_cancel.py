@@ -42,9 +42,6 @@ class Action:
     """What the three services of one action share, under a lock that is taken last.
 
     Attributes:
-        goals: Its goals.
-        to_cancel: Who is to be told.
-        replicas: Who can be given goals.
         began: Called, without the lock, with a goal and a replica that has taken it.
     """
 

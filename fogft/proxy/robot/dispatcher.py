@@ -60,13 +60,11 @@ class Dispatcher:
         ok_of: Returns, for a name of a boolean response field, whether a response is a success;
             asked where the spec names an `ok_field`.
         empty_response: The serialised default response, for ``on_timeout: empty``.
-        wake: Has `tick` called soon. Any thread.
         max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
         id_of: Gives a caller's request its id, by service and handle.
 
     Attributes:
         leaving: Whether callers' requests are left to another proxy, which gets them too.
-        outcomes: What became of its requests.
     """
 
     def __init__(

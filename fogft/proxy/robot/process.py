@@ -185,8 +185,6 @@ def make_dispatcher(
 
     Args:
         respond: Sends a response to the caller of a handle.
-        wake: Has the dispatcher's `tick` called soon.
-        marks: Folder of the stateful services' marks.
         speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
         id_of: Gives a request its id, by service and handle; a random one unless given.
 

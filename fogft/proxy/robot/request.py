@@ -60,8 +60,6 @@ class Ledger:
 
     Attributes:
         lock: Held for moments, never while something is sent or delivered.
-        spec: The service and its policy.
-        clock: Monotonic seconds.
     """
 
     def __init__(

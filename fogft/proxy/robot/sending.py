@@ -78,7 +78,6 @@ class Sender:
 
         Args:
             links: Those whose replica is ready; where replicas are brought to readiness, all.
-            versions: What each replica of the pool runs.
             hanging: Those that say that the service answers nothing of what it has.
         """
         routed = {key_of(link): link for link in links}

@@ -242,7 +242,6 @@ class TopicsOnRobot:
     """The topics of one client proxy.
 
     Args:
-        wake: Has `tick` called soon. Any thread.
         merge: Makes one status of an action of what its replicas say.
     """
 

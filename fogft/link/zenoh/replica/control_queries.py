@@ -40,7 +40,6 @@ class ControlQueries:
 
     Args:
         records: What the pool has signed, as far as it is known here.
-        streams: Where each connection's answers go.
     """
 
     def __init__(

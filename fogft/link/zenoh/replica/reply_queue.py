@@ -41,7 +41,6 @@ class Reply:
     """One answer: a payload, or a refusal where that is not empty.
 
     Attributes:
-        stream: Whose query it is a reply to.
         load: What the replica has to do, as `frame.encode_load` writes it.
         may_pack: It may be compressed: its robot's link was seen to be thin.
     """

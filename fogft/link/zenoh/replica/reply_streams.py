@@ -47,11 +47,7 @@ class _Sent(NamedTuple):
 
 
 class ReplyCredit:
-    """The replies that one robot has not acknowledged. Any thread.
-
-    Args:
-        slow: Whether it is known to read slowly.
-    """
+    """The replies that one robot has not acknowledged. Any thread."""
 
     def __init__(
         self,
@@ -138,11 +134,7 @@ LIMIT = 1024  # a replica has 128 sessions; the others are those of connections 
 
 
 class Stream:
-    """One connection's open query. Any thread.
-
-    Args:
-        credit: What is on the way to its robot.
-    """
+    """One connection's open query. Any thread."""
 
     __slots__ = ("_credit", "_name", "query")
 

@@ -39,7 +39,6 @@ class AuthenticatedSessions:
     Args:
         pool_uid: Holders of other pools are not let in.
         replica: This replica's common name, which a greeting is made out to.
-        verify: Checks a signature and its certificate.
     """
 
     def __init__(self, pool_uid: str, replica: str, verify: Verify) -> None:

@@ -76,8 +76,6 @@ class Callbacks:
     """What a connection tells its link. Called from any thread; none may block.
 
     Attributes:
-        answered: An attempt has ended; once for each.
-        late: An attempt has ended that was forgotten.
         room: A window that was full has room again.
         large: Something large is sent, and `Attempts.watched` was not set.
         lost: The connection is of no more use. Perhaps more than once.
@@ -95,13 +93,9 @@ class Attempts:
 
     Args:
         origin: What the headers of all its requests say (`frame.origin`).
-        options: How the services' payloads are sent.
-        gate: Shared with the robot's other connections.
         cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
-        ended: What the sender thread does last.
 
     Attributes:
-        window: Those that are open.
         packs: Whether the replica reads what is compressed.
         packs_answers: Whether it finds out by itself when to compress answers.
         watched: Something large was sent lately: the link's thread looks often.

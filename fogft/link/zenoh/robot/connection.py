@@ -61,9 +61,7 @@ class Connection:
     """An open session whose peer was found to be the right one.
 
     Attributes:
-        attempts: The requests open on it.
         certificate: Ours (DER), which it uses.
-        flow: What flows through its socket.
         lost_because: Why it is of no more use; empty while it is.
         told: The records that the replica has taken from us.
 

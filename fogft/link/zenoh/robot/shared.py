@@ -16,12 +16,8 @@ class Shared:
     """What all links of one robot share. Written by the dialer, read by its links.
 
     Attributes:
-        robot: The robot's name.
         suspect_after_s: Probes unanswered for so long make a link suspect.
-        settings: Zenoh's times.
         tell_losers: Whether replicas are told which requests are no longer wanted.
-        options: How each service is sent.
-        gate: Lets one large message go at a time.
         records: Signed records for every replica, packed; empty for none.
     """
 
