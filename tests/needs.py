@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import pytest
 
+from tests.boot.machine import can_boot
 from tests.link.namespaces import can_make_namespaces
 from tests.nightly import NIGHTLY
 
@@ -72,6 +73,7 @@ NEEDS = {
     "apriltags": Need(_installed("pupil_apriltags"), "scripts/setup demo"),
     "arm64": Need(lambda: "FOGFT_ARM64" in os.environ, "scripts/test-arm64"),
     "build": Need(_can_build, "scripts/setup ros-test, apt install g++ cmake ninja-build"),
+    "boot": Need(can_boot, "root, systemd, overlays, cgroup2 and namespaces, to boot a machine"),
     "browser": Need(
         lambda: bool(shutil.which("chromedriver") and importlib.util.find_spec("selenium")),
         "scripts/setup docs, apt install chromium-driver",

@@ -7,6 +7,7 @@ group of commands.
 
 from __future__ import annotations
 
+import keyword
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -46,6 +47,8 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "include": ("change", "local/us-west-2"),
         "retry": ("change", ""),
         "credentials": ("credentials", ""),
+        "export": ("credentials", "planner planner.pool"),
+        "import": ("credentials", "planner.pool"),
         "service": ("parts", ""),
     },
     "Simulate and inject faults": {
@@ -80,7 +83,7 @@ class _Loaded(Mapping[str, Any]):
 def _load(name: str, module: str, example: str) -> Any:
     if sys.platform != "linux" and name not in ANYWHERE:
         return _elsewhere(name)
-    found = getattr(import_module(f"fogft.cli.{module}"), name)
+    found = getattr(import_module(f"fogft.cli.{module}"), name + "_" * keyword.iskeyword(name))
     if isinstance(found, typer.Typer):
         return typer.main.get_command(found)
     alone = typer.Typer(add_completion=False)

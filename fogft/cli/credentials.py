@@ -1,4 +1,4 @@
-"""``fogft credentials | join``: issue, list, revoke, rotate and use a pool's certificates.
+"""``fogft credentials | join | export | import``: a pool's certificates, and its move.
 
 A passphrase is typed, read from a file or generated; it is never an argument. Keys are never
 shown.
@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft.cli import output
+from fogft import disk
+from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolOption
 from fogft.errors import CredentialError, FogftError
@@ -201,6 +202,71 @@ def join(
     if joined.alone:
         output.warn(_alone(joined.holder))
     output.hint(f"start it with `fogft {joined.command} --config {joined.config}`")
+
+
+def export(
+    pool: Annotated[
+        str, typer.Argument(metavar="POOL", help="Pool name.", autocompletion=options.pools)
+    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write.")],
+    *,
+    hours: Annotated[
+        float, typer.Option(min=0.1, max=720, metavar="H", help="Hours until it expires.")
+    ] = DAY_H,
+    passphrase_file: PassphraseFile = None,
+) -> None:
+    """Write a sealed file that moves a pool to another machine.
+
+    This machine manages it no more; only `fogft import` makes it manageable again, here or there.
+    Replicas and this machine's client proxy go on answering.
+    """
+    from fogft.pool.commands import composition, moving
+    from fogft.pool.credentials.bundle import new_passphrase
+    from fogft.pool.folder.paths import home
+
+    own = None if passphrase_file is None else _read_passphrase(passphrase_file)
+    passphrase = own or new_passphrase()
+    store = composition.store_of(pool)
+    identity = moving.export(
+        *(store, home(), file, passphrase, time.time()),
+        open_for_s=hours * 3600,
+        told=lambda what: output.say(f"ended {what}"),
+    )
+    output.data(str(file))
+    if own is None:
+        output.say(f"passphrase: {passphrase}")
+    output.done(f"`{pool}` is exported; this machine manages it no more")
+    if identity.cloud != composition.LOCAL:
+        output.warn(
+            "the file has nothing of SkyPilot's own state: use the same API server there, or copy "
+            "`~/.sky` and `~/.ssh/sky-key*` before the import"
+        )
+    output.hint(f"run `fogft import {file.name}` on the other machine within {hours:g} hours, then "
+                f"`fogft down {pool}` here")  # fmt: skip
+
+
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="From `fogft export`.")],
+    *,
+    pool_file: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The pool file on this machine, if it has moved."),
+    ] = None,
+    passphrase_file: PassphraseFile = None,
+) -> None:
+    """Take over a pool that another machine exported.
+
+    Starts its manager here. The file can be used once, on one machine; it is then deleted.
+    """
+    from fogft.pool.commands import moving, startup
+    from fogft.pool.folder.paths import home
+
+    passphrase = _read_passphrase(passphrase_file)
+    disk.make_folder(home())
+    store = moving.import_(file, passphrase, home(), time.time(), pool_file=pool_file)
+    startup.start_manager(store)
+    output.done(f"this machine manages `{store.name}`")
+    output.hint(f"`fogft credentials rotate robot --pool {store.name}` locks the old machine out")
 
 
 def _alone(holder: Holder) -> str:

@@ -174,17 +174,19 @@ def down(
 ) -> None:
     """Shut down a pool: its replicas, client proxy and manager.
 
-    Works even if the manager is dead, and is safe to repeat.
+    Works even if the manager is dead, and is safe to repeat. Of a pool that was exported, ends
+    only what this machine still runs.
     """
     from fogft.pool.commands import composition
     from fogft.pool.manager import shutdown
     from fogft.ros import shared_memory
 
-    if not composition.pools():
+    if not (pool or named or composition.pools()):
         output.say("no pools on this machine")
         return
     store = composition.store_of(pool or named)
-    paid = store.identity().cloud != composition.LOCAL
+    elsewhere = store.paths.exported.exists()
+    paid = not elsewhere and store.identity().cloud != composition.LOCAL
     asks = paid and not yes and output.is_terminal(sys.stdin)
     if asks and not output.confirm(f"shut down `{store.name}` and all its machines?"):
         output.say("aborted: nothing was changed")
@@ -196,6 +198,9 @@ def down(
     shutdown.end(store, composition.cloud_of, told=told, warned=output.warn)
     if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
         told(f"{len(swept)} shared-memory files of dead processes")
+    if elsewhere:
+        output.done(f"nothing of `{store.name}` is left here; another machine manages it")
+        return
     output.done(f"`{store.name}` is shut down; nothing is left")
     if paid and not composition.pools():
         output.hint("SkyPilot's API server is still running; `sky api stop` ends it")

@@ -228,7 +228,10 @@ def remove(
     from fogft.pool.commands import service as units
 
     where = units.services(system=system)
-    names = [unit.name for unit in _units(pool, gateway, rendezvous, system=system)]
+    if pool is not None:  # it may have ended
+        names = list(units.names_of(pool).values())
+    else:
+        names = [unit.name for unit in _units(pool, gateway, rendezvous, system=system)]
     found = units.installed(where, names)
     units.remove(where, found)
     output.done(f"removed {', '.join(found)}" if found else "there were none")

@@ -42,10 +42,10 @@ def paths_of(name: str | None = None) -> PoolPaths:
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
         raise PoolNotFound(f"there are {len(known)} pools: {listed}", "say which one you mean")
-    if name is not None and name not in known:
+    if name is not None and name not in known and not PoolPaths.of(name).exported.exists():
         hint = f"there are: {listed}" if known else "start one with `fogft up FILE`"
         raise PoolNotFound(f"there is no pool `{name}`", hint)
-    if not known:
+    if name is None and not known:
         raise PoolNotFound("no pools on this machine", "start one with `fogft up FILE`")
     return PoolPaths.of(name or known[0])
 

@@ -163,15 +163,7 @@ def join(
     brought = read_content(content)
     files, endpoints = brought.files, list(brought.rendezvous)
     holder = label.holder
-    disk.make_folder(root / "joined")
-    used = root / "joined" / "used.json"
-    with disk.locked(root / "joined" / "used.lock"):
-        ids = stored(list[str], disk.read_json(used) or [], f"`{used}` is damaged")
-        if label.id in ids:
-            raise CredentialError(
-                f"this bundle for `{holder.short}` was already used on this machine",
-                "a bundle can be used once: have a new one issued",
-            )
+    with used_once(root, label):
         if endpoints:
             token = claiming.own_token(root / "joined" / "claims.json", label.id, now)
             with _on_disk(root / "joined", files, holder) as credentials:
@@ -182,11 +174,31 @@ def join(
             place = folder / name
             disk.make_folder(place.parent)
             disk.write_whole(place, text)
-        disk.write_json(used, [*ids, label.id][-_USED_LIMIT:])
-    _destroy(file, len(data))
+    destroy(file, len(data))
     config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
     alone = not endpoints and holder.role is not Role.RENDEZVOUS
     return Joined(label.pool, holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
+
+
+@contextlib.contextmanager
+def used_once(root: Path, label: Label) -> Iterator[None]:
+    """Remember a bundle as used on this machine, if what is done meanwhile succeeds.
+
+    Raises:
+        CredentialError: It was used before.
+        StateError: It cannot be remembered.
+    """
+    used = root / "joined" / "used.json"
+    disk.make_folder(used.parent)
+    with disk.locked(used.with_suffix(".lock")):
+        ids = stored(list[str], disk.read_json(used) or [], f"`{used}` is damaged")
+        if label.id in ids:
+            raise CredentialError(
+                f"this bundle for `{label.holder.short}` was already used on this machine",
+                "a bundle can be used once: have a new one issued",
+            )
+        yield
+        disk.write_json(used, [*ids, label.id][-_USED_LIMIT:])
 
 
 @contextlib.contextmanager
@@ -213,10 +225,11 @@ def read(file: Path) -> bytes:
         ) from None
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str, depth: int = 2) -> None:
+    """See that a file's name stays below its folder."""
     parts = PurePosixPath(name).parts
     safe = parts and all(part.strip(".") and "\0" not in part for part in parts)
-    if not safe or len(parts) > 2 or name.startswith("/"):
+    if not safe or len(parts) > depth or name.startswith("/"):
         raise ValueError(f"a file with an odd name: {name!r:.60}")
 
 
@@ -224,7 +237,7 @@ def _check_name(name: str) -> None:
 class Content:
     """What a bundle brings: files by their harmless names, and where a rendezvous is."""
 
-    files: Mapping[Annotated[str, _check_name], str]
+    files: Mapping[Annotated[str, check_name], str]
     rendezvous: tuple[Endpoint, ...] = ()
 
 
@@ -236,7 +249,7 @@ def read_content(content: dict[str, Any]) -> Content:
         raise CredentialError(f"the bundle holds what cannot be used: {error}") from error
 
 
-def _destroy(file: Path, size: int) -> None:
+def destroy(file: Path, size: int) -> None:
     """Overwrite and remove a file; a removed file's bytes may otherwise be read for long."""
     with contextlib.suppress(OSError):
         with file.open("r+b") as opened:
@@ -247,6 +260,6 @@ def _destroy(file: Path, size: int) -> None:
         file.unlink()
     except OSError as error:
         raise FogftError(
-            f"this machine has joined, but `{file}` cannot be removed: {error.strerror}",
+            f"all is set up, but `{file}` cannot be removed: {error.strerror}",
             "remove it by hand: it cannot be used again",
         ) from None

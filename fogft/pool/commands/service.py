@@ -35,7 +35,7 @@ MARK = "# Written by `fogft service install`"
 # tools keep those in files.
 _TAKEN = re.compile(
     r"ROS_.*|RMW_IMPLEMENTATION|AMENT_.*|COLCON_.*|CYCLONEDDS_URI|FAST(DDS|RTPS)_.*|ZENOH_.*|"
-    r"PATH|PYTHONPATH|LD_LIBRARY_PATH|VIRTUAL_ENV|LANG|HOME|FOGFT_HOME|XDG_STATE_HOME"
+    r"PATH|PYTHONPATH|LD_LIBRARY_PATH|VIRTUAL_ENV|LANG|FOGFT_HOME"
 )
 
 _UNIT = """\
@@ -57,7 +57,7 @@ EnvironmentFile={environment}
 RestartSec=1
 TimeoutStartSec=300
 TimeoutStopSec=180
-WatchdogSec=120
+WatchdogSec={watchdog_s}
 KillMode=process
 
 [Install]
@@ -100,18 +100,22 @@ def services(*, system: bool, environ: Mapping[str, str] = os.environ) -> Servic
     return Services(False, Path(config).expanduser() / "systemd" / "user")
 
 
+def names_of(pool: str) -> dict[str, str]:
+    """Return the names of the units of a pool, by part."""
+    return {part: f"fogft-{pool}-{part}.service" for part in ("manager", "proxy-a", "proxy-b")}
+
+
 def of_pool(paths: PoolPaths, *, system: bool) -> list[Unit]:
     """Return the units of a pool's manager and client proxies."""
     pool, environment = paths.folder.name, paths.folder / "service.env"
+    manager = ("manager", "--no-proxy", pool)
     proxy = ("proxy", "--standby", "--config", str(paths.proxy_config))
-    parts = {
-        f"fogft-{pool}-manager": ("manager", "--no-proxy", pool),
-        f"fogft-{pool}-proxy-a": proxy,
-        f"fogft-{pool}-proxy-b": proxy,
-    }
     return [
-        _unit(name, words, paths.identity, environment, system=system)
-        for name, words in parts.items()
+        _unit(
+            *(name, manager if part == "manager" else proxy, paths.identity, environment),
+            system=system,
+        )
+        for part, name in names_of(pool).items()
     ]
 
 
@@ -122,7 +126,8 @@ def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
         raise StateError(f"there is no `{config}`", "`fogft join` writes it")
     words = (command, "--config", str(config))
     environment = config.with_suffix(".env")
-    return [_unit(f"fogft-{command}-{config.stem}", words, config, environment, system=system)]
+    name = f"fogft-{command}-{config.stem}.service"
+    return [_unit(name, words, config, environment, system=system)]
 
 
 def _unit(name: str, words: Sequence[str], needs: Path, environment: Path, *, system: bool) -> Unit:
@@ -130,14 +135,15 @@ def _unit(name: str, words: Sequence[str], needs: Path, environment: Path, *, sy
     owner = pwd.getpwuid(needs.stat().st_uid).pw_name
     text = _UNIT.format(
         mark=MARK,
-        what=name.removeprefix("fogft-"),
+        what=name.removeprefix("fogft-").removesuffix(".service"),
         needs=str(needs).replace("%", "%%"),
         command=command,
         environment=str(environment).replace("%", "%%"),
         user=f"User={owner}\n" if system else "",
+        watchdog_s=120 if words[0] == "manager" else 30,  # a manager waits for its cloud
         wanted_by="multi-user.target" if system else "default.target",
     )
-    return Unit(f"{name}.service", text, environment)
+    return Unit(name, text, environment)
 
 
 def _quoted(word: str) -> str:
@@ -148,9 +154,12 @@ def _quoted(word: str) -> str:
 
 
 def environment(environ: Mapping[str, str] = os.environ) -> str:
-    """Return an environment file with what ROS, its middleware and fogft need."""
+    """Return an environment file with what ROS, its middleware and fogft need.
+
+    Not the home: `sudo` leaves root's, and systemd sets that of the unit's user.
+    """
     taken = {name: value for name, value in environ.items() if _TAKEN.fullmatch(name)}
-    taken.setdefault("FOGFT_HOME", str(home(environ)))
+    taken["FOGFT_HOME"] = str(home(environ).absolute())
     lines = []
     for name, value in sorted(taken.items()):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("`", "\\`")
@@ -218,10 +227,14 @@ def states(where: Services, names: Sequence[str]) -> dict[str, str]:
 
 
 def remove(where: Services, names: Sequence[str]) -> None:
-    """Stop units, and delete them."""
-    if shutil.which("systemctl") is not None and names:
+    """Stop units, and delete them and their environment."""
+    runs = shutil.which("systemctl") is not None
+    if runs and names:
         where.systemctl("disable", "--now", *names)
-    for name in names:
-        (where.folder / name).unlink(missing_ok=True)
-    if shutil.which("systemctl") is not None:
+    for unit in (where.folder / name for name in names):
+        for path in re.findall("^EnvironmentFile=(.*)$", unit.read_text(), re.MULTILINE):
+            Path(path.replace("%%", "%")).unlink(missing_ok=True)
+        unit.unlink()
+    if runs and names:
         where.systemctl("daemon-reload")
+        where.systemctl("reset-failed", *names)

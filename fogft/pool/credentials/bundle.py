@@ -1,4 +1,4 @@
-"""A join bundle: one file that sets up a robot, gateway or replica on another machine.
+"""A bundle: one file that sets up a robot, gateway, replica or manager on another machine.
 
 It is readable JSON around sealed content: the key that seals it is made from a passphrase
 (scrypt), and the readable part is sealed along with it (AES-GCM), so whoever changes a
@@ -25,7 +25,7 @@ from fogft.model.keys import only
 from fogft.model.plain import Moment, from_plain, to_plain
 
 VERSION = 2
-SIZE_LIMIT = 1 << 20
+SIZE_LIMIT = 32 << 20
 PASSPHRASE_LEAST = 12
 # 64 MiB and about a fifth of a second a guess. Fixed by the version: a file cannot ask for more.
 SCRYPT: dict[str, int] = {"n": 1 << 16, "r": 8, "p": 1}
@@ -104,7 +104,7 @@ def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[s
     except InvalidTag:
         raise CredentialError(
             "the passphrase is wrong, or the bundle was changed",
-            "it was shown by the `fogft credentials issue` that made this bundle",
+            "it was shown by the command that made this file",
         ) from None
     except ValueError:
         raise CredentialError("the bundle's content cannot be read") from None

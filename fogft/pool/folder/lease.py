@@ -68,6 +68,16 @@ class Lease:
         self._lock.release()
 
 
+def read_epoch(paths: PoolPaths) -> int:
+    """Return the epoch of the manager that held the lease last; 0 for none."""
+    return _read(paths).epoch
+
+
+def write_epoch(paths: PoolPaths, epoch: int) -> None:
+    """Have the next manager take an epoch above this one."""
+    disk.write_json(paths.lease, to_plain(_Held(epoch)))
+
+
 def _read(paths: PoolPaths) -> _Held:
     """Return what the file says; a damaged one says nothing, as where there is none."""
     try:

@@ -56,6 +56,8 @@ class PoolPaths:
 
     identity = _File("pool.json")
     """``{name, uid, cloud, file, created_at}``: written once, at the first `up`."""
+    exported = _File("exported.json")
+    """`identity`, once another machine manages the pool."""
     spec = _File("spec.yaml")
     """The pool file as last applied, byte for byte."""
     good_spec = _File("good.yaml")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from fogft import disk
-from fogft.errors import PoolNotFound, SpecError, StateError
+from fogft.errors import PoolBusy, PoolNotFound, SpecError, StateError
 from fogft.model.intent import Intent
 from fogft.model.membership import from_dict, to_dict
 from fogft.model.names import PoolUid
@@ -253,9 +253,16 @@ def read_identity(paths: PoolPaths) -> Identity:
 
     Raises:
         PoolNotFound: There is none.
+        PoolBusy: Another machine manages it.
         StateError: Its file is damaged.
     """
     raw = disk.read_json(paths.identity)
+    if raw is None and paths.exported.exists():
+        name = paths.folder.name
+        raise PoolBusy(
+            f"pool `{name}` was exported from this machine",
+            f"manage it where it was imported; `fogft down {name}` ends what is left here",
+        )
     if raw is None:
         raise PoolNotFound(f"there is no pool `{paths.folder.name}`", "`fogft up FILE` starts one")
     return stored(Identity, raw, f"`{paths.identity}` is damaged")

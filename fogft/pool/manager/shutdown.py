@@ -40,6 +40,8 @@ def end(
 ) -> list[str]:
     """End a pool and return what was ended, in words, in order.
 
+    Of one that another machine manages, only what is left here.
+
     `told` hears of each thing as it has ended, `warned` of what could not be made certain.
 
     Raises:
@@ -47,19 +49,24 @@ def end(
         CloudUnreachable: It is not known what is left; run it again.
         FogftError: Something did not end (the message says what); run it again.
     """
-    paths, identity = store.paths, store.identity()
+    paths = store.paths
     ended: list[str] = []
 
     def done(what: str) -> None:
         ended.append(what)
         told(what)
 
+    if paths.exported.exists():
+        with without_client_proxy(paths, done):
+            shutil.rmtree(paths.folder)
+        return ended
+    store.identity()
     with disk.locked(paths.intent_lock), contextlib.ExitStack() as kept:
         try:
             identity = store.identity()
         except PoolNotFound:
             return ended  # another `down` was faster
-        kept.enter_context(_taken(done, "manager", paths.manager_lock))
+        kept.enter_context(without_manager(paths, done))
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             store.write_intent(replace(_intent(store), stopping=True))
@@ -76,6 +83,17 @@ def end(
         paths.identity.unlink(missing_ok=True)
         shutil.rmtree(paths.folder, ignore_errors=True)
     return ended
+
+
+def without_manager(
+    paths: PoolPaths, done: Callable[[str], None]
+) -> contextlib.AbstractContextManager[None]:
+    """End a pool's manager; none can start while this is open.
+
+    Raises:
+        FogftError: It does not end.
+    """
+    return _taken(done, "manager", paths.manager_lock)
 
 
 @contextlib.contextmanager

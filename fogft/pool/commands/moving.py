@@ -1,0 +1,175 @@
+"""Move a pool to another machine: its CA, its history and what it aims for, in one sealed file.
+
+Replicas are not touched and go on answering. From the export on no manager starts for the pool on
+the old machine and no command changes it. The first manager on the new one takes an epoch above
+all before, so what the old machine may still say is out of date to everybody who hears both.
+
+Owns: what is in the file, and the order of steps. Not here: sealing (`bundle`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from fogft import disk
+from fogft.errors import FogftError, PoolBusy, PoolNotFound
+from fogft.model.credentials import Holder, Role
+from fogft.model.plain import stored, to_plain
+from fogft.pool.commands import joining, startup
+from fogft.pool.commands.composition import make_store
+from fogft.pool.credentials import bundle
+from fogft.pool.credentials.bundle import Label
+from fogft.pool.folder import costs, lease
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
+from fogft.pool.manager import proxy_supervisor, shutdown
+
+_POOL, _CLOUD, _COSTS = "pool", "cloud", "costs"  # folders in the file
+_check_name = functools.partial(joining.check_name, depth=4)
+
+
+@dataclass(frozen=True)
+class _Moved:
+    identity: Identity
+    files: Mapping[Annotated[str, _check_name], str]
+
+
+def export(
+    store: PoolStore,
+    root: Path,
+    file: Path,
+    passphrase: str,
+    now: float,
+    *,
+    open_for_s: float,
+    told: Callable[[str], None] = lambda _: None,
+) -> Identity:
+    """Seal a pool into a file, and manage it here no more; return what it is.
+
+    The client proxy of this machine goes on, so that requests are answered meanwhile; where a
+    service is stateful it ends, since only one robot may order its requests.
+
+    Args:
+        store: The pool.
+        root: The folder of all of fogft's state.
+        file: What to write; it must not exist.
+        passphrase: What to seal it with.
+        now: Seconds since the epoch.
+        open_for_s: How long the file can be imported.
+        told: Called with each process as it has been ended.
+
+    Raises:
+        CredentialError: The passphrase is too short.
+        FogftError: The file exists or cannot be written: the pool is managed here as before.
+    """
+    bundle.check_passphrase(passphrase)
+    if file.exists():
+        raise FogftError(f"`{file}` exists", "choose another name")
+    unfinished = file.with_name(f"{file.name}.unfinished")
+    paths = store.paths
+    with disk.locked(paths.intent_lock):
+        identity = store.identity()
+        try:
+            with contextlib.ExitStack() as ended:
+                ended.enter_context(shutdown.without_manager(paths, told))
+                proxy_supervisor.forbid_restart(paths)
+                if any(service.state is not None for service in store.spec().services):
+                    ended.enter_context(shutdown.without_client_proxy(paths, told))
+                epoch = lease.read_epoch(paths) + 1
+                holder = Holder(Role.MANAGER, "manager", epoch, identity.uid)
+                until = now + open_for_s
+                label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, until)
+                moved = _Moved(identity, dict(_files(paths, identity, root)))
+                disk.write_whole(unfinished, bundle.seal(label, to_plain(moved), passphrase))
+                os.replace(paths.identity, paths.exported)
+        except (FogftError, OSError):
+            unfinished.unlink(missing_ok=True)
+            startup.start_manager(store)
+            raise
+        os.replace(unfinished, file)
+    return identity
+
+
+def _files(paths: PoolPaths, identity: Identity, root: Path) -> Iterator[tuple[str, str]]:
+    """Yield name and content of what another machine needs; bytes as Latin-1."""
+    kept = (
+        *(paths.spec, paths.good_spec, paths.intent, paths.trial, paths.discovered),
+        *(paths.history, paths.membership, paths.records, paths.manager_records),
+        paths.announcements,
+        *sorted(paths.credentials.iterdir()),
+        *sorted(paths.proxy_status.with_suffix(".marks").glob("*")),
+    )
+    for path in kept:
+        if path.is_file() and path.suffix != ".lock":
+            yield f"{_POOL}/{path.relative_to(paths.folder)}", path.read_bytes().decode("latin-1")
+    spent = costs.path_of(paths.costs, identity.name, identity.uid)
+    if spent.exists():
+        yield f"{_COSTS}/{spent.name}", spent.read_bytes().decode("latin-1")
+    for path in sorted((root / identity.cloud / "launches").rglob("*")):
+        if identity.uid in str(path) and path.suffix != ".log" and path.is_file():
+            name = path.relative_to(root / identity.cloud)
+            yield f"{_CLOUD}/{name}", path.read_bytes().decode("latin-1")
+
+
+def import_(
+    file: Path, passphrase: str, root: Path, now: float, *, pool_file: Path | None = None
+) -> PoolStore:
+    """Take a pool over from its file, and destroy the file; return the pool, without a manager yet.
+
+    Args:
+        file: From `export`.
+        passphrase: What it was sealed with.
+        root: The folder of all of fogft's state.
+        now: Seconds since the epoch.
+        pool_file: The pool file on this machine: relative paths in it start at its folder.
+
+    Raises:
+        CredentialError: It is none, is too old, or was used here.
+        FogftError: There is a pool of this name here, or its pool file is missing.
+    """
+    data = joining.read(file)
+    label, content = bundle.open_sealed(data, passphrase, now)
+    if label.holder.role is not Role.MANAGER:
+        raise FogftError(f"`{file}` lets a machine join a pool", "use it with `fogft join`")
+    brought = stored(_Moved, content, "the file holds no pool")
+    was = brought.identity
+    place = (pool_file or Path(was.file)).resolve()
+    if not place.is_file():
+        raise FogftError(
+            f"the pool file `{place}` is not on this machine",
+            "put it there with its `workdir`, or say where it is with `--pool-file`",
+        )
+    paths = PoolPaths.of(was.name, root)
+    disk.make_folder(paths.folder)
+    with disk.locked(paths.intent_lock), joining.used_once(root, label):
+        try:
+            read_identity(paths)
+        except PoolNotFound:
+            pass
+        except PoolBusy:  # exported from here
+            if stored(Identity, disk.read_json(paths.exported), "").uid != was.uid:
+                raise
+        else:
+            raise FogftError(
+                f"this machine has a pool `{was.name}`", f"end it with `fogft down {was.name}`"
+            )
+        shutil.rmtree(paths.credentials, ignore_errors=True)
+        folders = {_POOL: paths.folder, _COSTS: paths.costs, _CLOUD: root / was.cloud}
+        for name, text in brought.files.items():
+            folder, _, rest = name.partition("/")
+            if folder in folders and rest:
+                disk.make_folder((folders[folder] / rest).parent)
+                disk.write_whole(folders[folder] / rest, text.encode("latin-1"))
+        lease.write_epoch(paths, max(label.holder.generation, lease.read_epoch(paths)))
+        write_identity(paths, Identity(was.name, was.uid, was.cloud, str(place), was.created_at))
+        paths.exported.unlink(missing_ok=True)
+    joining.destroy(file, len(data))
+    return make_store(was.name)

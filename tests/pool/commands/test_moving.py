@@ -1,0 +1,98 @@
+"""What `fogft export` and `import` refuse, and that a refusal changes nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from fogft.errors import CredentialError, FogftError, PoolBusy
+from fogft.model.credentials import Role
+from fogft.pool.commands import joining, moving
+from fogft.pool.commands.composition import make_store
+from fogft.pool.credentials.authority import create_authority
+from fogft.pool.credentials.ledger import Ledger
+from fogft.pool.folder.lease import read_epoch
+from fogft.pool.folder.paths import PoolPaths
+from tests.cli.pools import UID, lay_down
+
+SECRET = "correct horse battery staple"
+NOW = 1_000_000.0
+
+
+@pytest.fixture
+def made(tmp_path, monkeypatch):
+    """A pool without processes, and where its file would be."""
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
+    paths = lay_down(tmp_path / "home", None)
+    create_authority(paths.credentials, UID)
+    Ledger(paths.credentials).issue_next(Role.ROBOT, "ada", UID, days=1)
+    return make_store("planner"), tmp_path / "planner.pool"
+
+
+def export(store, file, now=NOW):
+    return moving.export(store, store.paths.folder.parents[1], file, SECRET, now, open_for_s=60)
+
+
+def test_what_is_moved_is_the_same_pool_under_a_later_epoch(made, tmp_path):
+    store, file = made
+    pool_file = tmp_path / "elsewhere.yaml"
+    pool_file.write_text(store.paths.spec.read_text())
+    before = {p.name: p.read_bytes() for p in store.paths.credentials.glob("*[!k]")}
+    was = export(store, file)
+    with pytest.raises(PoolBusy, match="exported from this machine"):
+        store.identity()
+    new = tmp_path / "new"
+    moving.import_(file, SECRET, new, NOW + 59, pool_file=pool_file)
+    paths = PoolPaths.of(was.name, new)
+    assert before
+    for name, content in before.items():
+        assert (paths.credentials / name).read_bytes() == content
+        assert (paths.credentials / name).stat().st_mode & 0o777 == 0o600
+    assert paths.spec.read_bytes() == store.paths.spec.read_bytes()
+    assert read_epoch(paths) > read_epoch(store.paths)
+    assert not file.exists()
+
+
+def test_an_export_comes_back_where_it_was_made(made, tmp_path):
+    store, file = made
+    pool_file = tmp_path / "pool.yaml"
+    pool_file.write_text("")
+    was = export(store, file)
+    moving.import_(file, SECRET, tmp_path / "home", NOW, pool_file=pool_file)
+    assert store.identity().uid == was.uid
+    assert not store.paths.exported.exists()
+
+
+def test_what_is_refused_leaves_the_file_and_no_pool(made, tmp_path):
+    store, file = made
+    export(store, file)
+    sealed, new = file.read_bytes(), tmp_path / "new"
+    with pytest.raises(CredentialError, match="expired"):
+        moving.import_(file, SECRET, new, NOW + 61)
+    with pytest.raises(CredentialError, match="passphrase is wrong"):
+        moving.import_(file, SECRET + "x", new, NOW)
+    with pytest.raises(FogftError, match="is not on this machine"):
+        moving.import_(file, SECRET, new, NOW, pool_file=tmp_path / "nowhere.yaml")
+    assert file.read_bytes() == sealed
+    assert not PoolPaths.of("planner", new).identity.exists()
+
+
+def test_a_join_bundle_moves_no_pool(made, tmp_path):
+    store, _ = made
+    spec = store.paths.spec.read_text()
+    store.paths.spec.write_text(spec + "  rendezvous: [127.0.0.1:7450]\n")
+    bundle = tmp_path / "ada.join"
+    _, data = joining.issue(store, Role.ROBOT, "ada", SECRET, NOW, open_for_s=60)
+    bundle.write_bytes(data)
+    with pytest.raises(FogftError, match="lets a machine join"):
+        moving.import_(bundle, SECRET, tmp_path / "new", NOW)
+
+
+def test_a_pool_whose_file_cannot_be_written_stays(made, tmp_path, monkeypatch):
+    """It is managed here as before: its manager is started again."""
+    store, _ = made
+    started = []
+    monkeypatch.setattr(moving.startup, "start_manager", started.append)
+    with pytest.raises(FogftError, match="cannot be written"):
+        export(store, tmp_path / "no folder" / "planner.pool")
+    assert started == [store]
+    assert store.identity().name == "planner"
