@@ -1,4 +1,4 @@
-"""Counters of proxies, and the page that Prometheus reads.
+"""Counters of proxies, the page that Prometheus reads, and spans for OpenTelemetry.
 
 Not here: the manager's metrics (`fogft.pool.manager.tally`).
 """

@@ -84,14 +84,16 @@ class Outcomes:
         outcome: Outcome,
         *,
         took_s: float,
+        at: float,
         asked: Mapping[int, float] = MappingProxyType({}),
         refused: Mapping[int, Refusal] = MappingProxyType({}),
         replica: str = "",
     ) -> None:
-        """Trace how a request ended."""
+        """Trace how a request ended, and when (on the clock of whoever traces)."""
         if self.trace is not None:
             self.trace.append(
                 {
+                    "at": at,
                     "request": request.hex(),
                     "outcome": outcome.value,
                     "replica": replica,

@@ -205,7 +205,8 @@ class ServiceSpec:
     )
     trace: bool = key(
         Flag(),
-        "Write a line for each request to the client proxy's `trace.jsonl`.",
+        "Write a line for each request to the client proxy's `trace.jsonl`, or export it as "
+        "OpenTelemetry spans where the environment has OTEL_EXPORTER_OTLP_ENDPOINT.",
         default=False,
         advanced=True,
         parameter=True,

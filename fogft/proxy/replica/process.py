@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from fogft.cloud import notice
@@ -20,6 +21,7 @@ from fogft.cloud.notice import Notice, NoticeKind
 from fogft.link.zenoh import runtime
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
+from fogft.metrics.spans import wanted
 from fogft.model.proxy_config import ServerProxyConfig
 from fogft.model.type_definition import Definition
 from fogft.process import start_log, stop_on_signal
@@ -27,6 +29,7 @@ from fogft.proxy import middleware, start
 from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
 from fogft.proxy.replica.server import ServerProxy
+from fogft.proxy.replica.service_queue import Job
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.records import cache
 from fogft.records.record import RecordKind
@@ -84,7 +87,15 @@ def run(
 
     signal.signal(signal.SIGTERM, end)
     middleware.prepare(config.rmw)
-    proxy = _make(config)
+    traced = frozenset(service.name for service in config.services if service.trace)
+    spans = wanted("fogft-replica", config.pool) if traced else None
+
+    def answered(job: Job, ended: float) -> None:
+        if spans is not None and job.service in traced:
+            moments = (job.arrived, job.begun, ended)
+            spans.ran(job.id, job.service, config.id.short, moments)
+
+    proxy = _make(config, answered if spans is not None else None)
     watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
     presence: Presence | None = None
     scrape = Scrape(
@@ -112,7 +123,7 @@ def run(
         log.info("replica_stopped replica=%s", config.id)
 
 
-def _make(config: ServerProxyConfig) -> ServerProxy:
+def _make(config: ServerProxyConfig, answered: Callable[[Job, float], None] | None) -> ServerProxy:
     from fogft.link.zenoh.handshakes import HandshakeLog
     from fogft.link.zenoh.replica.listener import ZenohListener
     from fogft.ros.state_bytes import StateBytes
@@ -141,6 +152,7 @@ def _make(config: ServerProxyConfig) -> ServerProxy:
         define=define,
         topics=config.topics,
         max_in_flight=config.max_in_flight,
+        answered=answered,
     )
 
 

@@ -48,6 +48,7 @@ class Responder:
         passing: Whether a service's answer holds for the moment only: a copy is run anew; None
             where none does.
         kept_bytes, kept_ids: As for `KnownRequests`.
+        answered: Told of each request that the service has answered, and when.
 
     Attributes:
         ran, ran_s: Requests passed on, and the time until their responses together.
@@ -68,6 +69,7 @@ class Responder:
         passing: Callable[[str, bytes], bool] | None = None,
         kept_bytes: int = 16 << 20,
         kept_ids: int = 32768,
+        answered: Callable[[Job, float], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._is_ready = is_ready
@@ -75,7 +77,7 @@ class Responder:
         self._outstanding, self._limits = outstanding, dict(limits or {})
         self._latest = frozenset(latest)
         self._passing = passing
-        self._clock = clock
+        self._clock, self._answered = clock, answered
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
         self._interruptions = Interruptions()
@@ -301,6 +303,8 @@ class Responder:
                     incoming.reply(payload, load=load, more=more)
         finally:
             self._over(job, queue, now, wasted=not waiting or job.unwanted)
+            if self._answered is not None:
+                self._answered(job, now)
 
     def _over(self, job: Job, queue: ServiceQueue, now: float, *, wasted: bool) -> None:
         """Give the room of finished work to what waits. After its replies: these cannot wait."""

@@ -35,7 +35,7 @@ from fogft.proxy.replica.interruption import CANCEL_TYPE
 from fogft.proxy.replica.offering import Offering
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.replica.responder import Responder
-from fogft.proxy.replica.service_queue import limits_of
+from fogft.proxy.replica.service_queue import Job, limits_of
 from fogft.proxy.replica.serving_lease import HeldLease
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
@@ -60,6 +60,7 @@ class ServerProxy:
         make_state: Says how the state of a stateful service travels.
         define: Returns the definition of a service type here, for the robot to compare.
         topics: What passes besides services; then nodes publish and subscribe, too.
+        answered: As for `Responder`.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class ServerProxy:
         define: Callable[[str], Definition] | None = None,
         topics: tuple[TopicSpec, ...] = (),
         max_in_flight: int = 512,
+        answered: Callable[[Job, float], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._id = id
@@ -101,6 +103,7 @@ class ServerProxy:
             limits=limits_of(services),
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
             passing=for_the_moment(services),
+            answered=answered,
             clock=clock,
         )
         self._goals = GoalsOnce(

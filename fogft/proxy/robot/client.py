@@ -337,9 +337,10 @@ class ClientProxy:
 
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, of the services that are traced."""
+        past_s = time.time() - time.monotonic()
         with self._lock:
             return [
-                {"service": name, **line}
+                {**line, "at": round(line["at"] + past_s, 6), "service": name}
                 for name, service in self._services.items()
                 for line in service.dispatcher.trace()
             ]

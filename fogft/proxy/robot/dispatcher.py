@@ -162,7 +162,7 @@ class Dispatcher:
         """Count a request that is not taken. Under the lock."""
         count = self.outcomes.count
         count["turned_away"] += 1
-        self.outcomes.note(request, Outcome.TURNED_AWAY, took_s=0.0)
+        self.outcomes.note(request, Outcome.TURNED_AWAY, took_s=0.0, at=self._clock())
         if worth_logging(count["turned_away"]):
             log.warning("request_turned_away service=%s reason=%r count=%d",
                         self.spec.name, "pending is full", count["turned_away"])  # fmt: skip

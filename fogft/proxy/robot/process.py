@@ -23,6 +23,7 @@ from fogft.errors import FogftError, PoolBusy, StateError
 from fogft.link.uplinks import UplinkDialer
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
+from fogft.metrics.spans import Spans, wanted
 from fogft.model import names
 from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig
@@ -121,8 +122,9 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     log.info("proxy_started pool=%s robot=%s pid=%d standby=%s start_s=%.2f", config.pool,
              config.robot, os.getpid(), early is not None, time.monotonic() - began)  # fmt: skip
     running = _Running(
-        config_path, metrics, config, lock, proxy, following, dialer, seen, scrape, joined, managing
-    )
+        config_path, metrics, config, lock, proxy, following, dialer, seen, scrape, joined,
+        managing, wanted("fogft-robot", config.pool),
+    )  # fmt: skip
     try:
         start.settle()
         notify("READY=1")
@@ -235,6 +237,7 @@ class _Running(NamedTuple):
     scrape: Scrape
     joined: middleware.Joined
     managing: ManagerRestart
+    spans: Spans | None
 
     def callers(self) -> dict[str, int]:
         """Count who may call each service that is offered, as far as discovery knows."""
@@ -301,7 +304,7 @@ class _Running(NamedTuple):
                 told = {"uptime_s": now - started, "participant": participant.hex()}
                 try_step(functools.partial(self._report, told), config.status)
                 trace = config.status.with_name(TRACE_NAME)
-                try_step(functools.partial(_write_trace, trace, proxy), trace)
+                try_step(functools.partial(_trace, trace, proxy, self.spans), trace)
 
     def _reconfigure(self) -> None:
         path = self.config_path
@@ -386,17 +389,19 @@ def _tell(path: Path, proxy: ClientProxy) -> None:
     proxy.tell(cache.read(path))
 
 
-def _write_trace(path: Path, proxy: ClientProxy) -> None:
-    """Append how requests ended, a JSON object a line; keep one older file."""
+def _trace(path: Path, proxy: ClientProxy, spans: Spans | None) -> None:
+    """Append how requests ended, a JSON object a line, or export it; keep one older file."""
     lines = proxy.trace()
     if not lines:
         return
-    at = round(time.time(), 3)
+    if spans is not None:
+        spans.asked(lines)
+        return
     try:
         if path.exists() and path.stat().st_size > _TRACE_BYTES:
             path.replace(path.with_name(path.name + ".1"))
         with path.open("a") as file:
-            file.writelines(json.dumps({"at": at, **line}) + "\n" for line in lines)
+            file.writelines(json.dumps(line) + "\n" for line in lines)
     except OSError as error:
         raise StateError(f"`{path}` cannot be written: {error.strerror}") from error
 

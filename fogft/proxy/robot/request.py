@@ -100,6 +100,7 @@ class Ledger:
             request,
             outcome,
             took_s=now - arrived,
+            at=now,
             asked=asked,
             refused=trace.refused,
             replica=replica,
