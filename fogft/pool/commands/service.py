@@ -35,7 +35,7 @@ MARK = "# Written by `fogft service install`"
 # tools keep those in files.
 _TAKEN = re.compile(
     r"ROS_.*|RMW_IMPLEMENTATION|AMENT_.*|COLCON_.*|CYCLONEDDS_URI|FAST(DDS|RTPS)_.*|ZENOH_.*|"
-    r"PATH|PYTHONPATH|LD_LIBRARY_PATH|VIRTUAL_ENV|LANG|FOGFT_HOME"
+    r"OTEL_.*|PATH|PYTHONPATH|LD_LIBRARY_PATH|VIRTUAL_ENV|LANG|FOGFT_HOME"
 )
 
 _UNIT = """\
