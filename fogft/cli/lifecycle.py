@@ -79,27 +79,27 @@ def up(
 
     order = preview.order(file, cloud, told=output.say)
     paths = PoolPaths.of(order.spec.name)
-    running = "" if order.preview.is_new else startup.manager_version(paths)
+    running = "" if order.is_new else startup.manager_version(paths)
     upgrades = running not in ("", __version__)
-    old = None if order.preview.is_new or upgrades else status.read(paths, time.time())
+    old = None if order.is_new or upgrades else status.read(paths, time.time())
     update = None if old is None else old.status.update
     under_way = update is not None and update.state != UpdateState.ROLLED_BACK.value
-    progress.announce(order.preview, update if under_way else None, upgrade_from=running)
-    may_cost_more = order.preview.is_new or order.preview.changes or upgrades
-    if order.preview.costs_money and may_cost_more and not yes:
-        count = len(order.preview.launches) if order.preview.is_new else 0
+    progress.announce(order, update if under_way else None, upgrade_from=running)
+    may_cost_more = order.is_new or order.changes or upgrades
+    if order.costs_money and may_cost_more and not yes:
+        count = len(order.launches) if order.is_new else 0
         machines = f"{count} machine{'' if count == 1 else 's'}"
         if not output.confirm(f"launch {machines} at these prices?" if count else "continue?"):
             output.say("aborted: nothing was changed")
             raise typer.Exit(1)
-    limit_s = timeout or (progress.REAL_LIMIT_S if order.preview.costs_money else progress.LIMIT_S)
+    limit_s = timeout or (progress.REAL_LIMIT_S if order.costs_money else progress.LIMIT_S)
     applied_at = time.time()
-    if startup.start(order) and not order.preview.is_new and not upgrades:
+    if startup.start(order) and not order.is_new and not upgrades:
         output.say("the pool had no manager: started a new one")
     if upgrades:
         applied_at = time.time()  # what the old manager saw says nothing of the new one's work
     name = order.spec.name
-    replaces = order.preview.replaces_replicas or order.preview.rolled_back or under_way or upgrades
+    replaces = order.replaces_replicas or order.rolled_back or under_way or upgrades
     awaited = Awaited(
         frozenset(service.name for service in order.spec.services),
         applied_at,

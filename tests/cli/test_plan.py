@@ -45,7 +45,7 @@ def test_the_plan_is_what_up_would_launch(pool, capsys):
     """The same planner: the places shown are those that `fogft up` announces."""
     assert main.run(["plan", str(pool), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
-    announced = preview.order(pool).preview.launches
+    announced = preview.order(pool).launches
     assert [(r["slot"], r["usd_per_hour"]) for r in shown["replicas"]] == [
         (launch.slot, launch.offer.usd_per_hour) for launch in announced
     ]
@@ -155,7 +155,7 @@ def test_losses_of_the_pool_are_shown(pool, capsys):
     order = preview.order(pool)
     store = composition.make_store("planner")
     startup.write(store, order.spec, source=order.source, file=pool, cloud="local")
-    place = order.preview.launches[0].offer.placement.location
+    place = order.launches[0].offer.placement.location
     now = time.time()
     with store.paths.history.open("a") as lines:
         for at, event in ((now - 200, "launch"), (now - 190, "ready"), (now - 60, "gone")):

@@ -79,11 +79,11 @@ def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys
     id = machines.running(task={"run": "x"}).id
     file = tmp_path / "pool.yaml"
     file.write_text(SPEC.replace("planner\n", "test\n", 1) + "resources: {infra: local}\n")
-    (note,) = [one for one in preview.order(file).preview.notes if "earlier pool" in one]
+    (note,) = [one for one in preview.order(file).notes if "earlier pool" in one]
     assert f"cost $0.070/h together: `{id}`." in note
     assert "`fogft sweep` ends them" in note
     file.write_text(SPEC + "resources: {infra: local}\n")
-    assert "earlier pool" not in str(preview.order(file).preview.notes), "another name"
+    assert "earlier pool" not in str(preview.order(file).notes), "another name"
     [line], _ = run(capsys)
     assert line.endswith(f"no pool of this uid in `{home}`")
     _, err = run(capsys, "--end", "--yes")

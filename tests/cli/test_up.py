@@ -315,7 +315,7 @@ OWN_TYPES = {
 @pytest.mark.parametrize("name", [name for name in init.examples() if name not in OWN_TYPES])
 def test_every_example_is_a_good_pool_file(tmp_path, name):
     files = init.copy_example(name, tmp_path / name)
-    found = preview.order(files[0]).preview
+    found = preview.order(files[0])
     assert len(found.launches) == found.spec.replicas
     assert found.notes == ()
 

@@ -75,7 +75,7 @@ def test_a_file_that_names_clouds_is_for_sky_and_its_prices_are_told(scene, file
     assert "live, " in said[3]
     assert said[6].startswith("  total $0.1")
     assert len(started) == 1
-    assert started[0].preview.cloud == "sky"
+    assert started[0].cloud == "sky"
 
 
 def test_nothing_is_started_unasked(scene, file, started, monkeypatch, capsys):

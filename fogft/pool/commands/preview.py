@@ -53,6 +53,8 @@ class Preview:
 
     spec: PoolSpec
     cloud: str
+    source: str
+    file: Path
     is_new: bool
     wanted: int = 0
     launches: tuple[PlannedLaunch, ...] = ()
@@ -70,20 +72,6 @@ class Preview:
         """What the launches cost together."""
         return sum(launch.offer.usd_per_hour for launch in self.launches)
 
-
-@dataclass(frozen=True)
-class Order:
-    """A pool file that was read and judged, and what applying it would do."""
-
-    preview: Preview
-    source: str
-    file: Path
-
-    @property
-    def spec(self) -> PoolSpec:
-        """What the file asks for."""
-        return self.preview.spec
-
     @property
     def digest(self) -> str:
         """What names the file's text in a pool's status."""
@@ -92,7 +80,7 @@ class Order:
 
 def order(
     file: Path, cloud: str | None = None, *, told: Callable[[str], None] = lambda _: None
-) -> Order:
+) -> Preview:
     """Read and judge a pool file, and find out what applying it would do. Changes nothing.
 
     It runs on the cloud that its resources name, else `local`, unless told; `told` hears of what
@@ -146,9 +134,11 @@ def order(
     replaces = before is not None and not rolled_back and replaces_replicas(before, spec)
     usd_per_hour = sum(launch.offer.usd_per_hour for launch in planned.launches)
     cheapest = min((offer.usd_per_hour for offer in sold), default=0.0)
-    preview = Preview(
+    return Preview(
         spec,
         cloud_name,
+        source,
+        file,
         is_new=before is None,
         wanted=planned.wanted,
         launches=tuple(planned.launches),
@@ -161,7 +151,6 @@ def order(
         costs_money=isinstance(concrete, Accounts),
         accounts=accounts,
     )
-    return Order(preview, source, file)
 
 
 def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:

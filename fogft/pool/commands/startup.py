@@ -24,7 +24,7 @@ from fogft.model.intent import Intent
 from fogft.model.spec import PoolSpec
 from fogft.planning import lifetime
 from fogft.pool.commands.composition import make_store
-from fogft.pool.commands.preview import Order
+from fogft.pool.commands.preview import Preview
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
@@ -33,14 +33,14 @@ from fogft.pool.manager import process_control
 MANAGER_LIMIT_S = 20.0
 
 
-def start(order: Order) -> bool:
+def start(order: Preview) -> bool:
     """Create the pool or apply the changed file; return whether a manager had to be started.
 
     Raises:
         FogftError: The pool is another one's, is being ended, or its manager did not start.
     """
     disk.make_folder(home())
-    store, cloud = make_store(order.spec.name), order.preview.cloud
+    store, cloud = make_store(order.spec.name), order.cloud
     write(store, order.spec, source=order.source, file=order.file.resolve(), cloud=cloud)
     return start_manager(store)
 
