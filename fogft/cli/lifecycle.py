@@ -15,7 +15,7 @@ from fogft.cli.options import DEFAULT_FILE, Cloud, PoolArgument, PoolFile, PoolO
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
-    from fogft.pool.commands.current import Seen
+    from fogft.pool.commands.status import Seen
     from fogft.pool.manager.status import PoolStatus
 
 

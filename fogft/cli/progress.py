@@ -18,9 +18,9 @@ from fogft.errors import FogftError
 
 if TYPE_CHECKING:
     from fogft.model.spec import PoolSpec
-    from fogft.pool.commands.current import Seen
     from fogft.pool.commands.outcome import Awaited, Outcome, Settled
     from fogft.pool.commands.preview import Preview
+    from fogft.pool.commands.status import Seen
     from fogft.pool.folder.paths import PoolPaths
     from fogft.pool.folder.store import PoolStore
     from fogft.pool.manager.status import UpdateStatus

@@ -20,7 +20,7 @@ from fogft.cli.options import PoolArgument, PoolOption
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from fogft.pool.commands.current import Seen
+    from fogft.pool.commands.status import Seen
     from fogft.pool.folder.paths import PoolPaths
 
 REDRAW_EVERY_S = 1.0

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.text import Text
     from rich.tree import Tree
 
-    from fogft.pool.commands.current import Seen
+    from fogft.pool.commands.status import Seen
     from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus, TopicStatus
 
 PHASES = {

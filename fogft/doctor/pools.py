@@ -14,7 +14,7 @@ from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.commands import status
-from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity

@@ -16,10 +16,10 @@ from fogft.errors import SpecError
 from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
 from fogft.model.groups import MAX_GROUPS
 from fogft.model.names import NAMES_BYTES_LIMIT, POOL_NAME_PATTERN
-from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.model.spec import CONCURRENCY_LIMIT, Part, PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
+from fogft.model.topic import ActionSpec, Origin, Select, TopicSpec
 from fogft.poolfile import rules
-from fogft.poolfile.actions import action_services, action_topics
 from fogft.poolfile.reader import Reader
 from fogft.poolfile.task import check_task
 from fogft.poolfile.tree import Mistakes, Node, Section, plain, shown
@@ -228,3 +228,35 @@ def _name(top: Section) -> str:
 
 def _slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower())[:40].strip("-") or "perception"
+
+
+def action_services(action: ActionSpec) -> tuple[ServiceSpec, ...]:
+    """Return the three services of an action."""
+
+    def one(end: str, type: str, part: Part, seconds: float, concurrency: int) -> ServiceSpec:
+        name = f"{action.name}/_action/{end}"
+        return ServiceSpec(name, type, seconds, concurrency=concurrency, part=part)
+
+    accepted_s, type = action.timeout_s, action.type
+    return (
+        one("send_goal", f"{type}_SendGoal", Part.GOAL, accepted_s, 0),
+        one("cancel_goal", "action_msgs/srv/CancelGoal", Part.CANCEL, accepted_s, 0),
+        # It is answered when its goal ends: many wait there without being at work.
+        one(
+            "get_result",
+            f"{type}_GetResult",
+            Part.RESULT,
+            action.result_timeout_s,
+            CONCURRENCY_LIMIT,
+        ),
+    )
+
+
+def action_topics(action: ActionSpec) -> tuple[TopicSpec, ...]:
+    """Return the two topics of an action."""
+    feedback, status = f"{action.name}/_action/feedback", f"{action.name}/_action/status"
+    of_status = "action_msgs/msg/GoalStatusArray"
+    return (
+        TopicSpec(feedback, f"{action.type}_FeedbackMessage", Origin.REPLICAS, Select.GOAL),
+        TopicSpec(status, of_status, Origin.REPLICAS, Select.STATUS, depth=1, latched=True),
+    )

@@ -19,7 +19,7 @@ from typing import Any
 
 from fogft.model.choices import Speaks
 from fogft.model.topic import ActionSpec, Origin, TopicSpec
-from fogft.poolfile.actions import action_services
+from fogft.poolfile.pool import action_services
 from fogft.proxy import middleware
 
 FLAG = ("/bench_flag", "std_srvs/srv/SetBool")

@@ -10,7 +10,7 @@ import pytest
 
 from fogft import disk
 from fogft.cli import main, progress
-from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import Seen
 from tests.cli.pools import FILE, REPLICA, STATUS, alive, lay_down
 
 

@@ -18,7 +18,7 @@ from fogft.cloud.local.faults import CloudFaults
 from fogft.doctor import checks, finding, leftovers, machine, pools, ros
 from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
-from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager.status import TopicStatus

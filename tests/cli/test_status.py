@@ -21,7 +21,7 @@ import pytest
 from fogft import disk
 from fogft.cli import main, status
 from fogft.cli.status_text import age, milliseconds, number
-from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus
 from tests.cli.pools import FILE, STATUS, alive, lay_down, report
 

@@ -9,7 +9,7 @@ import pytest
 from fogft.cli.lifecycle import services_at_fault
 from fogft.cli.status_text import notes, rendered, troubles
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
-from fogft.pool.commands.current import Seen, current
+from fogft.pool.commands.status import Seen, current
 from fogft.pool.manager.proxy_report import ProxyReport, TopicCounted
 from fogft.pool.manager.status import ServiceStatus, TopicStatus
 from tests.cli.pools import REPLICA, STATUS, UID

@@ -14,8 +14,7 @@ from fogft.errors import FogftError, SpecError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.pool.commands import composition, init, preview, startup
-from fogft.pool.commands.current import Seen
-from fogft.pool.commands.status import refreshed
+from fogft.pool.commands.status import Seen, refreshed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from fogft.reason_words import words

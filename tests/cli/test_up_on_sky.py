@@ -14,7 +14,7 @@ from fogft.cli import main, progress
 from fogft.cloud import sky
 from fogft.errors import CloudUnreachable
 from fogft.pool.commands import startup
-from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import Seen
 from tests.cli.pools import SPEC, lay_down
 from tests.cli.test_up import UP
 from tests.sky.scene import Scene

@@ -12,7 +12,7 @@ import pytest
 
 from fogft.model.plain import to_plain
 from fogft.model.topic import ActionSpec, Origin, TopicSpec
-from fogft.poolfile.actions import action_services, action_topics
+from fogft.poolfile.pool import action_services, action_topics
 from fogft.ros import environment
 from tests.needs import needs
 from tests.proxy.by_hand import Parts, Replica, Robot

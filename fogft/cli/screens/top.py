@@ -14,7 +14,7 @@ from fogft.cli.options import PoolArgument, PoolOption
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from fogft.pool.commands.current import Seen
+    from fogft.pool.commands.status import Seen
     from fogft.pool.folder.store import PoolStore
 
 LOOK_EVERY_S = 1.0

@@ -12,7 +12,7 @@ from enum import Enum, auto
 from fogft.model.reason import Cause
 from fogft.model.replica import Phase
 from fogft.planning.rollout import UpdateState
-from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import Seen
 
 HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
 

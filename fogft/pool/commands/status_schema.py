@@ -14,7 +14,7 @@ from types import NoneType, UnionType
 from typing import Any
 
 from fogft.model.reason import Reason
-from fogft.pool.commands.current import Seen
+from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus
 
 _PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}

@@ -8,8 +8,8 @@ import pytest
 
 from fogft.model.reason import Cause, Reason
 from fogft.planning.rollout import UpdateState
-from fogft.pool.commands.current import Seen
 from fogft.pool.commands.outcome import HOPELESS_RESTARTS, Awaited, Outcome, Settled
+from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from tests.cli.pools import REPLICA, STATUS
 

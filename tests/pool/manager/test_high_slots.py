@@ -21,8 +21,7 @@ from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.replica import LinkReport, LinkState, Member, Membership, ReplicaId
 from fogft.model.spec import GroupSpec
 from fogft.pool.commands import change
-from fogft.pool.commands.current import Seen
-from fogft.pool.commands.status import slots
+from fogft.pool.commands.status import Seen, slots
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths

@@ -7,7 +7,7 @@ from fogft.model.plain import from_plain, to_plain
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.topic import ActionSpec
-from fogft.poolfile.actions import action_services
+from fogft.poolfile.pool import action_services
 from fogft.proxy.replica.server import ServerProxy
 from tests.proxy.fakes import (
     UID,

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fogft.model.topic import ActionSpec
-from fogft.poolfile.actions import action_services
+from fogft.poolfile.pool import action_services
 from fogft.proxy.robot.actions import Actions
 from fogft.topics.goals import cancel_request, goal_of
 from tests.proxy.fakes import Clock, FakeLink
