@@ -53,14 +53,29 @@ class Verb:
         return main.run([type(self).__name__.lower(), *args.words])
 
 
-def _verb(name: str, help: str) -> type[Verb]:
-    return type(name, (Verb,), {"__doc__": help})
+class Up(Verb):
+    """Start a pool, or apply a changed pool file to a running pool."""
 
 
-Up = _verb("Up", "Start a pool, or apply a changed pool file to a running pool.")
-Down = _verb("Down", "End a pool and everything it started.")
-Status = _verb("Status", "Show a pool's replicas and services.")
-Scale = _verb("Scale", "Ask for more or fewer replicas.")
-Plan = _verb("Plan", "Explain where replicas would go, and at what price.")
-Logs = _verb("Logs", "Show the logs of the manager, the client proxy and the replicas.")
-Doctor = _verb("Doctor", "Check this machine, ROS 2 and the pools here.")
+class Down(Verb):
+    """End a pool and everything it started."""
+
+
+class Status(Verb):
+    """Show a pool's replicas and services."""
+
+
+class Scale(Verb):
+    """Ask for more or fewer replicas."""
+
+
+class Plan(Verb):
+    """Explain where replicas would go, and at what price."""
+
+
+class Logs(Verb):
+    """Show the logs of the manager, the client proxy and the replicas."""
+
+
+class Doctor(Verb):
+    """Check this machine, ROS 2 and the pools here."""
