@@ -258,8 +258,8 @@ def test_a_key_that_others_can_read_is_found(folder, tmp_path):
 @pytest.mark.parametrize(
     ("days", "verdict", "words"),
     [
-        (29, Verdict.WARN, "expires at"),
-        (31, Verdict.FAIL, "expired at"),
+        (364, Verdict.WARN, "expires at"),
+        (366, Verdict.FAIL, "expired at"),
         (-2, Verdict.FAIL, "not valid before"),
     ],
 )
