@@ -23,7 +23,7 @@ from fogft.ordering.active_version import ActiveVersion
 from fogft.ordering.catching_up import CatchingUp
 from fogft.ordering.log import OrderedLog
 from fogft.ordering.orders import START, Op, Position, Promise
-from fogft.ordering.peer import Order, Peer, Phase
+from fogft.ordering.peer import Peer, Phase
 
 CHECK_EVERY_S = 1.0
 
@@ -86,6 +86,7 @@ class Sequencer:
             log_bytes=log_bytes,
         )
         self._peers = self._replicas.peers
+        self.take = self._replicas.take  # the orders to send, in this order; they are forgotten
         if begin is not None:
             self._replicas.begin_at(begin.at)
             self._replicas.take_checkpoint(begin.at.index, begin.state)
@@ -118,10 +119,6 @@ class Sequencer:
         """Whether the owner has something to do at once: to send, or to end the term."""
         ends = self.deposed_by is not None or self.handover is not None
         return ends or self._replicas.sends or self._change_to is not None
-
-    def take(self) -> list[Order]:
-        """Return the orders to send, in this order, and forget them."""
-        return self._replicas.take()
 
     def submit(self, payload: bytes) -> int | None:
         """Number a request and order it applied; None while the term has not begun or is full."""

@@ -28,6 +28,7 @@ class FallbackTimer(Generic[T]):
         self.spec = spec
         self._arrived: dict[bytes, float] = {}  # not handed over yet, oldest first
         self._handed: set[bytes] = set()
+        self.failed = self._handed.discard  # it could not be asked: once more at the deadline
         self._awaited: dict[bytes, tuple[float, T]] = {}  # past the deadline: until when
 
     def __len__(self) -> int:
@@ -63,10 +64,6 @@ class FallbackTimer(Generic[T]):
             if now < arrived + after_s:
                 return
             yield request
-
-    def failed(self, request: bytes) -> None:
-        """The fallback could not be asked; at the deadline it is tried once more."""
-        self._handed.discard(request)
 
     def ended(self, request: bytes) -> None:
         """The request was answered by a replica."""

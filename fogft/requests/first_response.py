@@ -79,6 +79,7 @@ class FirstResponse(Generic[T]):
     def __init__(self, *, attempts: int = 3) -> None:
         self._attempts = attempts
         self._pending: dict[bytes, Pending[T]] = {}
+        self.get = self._pending.get  # a request that still awaits its answer
         # Those that some replica may have to be asked for, as far as is known, and from when on.
         self._short: dict[bytes, float] = {}
         self._soonest_deadline = float("inf")  # or sooner
@@ -89,10 +90,6 @@ class FirstResponse(Generic[T]):
 
     def __contains__(self, request: bytes) -> bool:
         return request in self._pending
-
-    def get(self, request: bytes) -> Pending[T] | None:
-        """Return a request that still awaits its answer."""
-        return self._pending.get(request)
 
     def register(
         self,

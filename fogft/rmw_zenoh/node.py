@@ -80,7 +80,12 @@ class RmwZenohNode:
 
     def _start(self) -> None:
         self._id = str(self._session.zid())
-        self.graph = Graph(self._id)
+        graph = self.graph = Graph(self._id)
+        self.node_of, self.services_of, self.offered = (
+            graph.node_of,
+            graph.services_of,
+            graph.offered,
+        )
         live = self._session.liveliness()
         node = Token(self._domain, self._id, "0", "0", NODE, self._name)
         self._declared = live.declare_token(str(node))
@@ -161,18 +166,6 @@ class RmwZenohNode:
                 raise RosError(f"Zenoh refuses a service or client: {error}") from error
             self._made = [*(m for m in self._made if m.is_open), made]
             return made
-
-    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
-        """Return the node that a client of a service belongs to; see `Graph.node_of`."""
-        return self.graph.node_of(service, client)
-
-    def services_of(self, name: str, namespace: str) -> list[str]:
-        """Return the names of a node's services."""
-        return self.graph.services_of(name, namespace)
-
-    def offered(self) -> dict[str, str]:
-        """Return name -> type of the services that applications offer in this domain."""
-        return self.graph.offered()
 
     def close(self) -> None:
         """Close all that was made here, and the session. Repeatable."""

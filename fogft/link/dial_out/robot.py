@@ -78,6 +78,8 @@ class DialIn:
         self._verify = verify
         self._revoked = revoked
         self._counters = Counters()
+        # ``admitted``, ``tunnels``, ``greeting_...``, ``refused_full``
+        self.counters = self._counters.snapshot
         self._lock = threading.Condition()
         self._waiting: dict[ReplicaId, deque[_Waiting]] = {}
         self._local: dict[ReplicaId, socket.socket] = {}
@@ -267,10 +269,6 @@ class DialIn:
         """Return how many connections of each replica wait."""
         with self._lock:
             return {id: len(queue) for id, queue in self._waiting.items()}
-
-    def counters(self) -> Mapping[str, int]:
-        """Counts since the start: ``admitted``, ``tunnels``, ``greeting_...``, ``refused_full``."""
-        return self._counters.snapshot()
 
     def _count(self, event: str, detail: str) -> None:
         self._counters.warn(log, event, "dial_in_refused event=%s detail=%r", event, detail[:200])

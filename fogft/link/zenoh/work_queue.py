@@ -30,6 +30,7 @@ class WorkQueue:
     def __init__(self, name: str, counters: Counters) -> None:
         self._counters = counters
         self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self.add = self._queue.put  # take a job in any case; the collector of garbage may, too
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
 
     def __len__(self) -> int:
@@ -46,10 +47,6 @@ class WorkQueue:
             return False
         self._queue.put(job)
         return True
-
-    def add(self, job: Callable[[], None]) -> None:
-        """Take a job in any case. The collector of garbage may call this, too."""
-        self._queue.put(job)
 
     def close(self) -> None:
         """Do what waits, then end."""

@@ -37,6 +37,7 @@ class KnownRequests:
         self._kept_bytes_limit = kept_bytes
         self._kept_ids = kept_ids
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
+        self.get = self._jobs.get  # a job that is known, by its id
         # One queue a service: its requests share a time-out, so the oldest expires first.
         self._deadlines: dict[str, deque[tuple[float, bytes]]] = {}
         self._kept: OrderedDict[bytes, Job] = OrderedDict()
@@ -49,10 +50,6 @@ class KnownRequests:
         """How much is remembered, answered requests included."""
         deadlines = sum(map(len, self._deadlines.values()))
         return Remembered(len(self._jobs), deadlines, len(self._kept), self._kept_bytes)
-
-    def get(self, id: bytes) -> Job | None:
-        """Return a job that is known."""
-        return self._jobs.get(id)
 
     def unanswered(self, service: str | None) -> list[Job]:
         """Return the jobs that somebody waits for, of one service or of all."""

@@ -69,6 +69,7 @@ class ServiceQueue:
 
     def __init__(self, most: int, given: int | None = None, *, latest: bool = False) -> None:
         self._waiting: AdmissionQueue[Job] = AdmissionQueue(latest=latest)
+        self.evict = self._waiting.evict  # what must go so that a newcomer fits in
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
         self._begun_last = 0.0
@@ -126,10 +127,6 @@ class ServiceQueue:
         if not waiting or self.limit.wait_s(waiting, self.at_work) <= remaining_s:
             return False
         return self.limit.wait_s(self._waiting.ahead(robot, deadline), self.at_work) > remaining_s
-
-    def evict(self, robot: str, deadline: float) -> Job | None:
-        """Take out what must go so that a newcomer fits in; None if that must go itself."""
-        return self._waiting.evict(robot, deadline)
 
     def take(self, now: float) -> Job | None:
         """Return what is to be passed on next; None when nothing waits, or nothing more may be.

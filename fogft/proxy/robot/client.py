@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +27,6 @@ from fogft.proxy.robot.links import Define, Links, TypeCheck
 from fogft.proxy.robot.proxied_service import ProxiedService
 from fogft.proxy.robot.sending import key_of
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
-from fogft.records.record import SignedRecord
 from fogft.requests.load import NEVER
 from fogft.ros.port import RosNode, RosTopics
 
@@ -68,6 +67,7 @@ class ClientProxy:
         self._pool_uid = pool_uid
         self._node = node
         self._dialer = dialer
+        self.tell = dialer.tell  # signed records, for every replica
         self._make_dispatcher = make_dispatcher
         self._clock = clock
         self._lock = threading.RLock()
@@ -164,10 +164,6 @@ class ClientProxy:
                 self.links.reach(member)
         self._change()
         return True
-
-    def tell(self, records: Sequence[SignedRecord]) -> None:
-        """Pass signed records on to every replica: revocations, where no rendezvous does."""
-        self._dialer.tell(records)
 
     def renew(self) -> None:
         """Take new credentials into use, link by link; no request is lost by it."""

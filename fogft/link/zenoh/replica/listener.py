@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 import socket
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -90,6 +90,7 @@ class ZenohListener:
         )
         self._counters = Counters()
         self._turns = QueryTurns()
+        self.revoke = self._sessions.revoke  # let these holders in no more
         self._work_queue = WorkQueue("fogft-probes", self._counters)
         self._queues = ReplyQueues(
             self._counters, self._turns, thin=self._thin, later=self._work_queue.add
@@ -297,10 +298,6 @@ class ZenohListener:
     def lease(self) -> Record | None:
         """Return the newest lease that the manager signed, of those that robots brought."""
         return self._control.known(RecordKind.LEASE)
-
-    def revoke(self, names: Collection[str]) -> None:
-        """Let these holders in no more; what they ask from now on is refused."""
-        self._sessions.revoke(names)
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,

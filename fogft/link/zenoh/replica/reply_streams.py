@@ -134,26 +134,17 @@ LIMIT = 1024  # a replica has 128 sessions; the others are those of connections 
 
 
 class Stream:
-    """One connection's open query. Any thread."""
+    """One connection's open query, with `ReplyCredit`'s methods for that connection. Any thread."""
 
-    __slots__ = ("_credit", "_name", "query")
+    __slots__ = ("query", "seen", "send", "send_at_once")
 
     def __init__(self, query: zenoh.Query, credit: ReplyCredit | None = None) -> None:
         self.query = query
-        self._credit = credit or ReplyCredit()
-        self._name = object()  # which must not keep the query: that ends with us
-
-    def seen(self, stamp: bytes) -> None:
-        """Note the last stamp that the robot says it has seen; one that is not known is fine."""
-        self._credit.seen(self._name, stamp)
-
-    def send_at_once(self, send: Send) -> bool:
-        """Call `send` for something of at most 16 KiB where it cannot block; return whether."""
-        return self._credit.send_at_once(self._name, send)
-
-    def send(self, send: Send) -> None:
-        """Call `send`, which may block, for anything. At once nothing leaves until it was seen."""
-        self._credit.send(self._name, send)
+        credit = credit or ReplyCredit()
+        name = object()  # of this connection: it must not keep the query, which ends with us
+        self.seen = partial(credit.seen, name)
+        self.send = partial(credit.send, name)
+        self.send_at_once = partial(credit.send_at_once, name)
 
 
 class Streams:
@@ -168,6 +159,7 @@ class Streams:
         self._slow = slow
         self._lock = threading.Lock()
         self._streams: OrderedDict[bytes, Stream] = OrderedDict()
+        self.of = self._streams.get  # by token, if it has asked one; for each request
         self._credit: WeakValueDictionary[str, ReplyCredit] = WeakValueDictionary()
 
     def opened(
@@ -186,10 +178,6 @@ class Streams:
                 oldest, stream = self._streams.popitem(last=False)
                 ended.append((oldest, stream.query))
         return ended
-
-    def of(self, token: bytes) -> Stream | None:
-        """Return the query of a connection, if it has asked one. Cheap, asked for each request."""
-        return self._streams.get(token)
 
     def clear(self) -> None:
         """Let go of all."""

@@ -47,6 +47,7 @@ class AuthenticatedSessions:
         self._verify = verify
         self._lock = threading.Lock()
         self._tokens: dict[bytes, str] = {}
+        self.admits = self._tokens.__contains__  # whether a token is let in; asked for each request
         self._holders: OrderedDict[str, OrderedDict[bytes, None]] = OrderedDict()
         self.revoked: frozenset[str] = frozenset()  # common names that are let in no more
 
@@ -103,10 +104,6 @@ class AuthenticatedSessions:
     def holder(self, token: bytes) -> str:
         """Return whose connection a token names; empty for nobody's."""
         return self._tokens.get(token, "")
-
-    def admits(self, token: bytes) -> bool:
-        """Whether requests under this token are let in. Cheap, asked for each request."""
-        return token in self._tokens
 
     def revoke(self, names: Collection[str]) -> None:
         """Let these holders in no more. Names that were revoked before stay so."""

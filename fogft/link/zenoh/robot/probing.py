@@ -84,6 +84,8 @@ class Probing:
         self._key = names.probe_key(peer.id.pool_uid, peer.id.slot)
         self._queue: SimpleQueue[Heard] = SimpleQueue()
         self._of_replica = Silence()
+        self.silent_s = self._of_replica.for_s  # for how long the replica has been
+        self.nobody_to_ask = self._of_replica.began  # it is not reached: silent from now on
         self._of_connection = Silence()
         self._doubted = False
         self._content = b""  # of the last answer: what is idle says the same again and again
@@ -147,10 +149,6 @@ class Probing:
 
     # -- silence --------------------------------------------------------------------------
 
-    def nobody_to_ask(self, now: float) -> None:
-        """The replica is not reached: from now on it is silent, unless it was before."""
-        self._of_replica.began(now)
-
     def another_connection(self) -> None:
         """What is asked from now on goes over another connection."""
         self._of_connection = Silence()
@@ -159,10 +157,6 @@ class Probing:
         """Leave out time up to `now` in which nobody could be heard."""
         for silence in (self._of_replica, self._of_connection):
             silence.excuse(seconds, now)
-
-    def silent_s(self, now: float) -> float:
-        """Return for how long the replica has been silent, in seconds."""
-        return self._of_replica.for_s(now)
 
     def unheard_s(self, now: float) -> float:
         """Return for how long the present connection has brought no answer, in seconds."""

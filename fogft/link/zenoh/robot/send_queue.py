@@ -29,13 +29,10 @@ class SendQueue:
 
     def __init__(self, latest: Collection[str] = ()) -> None:
         self._queued: SimpleQueue[OpenAttempt | str | None] = SimpleQueue()
+        self.qsize = self._queued.qsize
         self._lock = threading.Lock()
         self._order = count()
         self._waiting: dict[str, Waiting] = {service: [] for service in latest}
-
-    def qsize(self) -> int:
-        """How many wait."""
-        return self._queued.qsize()
 
     def overtakes(self, service: str) -> bool:
         """Whether what comes last of a service goes first."""
