@@ -110,7 +110,7 @@ class UplinksLink:
 
     def _send(self, request_id: bytes, attempt: _Attempt) -> bool:
         """Offer an attempt to the uplinks that its policy chooses; whether one took it."""
-        policy = self._dialer.policy(attempt.service)
+        policy = self._dialer.policies.get(attempt.service, UplinkPolicy.PREFER)
         taken = False
         usable = [i for i, link in enumerate(self._links) if link.usable]
         while usable and not taken:
@@ -263,7 +263,7 @@ class UplinkDialer:
         self.adopt, self.renew, self.tell = inner.adopt, inner.renew, inner.tell
         self.certificate, self.close = inner.certificate, inner.close
         self.interfaces: tuple[str, ...] = ()
-        self._policies: Mapping[str, UplinkPolicy] = {}
+        self.policies: Mapping[str, UplinkPolicy] = {}
         self._options = DEFAULT_OPTIONS
 
     def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
@@ -273,13 +273,9 @@ class UplinkDialer:
         old = (self.interfaces, self._options.latest, self._options.plain)
         changed = (tuple(interfaces), options.latest, options.plain) != old
         self.interfaces, self._options = tuple(interfaces), options
-        self._policies = {service.name: service.uplink_policy for service in services}
+        self.policies = {service.name: service.uplink_policy for service in services}
         self.adopt(options)
         return changed
-
-    def policy(self, service: str) -> UplinkPolicy:
-        """Return a service's policy."""
-        return self._policies.get(service, UplinkPolicy.PREFER)
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
         """Start a link; return at once, in state CONNECTING.

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import ipaddress
 import re
+from collections.abc import Mapping
 from typing import Annotated
 
 from fogft.model.keys import only
@@ -53,6 +54,11 @@ def slot_prefix(pool_uid: str, slot: int) -> str:
 def service_key(pool_uid: str, slot: int, service: str, type_name: str) -> str:
     """Return the Zenoh key at which a slot hears requests of a service."""
     return f"{slot_prefix(pool_uid, slot)}/s/{connection_id(pool_uid, slot, service, type_name)}"
+
+
+def service_keys(pool_uid: str, slot: int, types: Mapping[str, str]) -> dict[str, str]:
+    """Return service -> the key at which a slot hears its requests, of service -> type."""
+    return {name: service_key(pool_uid, slot, name, kind) for name, kind in types.items()}
 
 
 def services_key(pool_uid: str, slot: int) -> str:

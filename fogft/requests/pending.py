@@ -146,10 +146,6 @@ class PendingRequests(Generic[T]):
             pending.alone_at = replica
         return pending
 
-    def passed_over(self, request: bytes, replica: int) -> None:
-        """A replica was not asked because it has just declined another request."""
-        self.choose.declined(request, replica, full=False)
-
     def declined(self, request: bytes, replica: int) -> None:
         """A replica's link did not take an attempt."""
         self.table.declined(request, replica)

@@ -130,7 +130,7 @@ class _Gateway:
             handshakes=self._handshakes,
             certificate_name=self._holder.common_name,
         )
-        keys = {s.name: names.service_key(uid, slot, s.name, s.type) for s in self._services}
+        keys = names.service_keys(uid, slot, {s.name: s.type for s in self._services})
         listener.revoke(self._revoked)
         listener.serve(keys, self._forwarder.request, self._probed, self._forwarder.cancel)
         self._listener = listener

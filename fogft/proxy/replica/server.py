@@ -114,7 +114,8 @@ class ServerProxy:
 
     def start(self) -> None:
         """Begin to listen and start the user's command."""
-        keys = self._keys(self._offering.services) | self._topic_keys()
+        keys = self._keys(self._offering.services)
+        keys |= names.service_keys(self._id.pool_uid, self._id.slot, self._topics.types)
         self._join_ros()
         # Where no service is stateful there is nothing to choose, and nothing to pay.
         chosen = self._ordered or self._topics or self._goals
@@ -124,13 +125,8 @@ class ServerProxy:
         log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
 
     def _keys(self, services: tuple[ServiceSpec, ...]) -> dict[str, str]:
-        id = self._id
-        return {s.name: names.service_key(id.pool_uid, id.slot, s.name, s.type) for s in services}
-
-    def _topic_keys(self) -> dict[str, str]:
-        id, topics = self._id, self._topics.topics
-        return {t.key_name: names.service_key(id.pool_uid, id.slot, t.key_name, t.type)
-                for t in topics}  # fmt: skip
+        types = {service.name: service.type for service in services}
+        return names.service_keys(self._id.pool_uid, self._id.slot, types)
 
     def run_once(self) -> None:
         """See to the command, to readiness and to deadlines. Call at about 10 Hz."""

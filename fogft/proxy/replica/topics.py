@@ -98,6 +98,7 @@ class TopicsOnReplica:
         self, topics: Iterable[TopicSpec], clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._topics = {topic.key_name: topic for topic in topics}
+        self.types = {name: topic.type for name, topic in self._topics.items()}
         self._clock = clock
         session = os.urandom(frames.SESSION_BYTES)
         self._outgoing = {
@@ -119,11 +120,6 @@ class TopicsOnReplica:
 
     def __contains__(self, name: str) -> bool:
         return name in self._topics
-
-    @property
-    def topics(self) -> tuple[TopicSpec, ...]:
-        """What passes."""
-        return tuple(self._topics.values())
 
     @property
     def trouble(self) -> str:

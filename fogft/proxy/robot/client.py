@@ -191,9 +191,8 @@ class ClientProxy:
         self._change()
 
     def _keys(self, slot: int) -> dict[str, str]:
-        specs = [service.spec for service in self._services.values()]
-        services = {s.name: names.service_key(self._pool_uid, slot, s.name, s.type) for s in specs}
-        return services | self._topics.keys(self._pool_uid, slot)
+        types = {name: service.spec.type for name, service in self._services.items()}
+        return names.service_keys(self._pool_uid, slot, types | self._topics.types())
 
     def _drop(self, id: ReplicaId) -> None:
         link = self.links.remove(id)

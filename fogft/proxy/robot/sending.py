@@ -118,7 +118,7 @@ class Sender:
         with self._ledger.lock:
             requests = self._ledger.requests
             if skip:
-                requests.passed_over(request, replica)
+                requests.choose.declined(request, replica, full=False)
                 return False
             pending = requests.attempt(request, replica, now)
             if pending is None:

@@ -16,7 +16,6 @@ from typing import Any
 
 from fogft.errors import FrameError, RosError
 from fogft.link.port import Answer, Link
-from fogft.model import names
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, Select, TopicSpec
@@ -285,12 +284,9 @@ class TopicsOnRobot:
             log.info("topic_passed topic=%s origin=%s", topic.name, topic.origin.value)
         return changed
 
-    def keys(self, pool_uid: str, slot: int) -> dict[str, str]:
-        """Return the keys of a replica's topics, by their names on the wire."""
-        return {
-            name: names.service_key(pool_uid, slot, name, one.topic.type)
-            for name, one in self._topics.items()
-        }
+    def types(self) -> dict[str, str]:
+        """Return the type of each, by its name on the wire."""
+        return {name: one.topic.type for name, one in self._topics.items()}
 
     def route(self, links: Mapping[int, Link]) -> None:
         """Set the links to all replicas, by the dispatcher's numbers."""

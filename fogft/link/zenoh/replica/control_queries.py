@@ -27,7 +27,7 @@ from fogft.link.zenoh.replica.sessions import AuthenticatedSessions, NotAdmitted
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model.refusal import Refusal
 from fogft.records import frames
-from fogft.records.record import Record, RecordError, RecordKind, SignedRecord
+from fogft.records.record import RecordError, SignedRecord
 from fogft.records.record_set import RecordSet, Verdict
 
 log = logging.getLogger(__name__)
@@ -154,10 +154,6 @@ class ControlQueries:
             elif verdict is Verdict.OLDER:
                 self._counters.add("records_older")
         self._sessions.revoke(self._records.revoked)
-
-    def known(self, kind: RecordKind) -> Record | None:
-        """Return the newest good record of a kind that the manager writes."""
-        return self._records.get(kind)
 
     def _greeted(self, greeting: frame.Greeting, asked: QueryEnd) -> bool:
         """Whether this is somebody who is let in; else it is told why not."""

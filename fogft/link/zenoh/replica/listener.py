@@ -99,9 +99,10 @@ class ZenohListener:
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
         self.streams = Streams(slow=self._slow)
+        self._records = RecordSet(id.pool_uid, LazyVerifier(credentials.ca))
         self._control = ControlQueries(
             sessions=self._sessions,
-            records=RecordSet(id.pool_uid, LazyVerifier(credentials.ca)),
+            records=self._records,
             streams=self.streams,
             queues=self._queues,
             work=self._work_queue,
@@ -297,7 +298,7 @@ class ZenohListener:
 
     def lease(self) -> Record | None:
         """Return the newest lease that the manager signed, of those that robots brought."""
-        return self._control.known(RecordKind.LEASE)
+        return self._records.get(RecordKind.LEASE)
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,

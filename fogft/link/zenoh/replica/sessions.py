@@ -111,9 +111,3 @@ class AuthenticatedSessions:
             self.revoked |= frozenset(names)
             for name in self.revoked & self._holders.keys():
                 self._forget(name)
-
-    @property
-    def names(self) -> list[str]:
-        """Common names of those who greeted, sorted."""
-        with self._lock:
-            return sorted(self._holders)

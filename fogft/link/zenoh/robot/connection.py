@@ -82,7 +82,7 @@ class Connection:
         self._on_lost = tell.lost
         self._begun = False
         self._token = secrets.token_bytes(frame.TOKEN_BYTES)
-        self.certificate, signature = shared.sign(
+        self.certificate, signature = shared.signer(
             frame.greeted_bytes(self._token, peer.certificate_name)
         )
         greeting = frame.Greeting(self._token, self.certificate, signature)
@@ -195,10 +195,6 @@ class Connection:
             self.lose("the connection was lost")
 
     # -- the link's thread ----------------------------------------------------------------
-
-    def look(self, now: float) -> float:
-        """Look what flows; return for how many of the last seconds something large moved."""
-        return self.flow.look(now, self.attempts.look(now))
 
     def alive(self) -> bool:
         """Whether Zenoh still has a link beneath this session."""

@@ -318,7 +318,7 @@ class ZenohLink:
 
     def _flows(self, connection: Connection, now: float) -> bool:
         """See whether what is large moves: then nobody is silent. False where it stands still."""
-        moved_s = connection.look(now)
+        moved_s = connection.flow.look(now, connection.attempts.look(now))
         self._probing.excuse(moved_s, now)
         longest_s, shortest_s = self._suspect_after_s, self._shared.settings.stall_after_s
         if connection.flow.progress.stalled(now, shortest_s=shortest_s, longest_s=longest_s):

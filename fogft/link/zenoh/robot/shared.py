@@ -37,11 +37,3 @@ class Shared:
         if self._signer is None:
             self._signer = Signer(self.credentials.certificate, self.credentials.key)
         return self._signer
-
-    def sign(self, message: bytes) -> tuple[bytes, bytes]:
-        """Sign with the robot's key; return its certificate and the signature (DER).
-
-        Raises:
-            CredentialError: They cannot be used.
-        """
-        return self.signer(message)
