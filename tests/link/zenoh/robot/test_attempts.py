@@ -91,7 +91,7 @@ class Scene:
     def close(self) -> None:
         self.attempts.close()
         self.attempts.end()
-        self.attempts.join(30.0)
+        wait_for(lambda: self.ended)
 
 
 steps = st.lists(
