@@ -19,7 +19,7 @@ from fogft.cli.options import PoolOption, Slot
 if TYPE_CHECKING:
     from fogft.pool.folder.store import PoolStore
 
-Count = Annotated[int, typer.Argument(min=1, max=16, metavar="N", help="Number of replicas.")]
+Count = Annotated[int, typer.Argument(min=1, max=100, metavar="N", help="Number of replicas.")]
 
 Wait = Annotated[bool, typer.Option("--wait", help="Wait until it is done.")]
 

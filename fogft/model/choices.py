@@ -29,7 +29,7 @@ from fogft.model.keys import (
 from fogft.model.names import is_endpoint
 from fogft.model.ros_names import absolute_service_name
 
-MAX_REPLICAS = 16
+MAX_REPLICAS = 100
 MAX_USD_PER_HOUR = 1_000_000
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _LOCATION = re.compile(r"[\w.-]+(/[\w.-]+)?")

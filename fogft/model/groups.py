@@ -18,11 +18,11 @@ from typing import Any
 from fogft.model.choices import OnDemandSpec
 from fogft.model.spec import PoolSpec
 
-BLOCK = 100
+BLOCK = 200
 MAX_GROUPS = 8
-STAND_INS = 50
+STAND_INS = BLOCK // 2
 # The manager launches all slots below; replicas that people start by hand stay out of its way.
-FIRST_BY_HAND = 1000
+FIRST_BY_HAND = 2000
 LAST_BY_HAND = 999_999
 
 

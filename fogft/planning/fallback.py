@@ -5,7 +5,8 @@ Where a group has `fallback`, on-demand machines in slots of their own stand in.
 the moment that a spot replica is lost, is noticed or is refused, beside the order of
 another spot machine, and end once enough others have been ready for `SETTLED_S`.
 
-A slot whose first machine is still booting is not short of anything: nothing was lost.
+While an on-demand machine serves, which nobody takes away, spot is asked for alone, and another one
+stands in only once that was refused. Nor is a slot short whose first machine is still booting.
 
 Owns: who stands in, and how many are missing.
 Not here: where they are bought (`buying`) and the two steps of an ending (`endings`).
@@ -57,18 +58,38 @@ def losses_of_late(history: History, now: float) -> list[float]:
     ]
 
 
-def missing(wanted: int, here: Classification, standing_in: Sequence[Assessment]) -> int:
+def is_safe(machines: Classification) -> bool:
+    """Whether somebody serves whom nobody takes away."""
+    return any(s.serving and not s.placement.spot for s in (*machines.good, *machines.replaced))
+
+
+def is_first(slot: int, generation: int, history: History, *, safe: bool) -> bool:
+    """Whether a spot machine stands for itself: the first of its slot, or since it last served."""
+    return generation == (history.served(slot) if safe else 0) + 1
+
+
+def missing(
+    wanted: int,
+    here: Classification,
+    standing_in: Sequence[Assessment],
+    history: History,
+    *,
+    safe: bool,
+) -> int:
     """Return how many more stand-ins are called for.
 
     Args:
         wanted: How many replicas should be ready.
         here: The group's machines, without its stand-ins.
         standing_in: Its stand-ins, booting ones included.
+        history: Of all launches.
+        safe: See `is_safe`.
     """
     kept = (*here.good, *here.replaced)
-    ready = sum(s.ever_ready for s in kept)
-    first = sum(not s.ever_ready and s.id.generation == 1 for s in kept)
-    return wanted - ready - first - len(standing_in)
+    covered = sum(
+        s.ever_ready or is_first(s.slot, s.id.generation, history, safe=safe) for s in kept
+    )
+    return wanted - covered - len(standing_in)
 
 
 def spare(

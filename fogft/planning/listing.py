@@ -44,7 +44,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Listing:
-    """Offers of one kind, the best score first.
+    """The cheapest offer of each supply, the best score first: no other one is ever chosen.
 
     Attributes:
         trouble: Why there is no row; None where there is one.
@@ -140,7 +140,12 @@ def _listing(offers: Sequence[Offer], excluded: Collection[str], scale: Scale) -
         allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
     if not allowed:
         return Listing((), Reason(Cause.ALL_EXCLUDED))
-    return Listing(tuple(sorted(_rows(allowed, scale), key=without_offer)))
+    best: dict[str, Row] = {}
+    for row in _rows(allowed, scale):
+        known = best.get(row.supply)
+        if known is None or without_offer(row) < without_offer(known):
+            best[row.supply] = row
+    return Listing(tuple(sorted(best.values(), key=without_offer)))
 
 
 def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:

@@ -12,7 +12,8 @@ Not here: the steps: how many (`sizing`), who is ill (`health`), who is what
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from fogft.model.groups import Group, group_of
@@ -184,8 +185,16 @@ def plan_once(
         needs = needed_launches(sized.groups, counts, machines, history)
     room = wanted + spec.max_surge - machines.live
     first: Assessment | None = None
-    begun = [need.slot for need in needs if not history.generation(need.slot)]
-    short = _stand_ins_missing(sized.groups, counts, others, standing_in, begun)
+    safe = fallback.is_safe(machines)
+    begun = {
+        need.slot
+        for need in needs
+        if fallback.is_first(need.slot, history.generation(need.slot) + 1, history, safe=safe)
+    }
+    stand_ins_missing = partial(
+        _stand_ins_missing, sized.groups, counts, others, standing_in, history=history, safe=safe
+    )
+    short = stand_ins_missing(begun)
     kept_free = _kept_free(len(short), room, machines) if not standing_in else 0
     for need in needs:
         if not buyer.buy(need, room=room - kept_free):
@@ -193,8 +202,7 @@ def plan_once(
             first = first or _stand_in_to_go(need, buyer, wanted, room)
             waits = True
             break
-    begun = [launch.slot for launch in buyer.launches if launch.generation == 1]
-    for need in _stand_ins_missing(sized.groups, counts, others, standing_in, begun):
+    for need in stand_ins_missing(begun.intersection(x.slot for x in buyer.launches)):
         buyer.buy(need, room=room)
     staying: Sequence[ReplicaId] = ()
     if settling:
@@ -278,7 +286,10 @@ def _stand_ins_missing(
     counts: Sequence[int],
     others: Classification,
     standing_in: Sequence[Assessment],
-    begun: Sequence[int],
+    begun: Collection[int],
+    *,
+    history: History,
+    safe: bool,
 ) -> list[Need]:
     """Return the stand-ins called for, where some slots get their first machine now."""
     needs: list[Need] = []
@@ -287,7 +298,8 @@ def _stand_ins_missing(
         if not group.on_demand.fallback:
             continue
         here = [s for s in standing_in if group_of(groups, s.slot) is group and not s.unwanted]
-        lacking = fallback.missing(count, others.part(groups, group), here)
+        mine = others.part(groups, group)
+        lacking = fallback.missing(count, mine, here, history, safe=safe)
         for _ in range(lacking - sum(group_of(groups, slot) is group for slot in begun)):
             need = stand_in(group, used)
             used.add(need.slot)

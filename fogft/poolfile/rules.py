@@ -16,6 +16,7 @@ from fogft.model.choices import (
     ScheduleSpec,
     WindowSpec,
 )
+from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.names import gateway_slot
 from fogft.model.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
 from fogft.model.state import StateService, StateSpec
@@ -24,7 +25,7 @@ from fogft.model.topology import Topology, find_loop
 from fogft.poolfile.tree import Section, shown
 
 DAY_END_S = 86_400
-_LAST_REPLICA_PORT = 65535 - 1000  # slots that the manager launches go up to 999
+_LAST_REPLICA_PORT = 65535 - FIRST_BY_HAND
 
 
 def service(section: Section, made: ServiceSpec) -> ServiceSpec:

@@ -84,7 +84,7 @@ def test_wrong_usage_is_2_with_a_way_to_help(arguments, message, capsys):
     ("arguments", "message", "hint"),
     [
         (["drain", "2.1"], "'SLOT': must be a whole number", "the slot of replica `2.1` is 2"),
-        (["scale", "up", "99"], "'N': must be less than or equal to 16", "see `fogft scale up"),
+        (["scale", "up", "101"], "'N': must be less than or equal to 100", "see `fogft scale up"),
         (["up", "--timeout", "x"], "'--timeout': must be a number", "see `fogft up --help`"),
     ],
 )

@@ -94,14 +94,14 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
         machines[name] = Machine(pool, "gateway", name)
         machines[name].configure(listen=at[name], dial_in=door, dial_in_listen=door)
         machines[name].start()
-    machines["lab"] = Machine(pool, "replica", "1000", ros_domains())
+    machines["lab"] = Machine(pool, "replica", "2000", ros_domains())
     machines["lab"].configure(listen=local())
     machines["lab"].start()
     said = up.communicate(timeout=300)[0]
     assert up.returncode == 0, said
     wait(lambda: len(up_of(report(pool), "gateways")) == len(GATEWAYS))
-    wait(lambda: all(ready(machines[name].report()) == {0, 1, 1000} for name in GATEWAYS))
-    wait(lambda: ready(report(pool)) == {0, 1, 1000})
+    wait(lambda: all(ready(machines[name].report()) == {0, 1, 2000} for name in GATEWAYS))
+    wait(lambda: ready(report(pool)) == {0, 1, 2000})
     client = pool.client(120, 25)
     wait(lambda: sum(passed(machines[name]) for name in GATEWAYS) > 25)
     used = max(GATEWAYS, key=lambda name: passed(machines[name]))

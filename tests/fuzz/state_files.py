@@ -73,7 +73,7 @@ def _lay_down(home: Path) -> PoolPaths:
     ledger = Ledger(paths.credentials)
     holder, _ = ledger.issue_next(Role.ROBOT, "ada", UID, days=1.0)
     ledger.revoke([holder])
-    ledger.issue_next(Role.REPLICA, "1000", UID, days=1.0)
+    ledger.issue_next(Role.REPLICA, "2000", UID, days=1.0)
     records_cache.write(paths.records, signed_records())
     return paths
 

@@ -44,6 +44,21 @@ def test_at_a_notice_a_stand_in_is_ordered_beside_another_spot_machine():
     assert ordered(world(spot(0), spot(1, state="noticed"))) == [(1, True), (STAND_INS, False)]
 
 
+def test_while_an_on_demand_machine_serves_spot_is_asked_first():
+    """Nobody takes it away, so one more loss is not urgent; a refusal is."""
+    three = replace(MIXED, replicas=3, on_demand=OnDemandSpec(1, fallback=True))
+    based = replica(0, at=replace(PLACES[3], spot=False), price=0.3, of=three)
+    others = replica(1, of=three), replica(2, state="noticed", of=three)
+    asked = world(based, *others, of=three)
+    assert ordered(asked) == [(2, True)]
+    refused = (
+        Event(NOW - 2, EventKind.LAUNCH, 2, 2, PLACES[2].location),
+        Event(NOW - 1, EventKind.REFUSED, 2, 2, reason=Reason(Cause.CAPACITY)),
+    )
+    later = replace(asked, events=(*asked.events, *refused))
+    assert ordered(later) == [(2, True), (STAND_INS, False)]
+
+
 def test_after_a_refusal_a_stand_in_is_ordered_beside_the_next_try():
     refused = (
         Event(NOW - 2, EventKind.LAUNCH, 1, 1, PLACES[1].location),

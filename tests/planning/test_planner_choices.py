@@ -19,6 +19,7 @@ from fogft.model.choices import (
     ScheduleSpec,
     WindowSpec,
 )
+from fogft.model.groups import BLOCK
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.model.spec import PoolSpec
@@ -217,15 +218,15 @@ def test_each_group_gets_its_own_kind_in_its_own_slots():
     planned = World(spec(3, groups=GROUPS), offers=sold).plan()
     assert [(x.slot, x.offer.group, x.offer.placement.spot) for x in planned.launches] == [
         (0, "anchor", False),
-        (100, "fast", True),
-        (101, "fast", True),
+        (BLOCK, "fast", True),
+        (BLOCK + 1, "fast", True),
     ]
     assert len({x.offer.placement.location for x in planned.launches[1:]}) == 2
 
 
 def test_a_group_that_left_the_file_is_replaced_new_before_old():
     asked = spec(1)
-    world = World(asked).having(replica(100, of=asked))
+    world = World(asked).having(replica(BLOCK, of=asked))
     planned = world.plan()
     assert [x.slot for x in planned.launches] == [0]
     assert not planned.terminations

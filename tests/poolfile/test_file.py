@@ -214,12 +214,12 @@ MISTAKES = {
     "text for a whole number": (
         pool("replicas: two"),
         "pool.yaml:4: fogft.replicas: must be a whole number, not the text `two`",
-        "write a whole number from 1 to 16; the default is 2",
+        "write a whole number from 1 to 100; the default is 2",
     ),
     "fraction for a whole number": (
         pool("replicas: 2.0"),
         "pool.yaml:4: fogft.replicas: must be a whole number, not the number `2.0`",
-        "write a whole number from 1 to 16; the default is 2",
+        "write a whole number from 1 to 100; the default is 2",
     ),
     "truth value for a number": (
         pool("max_surge: yes"),
@@ -229,7 +229,7 @@ MISTAKES = {
     "nothing for a number": (
         pool("replicas:"),
         "pool.yaml:4: fogft.replicas: must be a whole number, not nothing",
-        "write a whole number from 1 to 16; the default is 2",
+        "write a whole number from 1 to 100; the default is 2",
     ),
     "text for a duration": (
         pool(services="[{name: a, type: a/srv/A, timeout_s: 2s}]"),
@@ -300,13 +300,13 @@ MISTAKES = {
     # numbers
     "no replicas": (
         pool("replicas: 0"),
-        "pool.yaml:4: fogft.replicas: must be from 1 to 16, not `0`",
-        "write a whole number from 1 to 16; the default is 2",
+        "pool.yaml:4: fogft.replicas: must be from 1 to 100, not `0`",
+        "write a whole number from 1 to 100; the default is 2",
     ),
     "too many replicas": (
-        pool("replicas: 17"),
-        "pool.yaml:4: fogft.replicas: must be from 1 to 16, not `17`",
-        "write a whole number from 1 to 16; the default is 2",
+        pool("replicas: 101"),
+        "pool.yaml:4: fogft.replicas: must be from 1 to 100, not `101`",
+        "write a whole number from 1 to 100; the default is 2",
     ),
     "too large a surge": (
         pool("max_surge: 5"),

@@ -40,7 +40,7 @@ def test_every_example_names_the_schema(path) -> None:
     "ours",
     [
         "replcas: 3",
-        "replicas: 17",
+        "replicas: 101",
         "replicas: two",
         "max_usd_per_hour: 0",
         "health: {suspect_after_s: -1}",

@@ -132,7 +132,7 @@ def test_a_quorum_and_its_tolerances_reach_the_client_proxy():
         (VOTING + "      tolerance: {a..b: 1}\n", "is not the path of a field"),
         (VOTING + "      tolerance: {x: 0}\n", "must be above 0"),
         (VOTING + "      tolerance: 3\n", "must be a map"),
-        (FILE + "      quorum: 1\n", "must be from 2 to 16"),
+        (FILE + "      quorum: 1\n", "must be from 2 to 100"),
     ],
 )
 def test_mistakes_with_a_quorum_are_told(file, what):

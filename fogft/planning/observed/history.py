@@ -18,6 +18,7 @@ from enum import Enum
 from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
+from fogft.model.choices import MAX_REPLICAS
 from fogft.model.plain import Moment
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import supply
@@ -79,7 +80,7 @@ class Event:
 _NO_FAULT = Reason(Cause.ERROR)
 OWN_FAULTS = frozenset({Cause.SETUP, Cause.NOT_SET_UP, Cause.NOT_READY})
 LAUNCHES_KEPT_S = 3600.0
-_PROOFS = 32  # of a version's failed launches: two of each of 16 slots
+_PROOFS = 2 * MAX_REPLICAS  # of a version's failed launches
 
 
 @dataclass

@@ -82,13 +82,13 @@ def test_a_replica_by_hand_joins_too(tmp_path: Path) -> None:
     """In a slot that the manager leaves alone; it dials the robot."""
     store = store_of(replace(SPEC, dial_in="ada.example:7460"), tmp_path)
     path = tmp_path / "lab.join"
-    path.write_bytes(issued(store, Role.REPLICA, "1000"))
+    path.write_bytes(issued(store, Role.REPLICA, "2000"))
     joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
     assert joined.command == "serve"
     config = read_server(joined.config)
-    assert config.id == ReplicaId(UID, 1000, 1)
+    assert config.id == ReplicaId(UID, 2000, 1)
     assert authority.describe(config.credentials.certificate).role == "replica"
-    for slot in ("3", "100", "999", "1000000", "01000", "x", "-1", "1²00", "9" * 30):
+    for slot in ("3", "100", "1999", "1000000", "02000", "x", "-1", "1²00", "9" * 30):
         with pytest.raises(CredentialError, match="no slot for a replica"):
             issued(store, Role.REPLICA, slot)
 
@@ -122,7 +122,7 @@ def test_a_gateway_joins_too(store: PoolStore, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spec", "role", "name"),
     [
-        (SPEC, Role.REPLICA, "1000"),
+        (SPEC, Role.REPLICA, "2000"),
         (replace(SPEC, dial_in="ada.example:7460"), Role.ROBOT, "bob"),
         (replace(SPEC, dial_in="ada.example:7460"), Role.GATEWAY, "edge"),
     ],

@@ -69,7 +69,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
 
 
 @pytest.mark.parametrize(
-    ("role", "name"), [(Role.ROBOT, "ada"), (Role.GATEWAY, "edge"), (Role.REPLICA, "1000")]
+    ("role", "name"), [(Role.ROBOT, "ada"), (Role.GATEWAY, "edge"), (Role.REPLICA, "2000")]
 )
 def test_a_copy_is_refused_on_a_second_machine(scene: Scene, role: Role, name: str) -> None:
     """It is told why and what to do, is left with no key, and its next bundle is welcome."""

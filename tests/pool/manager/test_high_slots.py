@@ -1,4 +1,4 @@
-"""Slots of 100 and more: those of groups, and those that people start by hand, 1000 and above."""
+"""Slots of 100 and more: those of groups, and those that people start by hand, 2000 and above."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from fogft.pool.manager.reconciler import Tick
 from tests.planning.pool_worlds import NOW, SERVICE, UID, World, replica, spec
 
 HIGH = st.integers(100, LAST_BY_HAND)
-SOME = (0, 9, 10, 99, 100, 105, 999, 1000, 1010, LAST_BY_HAND)
+SOME = (0, 9, 10, 99, 100, 105, 1999, 2000, 2010, LAST_BY_HAND)
 IDENTITY = Identity("pool", UID, "mock", "/pool.yaml", NOW)
 
 
@@ -89,9 +89,9 @@ GROUPS = tuple(GroupSpec(name, 2) for name in ("small", "large"))
 def test_the_planner_is_not_moved_by_what_runs_by_hand(states: list[str]) -> None:
     """Links to slots that no machine has change neither who is launched nor who is ended."""
     wanted = spec(4, groups=GROUPS)
-    parts = [replica(s, of=wanted, state=state) for s, state in zip((0, 1, 100, 101), states)]  # noqa: B905
+    parts = [replica(s, of=wanted, state=state) for s, state in zip((0, 1, 200, 201), states)]  # noqa: B905
     world = World(wanted).having(*parts)
-    by_hand = LinkReport(id_of(1000), LinkState.UP, ready=frozenset({SERVICE.name}))
+    by_hand = LinkReport(id_of(2000), LinkState.UP, ready=frozenset({SERVICE.name}))
     moved = replace(world, links=(*(world.links or ()), by_hand))
     if "ready" in states:
         assert world.plan() == moved.plan()
@@ -105,10 +105,10 @@ def test_a_replica_by_hand_has_its_own_port_for_metrics() -> None:
     metrics = replace(spec().metrics, replica="127.0.0.1:64000")
     text = {
         slot: configuration.replica_config(IDENTITY, spec(metrics=metrics), id_of(slot))
-        for slot in (105, 1000, LAST_BY_HAND)
+        for slot in (105, 2000, LAST_BY_HAND)
     }
     assert "127.0.0.1:64105" in text[105]
-    assert "127.0.0.1:64000" in text[1000]
+    assert "127.0.0.1:64000" in text[2000]
     assert "127.0.0.1:64000" in text[LAST_BY_HAND]
 
 
@@ -118,12 +118,12 @@ def test_a_replica_by_hand_has_its_own_port_for_metrics() -> None:
 def seen() -> status.PoolStatus:
     """Return the status of a pool with groups and two replicas by hand, one not found yet."""
     wanted = spec(4, groups=GROUPS)
-    world = World(wanted).having(*(replica(slot, of=wanted) for slot in (0, 1, 100, 101)))
+    world = World(wanted).having(*(replica(slot, of=wanted) for slot in (0, 1, 200, 201)))
     up = LinkReport(
-        id_of(1000, 2), LinkState.UP, ready=frozenset({SERVICE.name}), rtt_s=0.004, won=7
+        id_of(2000, 2), LinkState.UP, ready=frozenset({SERVICE.name}), rtt_s=0.004, won=7
     )
     world = replace(world, links=(*(world.links or ()), up))
-    listed = [*(machine.id for machine in world.machines or ()), id_of(1000, 2), id_of(1001)]
+    listed = [*(machine.id for machine in world.machines or ()), id_of(2000, 2), id_of(2001)]
     admitted = Membership("pool", UID, 1, 1, tuple(Member(id, "") for id in listed))
     tick = Tick(IDENTITY, wanted, world.intent, world.observed, world.plan(), admitted)
     report = proxy_report.ProxyReport(7, NOW)
@@ -138,10 +138,10 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
     monkeypatch.delenv("COLUMNS", raising=False)
     found = seen()
     assert (found.target, found.ready, found.services[0].ready_replicas) == (4, 4, 5)
-    assert [one.slot for one in found.replicas] == [0, 1, 100, 101]
+    assert [one.slot for one in found.replicas] == [0, 1, 200, 201]
     assert [(one.slot, one.phase, one.link) for one in found.by_hand] == [
-        (1000, "ready", "up"),
-        (1001, "starting", ""),
+        (2000, "ready", "up"),
+        (2001, "starting", ""),
     ]
     assert status.from_json(found.to_json()) == found
     output.show(status_text.rendered(Seen(found, 0.4, True), width=100))
@@ -149,7 +149,7 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
     first = next(n for n, line in enumerate(lines) if line.startswith("REPLICA"))
     table = lines[first : first + 7]
     assert [line.split()[0] for line in table[1:]] == [
-        "0.1", "1.1", "100.1", "101.1", "1000.2", "1001.1",
+        "0.1", "1.1", "200.1", "201.1", "2000.2", "2001.1",
     ]  # fmt: skip
     assert len({line.index(word) for line, word in zip(table, ["PHASE"] + 5 * ["ready"])}) == 1  # noqa: B905
     assert table[5].split()[1:] == ["ready", "by", "hand", "0.000", "up", "4.00", "ms", "7", "-"]
@@ -157,9 +157,9 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
 
 
 def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> None:
-    [by_hand, _] = pools.judge_links("p", [LinkReport(id_of(1000, 2), LinkState.SUSPECT)])
+    [by_hand, _] = pools.judge_links("p", [LinkReport(id_of(2000, 2), LinkState.SUSPECT)])
     [launched, _] = pools.judge_links("p", [LinkReport(id_of(105, 2), LinkState.SUSPECT)])
-    assert "replica `1000.2` is suspect" in by_hand.text
+    assert "replica `2000.2` is suspect" in by_hand.text
     assert "replica `105.2` is suspect" in launched.text
     assert "is not replaced automatically" in by_hand.advice
     assert "`fogft logs 105`" in launched.advice
@@ -173,6 +173,6 @@ def test_slots_are_listed_by_number(tmp_path: Path) -> None:
         change.generation_in(PoolPaths(tmp_path), 5, NOW)
     assert caught.value.hint == "slots with a replica: 9, 10, 99, 100"
     with pytest.raises(FogftError, match="started by hand") as caught:
-        change.generation_in(PoolPaths(tmp_path), 1000, NOW)
-    assert "`fogft credentials revoke replica 1000`" in caught.value.hint
+        change.generation_in(PoolPaths(tmp_path), 2000, NOW)
+    assert "`fogft credentials revoke replica 2000`" in caught.value.hint
     assert slots(PoolPaths(tmp_path)) == [9, 10, 99, 100]
