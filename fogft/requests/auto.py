@@ -146,7 +146,8 @@ class Auto(Learning):
         elif len(spares) + 1 < len(others):
             self._wanting[request] = None
         known.asked(request, now)
-        self._look(known.overdue_at(request, now))
+        if len(spares) + 1 < len(able):  # else there is nobody to hedge it at
+            self._look(known.overdue_at(request, now))
         return [best, *self._spared(request, spares, now)]
 
     def _spared(self, request: bytes, replicas: Sequence[int], now: float) -> Sequence[int]:

@@ -74,6 +74,10 @@ class FirstResponse(Generic[T]):
 
     Args:
         attempts: How often one replica may fail one request before it is barred from it.
+
+    Attributes:
+        soonest_deadline: Of the requests, or sooner.
+        has_rejected: Whether any request so far got a rejection.
     """
 
     def __init__(self, *, attempts: int = 3) -> None:
@@ -82,8 +86,8 @@ class FirstResponse(Generic[T]):
         self.get = self._pending.get  # a request that still awaits its answer
         # Those that some replica may have to be asked for, as far as is known, and from when on.
         self._short: dict[bytes, float] = {}
-        self._soonest_deadline = float("inf")  # or sooner
-        self.has_rejected = False  # any request so far
+        self.soonest_deadline = float("inf")
+        self.has_rejected = False
 
     def __len__(self) -> int:
         return len(self._pending)
@@ -114,7 +118,7 @@ class FirstResponse(Generic[T]):
             raise ValueError("request id is registered already")
         pending = Pending(deadline, item, dict.fromkeys(replicas, now))
         self._pending[request] = pending
-        self._soonest_deadline = min(self._soonest_deadline, deadline)
+        self.soonest_deadline = min(self.soonest_deadline, deadline)
         if not complete or not pending.open:
             self._short[request] = 0.0
         return pending
@@ -186,13 +190,13 @@ class FirstResponse(Generic[T]):
 
     def expire(self, now: float) -> list[tuple[bytes, Pending[T]]]:
         """Take out every request whose deadline has come, oldest first."""
-        if now < self._soonest_deadline:
+        if now < self.soonest_deadline:
             return []
         expired = [entry for entry in self._pending.items() if entry[1].deadline <= now]
         for request, _ in expired:
             self.close(request)
         left = (pending.deadline for pending in self._pending.values())
-        self._soonest_deadline = min(left, default=float("inf"))
+        self.soonest_deadline = min(left, default=float("inf"))
         return expired
 
     def idle(self) -> list[bytes]:

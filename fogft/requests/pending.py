@@ -36,6 +36,7 @@ POISON_DEATHS = 2  # once beside others, and then alone: that is no chance
 # So long after a death no request is at all replicas at once: another that kills would end them.
 CAUTIOUS_S = 60.0
 _SPREADS_AFTER_S = 1.0
+_LOOK_AGAIN_S = 0.02  # at a request for which nobody says when
 
 
 class PendingRequests(Generic[T]):
@@ -115,6 +116,8 @@ class PendingRequests(Generic[T]):
             if again_at > now:
                 self.table.look_at(request, again_at)
                 soonest = min(soonest, again_at)
+            else:
+                soonest = min(soonest, now + _LOOK_AGAIN_S)
         choose.look_at = now if choose.news else soonest
         return steps
 

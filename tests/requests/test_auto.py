@@ -194,8 +194,9 @@ def test_a_late_hedge_goes_to_a_free_replica_after_the_learned_delay_and_takes_a
     policy = learned(r1=0.1, r2=0.1)
     policy.look_at = NEVER
     policy.first(A, (1,), 31.0)
-    assert 31.11 < policy.look_at < 31.13
+    assert policy.look_at == NEVER  # nobody to hedge it at
     assert policy.more(A, {1: 31.0}, (2,), 31.05) == ()
+    assert 31.11 < policy.look_at < 31.13
     before = policy.report()["tokens"]
     assert policy.more(A, {1: 31.0}, (2,), 31.13) == (2,)
     assert policy.report()["tokens"] == before - 1

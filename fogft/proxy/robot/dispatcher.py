@@ -45,7 +45,8 @@ log = logging.getLogger(__name__)
 
 MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
 _SHORTEST_S = 0.002
-_TICK_S = 0.02  # while requests wait, and for a moment after: then it needs none
+_TICK_S = 0.02  # while losers may have to be told
+_SELDOM_S = 0.1  # while requests wait: else it looks when the policy or a deadline wants it
 _LINGERS_S = 0.1
 
 
@@ -96,6 +97,7 @@ class Dispatcher:
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
         self._busy_until = NEVER if self._decide.replicates else -NEVER
+        self._asked = False  # since the last tick
         self._requests: PendingRequests[Request] = PendingRequests(
             policy(spec),
             self._decide,
@@ -145,10 +147,14 @@ class Dispatcher:
                 return False
             links, able = self._sender.links, self._sender.able
             item = Request(payload, handle, now, traced=outcomes.trace is not None)
-            chosen = requests.begin(request, item, able, deadline=now + timeout_s, now=now)
+            deadline, self._asked = now + timeout_s, True
+            chosen = requests.begin(request, item, able, deadline=deadline, now=now)
             if item.trace is not None:
                 item.trace.asked.update(dict.fromkeys(chosen, now))
-            soon = min(requests.choose.look_at, now + _TICK_S)
+            soon = min(requests.choose.look_at, deadline, now + _SELDOM_S)
+            if len(chosen) > 1:
+                self._busy_until = max(self._busy_until, now + _LINGERS_S)
+                soon = min(soon, now + _TICK_S)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
         self._sender.first(request, payload, links, chosen, timeout_s)
@@ -359,10 +365,14 @@ class Dispatcher:
         look_at = min(self._sender.next_look, self._delivery.tick(now, able=self.able))
         look_at = max(look_at, now + _SHORTEST_S)
         self._sender.next_look = look_at
-        if len(self._requests.table):  # after that was set: who comes later sees it, and wakes
-            self._busy_until = max(self._busy_until, now + _LINGERS_S)
+        # After that was set: who comes later sees it, and wakes.
+        if self._asked or len(self._requests.table):
+            self._asked = False
+            deadline = max(self._requests.table.soonest_deadline, now + _SHORTEST_S)
+            look_at = min(look_at, deadline, now + _SELDOM_S)
         if now < self._busy_until:
-            self._sender.next_look = look_at = min(look_at, now + _TICK_S)
+            look_at = min(look_at, now + _TICK_S)
+        self._sender.next_look = look_at
         return look_at
 
     def close(self) -> None:
