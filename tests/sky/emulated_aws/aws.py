@@ -143,8 +143,9 @@ def let_in(instance: Any) -> str:
     for group in instance.security_groups:
         for rule in group.ingress_rules:
             ports = f"{rule.from_port}-{rule.to_port}" if rule.ip_protocol == "tcp" else "0-65535"
-            for source in rule.ip_ranges:
-                rules.append(f"ip saddr {source['CidrIp']} tcp dport {ports} accept")
+            source = (rule.ip_range or {}).get("CidrIp")
+            if source:
+                rules.append(f"ip saddr {source} tcp dport {ports} accept")
     return "\n".join(
         (
             "flush ruleset", "table inet groups {", "chain input {",
