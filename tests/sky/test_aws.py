@@ -213,7 +213,7 @@ def client_error(code: str) -> Exception:
 def test_not_allowed_is_not_the_same_as_cannot_tell(code: str, expected: type, hint: str):
     """The first hands the question to SkyPilot; from the second nothing may be concluded."""
     aws = Aws()
-    aws.clients["us-east-1"] = Refusing(client_error(code))
+    aws.clients["ec2", "us-east-1"] = Refusing(client_error(code))
     with pytest.raises(expected) as caught:
         aws.instances(["us-east-1"])
     if hint:
@@ -226,7 +226,7 @@ def test_a_region_that_may_not_be_asked_hides_no_other(account: None):
     """An organisation keeps its accounts out of most regions."""
     aws = Aws()
     launch("us-west-2", labels(replica(0)))
-    aws.clients["us-east-1"] = Refusing(client_error("UnauthorizedOperation"))
+    aws.clients["ec2", "us-east-1"] = Refusing(client_error("UnauthorizedOperation"))
     aws.regions = lambda: ["us-east-1", "us-west-2"]  # type: ignore[method-assign]
     assert [i.placement.region for i in aws.instances(None)] == ["us-west-2"]
     with pytest.raises(NotAllowedError):
@@ -235,7 +235,7 @@ def test_a_region_that_may_not_be_asked_hides_no_other(account: None):
 
 def test_no_network_is_cannot_tell():
     aws = Aws()
-    aws.clients["us-east-1"] = Refusing(ConnectionError("no route"))
+    aws.clients["ec2", "us-east-1"] = Refusing(ConnectionError("no route"))
     with pytest.raises(CloudUnreachable):
         aws.instances(["us-east-1"])
 

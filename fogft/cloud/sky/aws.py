@@ -33,8 +33,6 @@ T = TypeVar("T")
 _ALIVE = ["pending", "running", "stopping", "stopped"]  # a stopped one's disk still costs
 _FORBIDDEN = ("UnauthorizedOperation", "AccessDenied", "AccessDeniedException")
 _HOME = "us-east-1"  # any region lists the others
-_ROLE_OF = "the role of VMs"  # IAM's place among the regions: it has none
-_QUOTAS_OF = "the quotas of"
 ROLE = "skypilot-v1"
 _ENDS_IN_ENVIRONMENT = ("AWS_CREDENTIAL_EXPIRATION", "AWS_SESSION_EXPIRATION")
 _ENDS_IN_PROFILE = ("aws_expiration", "expiration", "x_security_token_expires")  # of login tools
@@ -49,7 +47,8 @@ class Aws:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._session: Any = None
-        self.clients: dict[str, Any] = {}  # by region: safe to share, and each costs megabytes
+        # By service and region: safe to share, and each costs megabytes.
+        self.clients: dict[tuple[str, str], Any] = {}
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
         """See `Provider`. Regions are asked side by side.
@@ -86,14 +85,12 @@ class Aws:
         """
         rules = {(port, source) for port in ports for source in sources}
         name = f"fogft-{hashlib.sha256(repr(sorted(rules)).encode()).hexdigest()[:16]}"
-        made = self._ask(region, functools.partial(_firewalls, name, rules))
-        for group, found in made.items():
-            if found != rules:
-                raise CloudError(
-                    f"the security group `{name}` ({group}) in `aws/{region}` was changed: it no "
-                    "longer lets in exactly what `fogft.allow_from` names",
-                    "delete it, and fogft makes it anew",
-                )
+        for group in self._ask(region, functools.partial(_firewalls, name, rules)):
+            raise CloudError(
+                f"the security group `{name}` ({group}) in `aws/{region}` was changed: it no "
+                "longer lets in exactly what `fogft.allow_from` names",
+                "delete it, and fogft makes it anew",
+            )
         return name
 
     def credentials_end_at(self) -> float | None:
@@ -127,7 +124,7 @@ class Aws:
                 return None
             return float(found["Quota"]["Value"])
 
-        return self._ask(f"{_QUOTAS_OF} {region}", value)
+        return self._ask(region, value, "service-quotas")
 
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         """See `Provider`."""
@@ -184,7 +181,7 @@ class Aws:
             return sorted(str(policy["PolicyName"]) for policy in found)
 
         try:
-            names = self._ask(_ROLE_OF, policies)
+            names = self._ask(_HOME, policies, "iam")
         except (NotAllowedError, CloudUnreachable):
             return ""
         if names is None:
@@ -200,28 +197,23 @@ class Aws:
             f"{', '.join(mighty)}: give it what docs/how-to/clouds.md lists, and nothing else"
         )
 
-    def _client(self, region: str) -> Any:
+    def _client(self, service: str, region: str) -> Any:
         with self._lock:
-            if region not in self.clients:
+            if (service, region) not in self.clients:
                 if self._session is None:
                     self._session = importlib.import_module("boto3").session.Session()
                 retries = {"max_attempts": 2, "mode": "standard"}
                 config = importlib.import_module("botocore.config").Config(
                     connect_timeout=5, read_timeout=10, retries=retries
                 )
-                service, where = "ec2", region
-                if region == _ROLE_OF:
-                    service, where = "iam", _HOME
-                elif region.startswith(_QUOTAS_OF):
-                    service, where = "service-quotas", region.rsplit(maxsplit=1)[-1]
-                self.clients[region] = self._session.client(
-                    service, region_name=where, config=config
+                self.clients[service, region] = self._session.client(
+                    service, region_name=region, config=config
                 )
-            return self.clients[region]
+            return self.clients[service, region]
 
-    def _ask(self, region: str, call: Callable[[Any], T]) -> T:
+    def _ask(self, region: str, call: Callable[[Any], T], service: str = "ec2") -> T:
         try:
-            return call(self._client(region))
+            return call(self._client(service, region))
         except ImportError as error:
             raise NotAllowedError("boto3 is not installed") from error
         except Exception as error:
@@ -252,10 +244,10 @@ def _terminate(key: str, ec2: Any) -> None:
         ec2.terminate_instances(InstanceIds=[key])
 
 
-def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> dict[str, Any]:
-    """Make a security group in each VPC that has none, with its rules; return all rules by group.
+def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:
+    """Make a security group in each VPC that has none; return those that let in anything else.
 
-    One whose making was interrupted has none, and gets them.
+    One whose making was interrupted has no rules, and gets them.
     """
 
     def groups() -> list[Any]:
@@ -266,14 +258,22 @@ def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> dict[str, An
     for vpc in sorted(missing - {group["VpcId"] for group in groups()}):
         with _unless("InvalidGroup.Duplicate"):
             ec2.create_security_group(GroupName=name, Description="fogft", VpcId=vpc)
+    wanted = [_permission(port, source) for port, source in sorted(rules)]
+    changed = []
     for group in groups():
         if not group["IpPermissions"]:
             with _unless("InvalidPermission.Duplicate"):
-                ec2.authorize_security_group_ingress(
-                    GroupId=group["GroupId"],
-                    IpPermissions=[_permission(*rule) for rule in sorted(rules)],
-                )
-    return {group["GroupId"]: set(_let_in(group["IpPermissions"])) for group in groups()}
+                ec2.authorize_security_group_ingress(GroupId=group["GroupId"], IpPermissions=wanted)
+        by_group = [{"Name": "group-id", "Values": [group["GroupId"]]}]
+        listed = ec2.describe_security_group_rules(Filters=by_group)["SecurityGroupRules"]
+        found = {
+            (one["IpProtocol"], one["FromPort"], one["ToPort"], _source(one))
+            for one in listed
+            if not one["IsEgress"]
+        }
+        if found != {("tcp", port, port, source) for port, source in rules}:
+            changed.append(str(group["GroupId"]))
+    return changed
 
 
 def _permission(port: int, source: str) -> dict[str, Any]:
@@ -282,16 +282,8 @@ def _permission(port: int, source: str) -> dict[str, Any]:
     return {"IpProtocol": "tcp", "FromPort": port, "ToPort": port, **ranges}
 
 
-def _let_in(permissions: Iterable[Mapping[str, Any]]) -> Iterator[tuple[Any, str]]:
-    """Yield the rules of a group: a port and who may connect to it, other text for any others."""
-    for one in permissions:
-        ports = one.get("FromPort"), one.get("ToPort")
-        tcp = one["IpProtocol"] == "tcp" and ports[0] == ports[1]
-        sources = [found["CidrIp"] for found in one.get("IpRanges", ())]
-        sources += [found["CidrIpv6"] for found in one.get("Ipv6Ranges", ())]
-        others = one.get("UserIdGroupPairs") or one.get("PrefixListIds") or ()
-        for source in (*sources, *map(str, others)):
-            yield ports[0] if tcp else ports, source
+def _source(rule: Mapping[str, Any]) -> str:
+    return str(rule.get("CidrIpv4") or rule.get("CidrIpv6") or "others")
 
 
 @contextlib.contextmanager

@@ -116,12 +116,13 @@ def test_estimates_grow_with_the_distance():
 
 
 def test_every_place_and_cloud_has_an_endpoint():
-    for cloud, regions in geography.REGIONS.items():
-        for region in regions:
-            host, port = geography.endpoint(f"{cloud}/{region}")
-            assert region in host
-            assert port == 443
-            assert geography.position(f"{cloud}/{region}")
+    assert {region.split("/")[0] for region in geography.positions()} == {"aws", "azure", "gcp"}
+    for region, (latitude, longitude) in geography.positions().items():
+        host, port = geography.endpoint(region)
+        assert region.split("/")[1] in host
+        assert port == 443
+        assert -90 <= latitude <= 90
+        assert -180 <= longitude <= 180
     assert geography.endpoint("local/us-west-1") is None
 
 
