@@ -74,7 +74,7 @@ class SkyCloud:
         self.journal = journal = Journal(self.folder / "launches")
         self._census = Census(by_name, clock, submit)
         self._presence = Presence(sky, journal, self._census, clock, submit)
-        self._ending = Ending(sky, journal, by_name, self.sleep, clock)
+        self._ending = Ending(sky, journal, self._census, self.sleep, clock)
         self._following = Following(sky, journal, self._ending, clock, self._presence.forget)
         self._prices = Prices(sky, by_name, clock, submit)
         self._lock = threading.Lock()

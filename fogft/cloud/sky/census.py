@@ -35,16 +35,28 @@ class Census:
         self._begun_at: dict[str, float] = {}
         self._refused: dict[str, str] = {}
 
-    def alive(self, entry: Entry) -> Instance | None:
-        """Return the instance of a replica that SkyPilot does not list; None when it is gone.
+    def of(self, id: ReplicaId, entry: Entry | None) -> list[Instance] | None:
+        """Return a replica's instances, asked now; None where SkyPilot's word has to do.
 
-        Where the provider cannot be asked, SkyPilot's word has to do.
+        Args:
+            id: The replica.
+            entry: What the journal knows of it; None where it may be anywhere.
         """
+        if entry is None:
+            found, _ = self.everywhere(id.pool_uid)
+            return [i for i in found if i.id == id] or None
         provider = self.providers.get(entry.placement.cloud)
         if provider is None:
             return None
-        found = self._ask(provider, [entry.placement.region], entry.id.pool_uid)
-        return next((i for i in found if i.id == entry.id), None)
+        mine = self._ask(provider, [entry.placement.region], id.pool_uid)
+        return [i for i in mine if i.id == id] if self.vouches(provider.cloud) else None
+
+    def terminate(self, instance: Instance) -> None:
+        """Ask for the end of an instance. Raises CloudUnreachable: it may run on."""
+        try:
+            self.providers[instance.placement.cloud].terminate([instance])
+        except NotAllowedError as error:
+            raise CloudUnreachable(f"{instance.key} may not be ended: {error}") from error
 
     def vouches(self, cloud: str) -> bool:
         """Whether a cloud's own list can be had, as far as is known."""

@@ -10,13 +10,13 @@ Not here: which replicas shall end (`fogft.planning.planner`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
+from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import Journal
 from fogft.cloud.sky.naming import cluster_name
-from fogft.cloud.sky.provider import Instance, NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import ReplicaId
@@ -35,7 +35,7 @@ class Ending:
 
     sky: InstalledSky
     journal: Journal
-    providers: Mapping[str, Provider]
+    census: Census
     sleep: Callable[[float], object]
     clock: Callable[[], float]
 
@@ -90,31 +90,11 @@ class Ending:
 
     def _left(self, id: ReplicaId, name: str) -> list[str]:
         """Return what still exists; ask the provider to end what SkyPilot did not."""
-        instances = self._instances(id)
+        instances = self.census.of(id, self.journal.get(id))
         # The provider knows best; SkyPilot's own look at the cloud waits behind its other requests.
         clusters = self.sky.clusters(name, refresh=instances is None)
         left = [f"cluster {c.name} ({c.state.value})" for c in clusters if c.name == name]
         for instance in instances or ():
             left.append(f"{instance.placement.cloud} instance {instance.key}")
-            try:
-                self.providers[instance.placement.cloud].terminate([instance])
-            except NotAllowedError as error:
-                raise CloudUnreachable(f"{instance.key} may not be ended: {error}") from error
+            self.census.terminate(instance)
         return left
-
-    def _instances(self, id: ReplicaId) -> list[Instance] | None:
-        """Return a replica's machines by the provider; None where SkyPilot's word has to do."""
-        entry = self.journal.get(id)
-        asked = list(self.providers)
-        if entry is not None:
-            asked = [cloud for cloud in asked if cloud == entry.placement.cloud]
-        out: list[Instance] = []
-        sure = entry is not None and bool(asked)  # else it may be where nobody can be asked
-        for cloud in asked:
-            provider = self.providers[cloud]
-            regions = None if entry is None else [entry.placement.region]
-            try:
-                out += [i for i in provider.instances(regions, id.pool_uid) if i.id == id]
-            except NotAllowedError:
-                sure = False
-        return out if sure or out else None

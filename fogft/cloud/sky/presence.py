@@ -72,13 +72,13 @@ class Presence:
     def refresh(self, id: ReplicaId) -> None:
         """See `SkyCloud.refresh`."""
         entry = self.journal.get(id)
-        if entry is not None and self.census.vouches(entry.placement.cloud):
-            gone = self.census.alive(entry) is None
-            sure = self.clock() - entry.launched_at > PROVIDER_SURE_AFTER_S or not gone
-            if sure and self.census.vouches(entry.placement.cloud):
-                if gone and entry.stage in ON_THE_MACHINE:
-                    self._is_gone(entry)
-                    self.submit(lambda: self._drop_record(id))
+        alive = None if entry is None else self.census.of(id, entry)
+        if entry is not None and alive is not None:
+            gone_for_sure = self.clock() - entry.launched_at > PROVIDER_SURE_AFTER_S
+            if not alive and gone_for_sure and entry.stage in ON_THE_MACHINE:
+                self._is_gone(entry)
+                self.submit(lambda: self._drop_record(id))
+            if alive or gone_for_sure:
                 return
         self.sky.clusters(cluster_name(id), refresh=True)
         self.forget()
@@ -97,13 +97,13 @@ class Presence:
             self._listed = (-math.inf, ())
 
     def _of_entry(self, entry: Entry, cluster: Cluster | None) -> Machine | None:
-        instance = None
+        alive = None
         if cluster is None and entry.stage in ON_THE_MACHINE:
-            instance = self.census.alive(entry)
-            if instance is None:
+            alive = self.census.of(entry.id, entry)
+            if not alive:
                 self._is_gone(entry)
                 return None
-        return listing.of_entry(entry, cluster, instance)
+        return listing.of_entry(entry, cluster, alive[0] if alive else None)
 
     def _of_cluster(self, id: ReplicaId, cluster: Cluster) -> Machine:
         launching = any(request.active for request in self.sky.launches(cluster.name))

@@ -13,10 +13,10 @@ import json
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from fogft.cloud.sky import extras
 from fogft.cloud.sky.catalogue import best
@@ -29,6 +29,8 @@ from fogft.model.replica import Offer, Placement
 
 log = logging.getLogger(__name__)
 
+K = TypeVar("K")
+V = TypeVar("V")
 FRESH_S = 300.0
 USABLE_S = 3600.0
 
@@ -141,8 +143,7 @@ class Prices:
         wanted = {one for one in wanted if one[2]}
         if not wanted:
             return sale.offers
-        with ThreadPoolExecutor(min(8, len(wanted)), "quotas") as pool:
-            limits = dict(zip(wanted, pool.map(self._quota, wanted), strict=True))
+        limits = _side_by_side(wanted, self._quota)
         kept = []
         for offer in sale.offers:
             limit, place = limits.get(asked(offer)), offer.placement
@@ -162,11 +163,7 @@ class Prices:
         key = f"{cloud}/{region}", code
         at, value = self._quotas.get(key, (-math.inf, None))
         if self.clock() - at > USABLE_S:
-            try:
-                value = self.providers[cloud].quota(region, code)
-            except (NotAllowedError, CloudUnreachable) as error:
-                log.info("quota_unknown region=%s/%s reason=%r", cloud, region, str(error))
-                value = None
+            value = _told(lambda: self.providers[cloud].quota(region, code), "quota", key[0])
             self._quotas[key] = self.clock(), value
         return value
 
@@ -178,17 +175,23 @@ class Prices:
                 wanted.setdefault((place.cloud, place.region), set()).add(place.instance)
         if not wanted:
             return listed
-        with ThreadPoolExecutor(min(8, len(wanted)), "prices") as pool:
-            answers = dict(zip(wanted, pool.map(self._live, wanted.items()), strict=True))
+
+        def live(where: tuple[str, str]) -> Mapping[tuple[str, str], float]:
+            cloud, region = where
+            provider, kinds = self.providers[cloud], wanted[where]
+            prices = _told(lambda: provider.spot_prices(region, kinds), "prices", "/".join(where))
+            return prices or {}
+
+        answers = _side_by_side(wanted, live)
         now = self.clock()
 
         def priced(offer: Offer) -> Offer:
             place = offer.placement
-            live = answers.get((place.cloud, place.region), {}) if place.spot else {}
+            found = answers.get((place.cloud, place.region), {}) if place.spot else {}
             # Without a zone the cloud chooses one: count with the dearest.
             prices = [
                 price
-                for (zone, kind), price in live.items()
+                for (zone, kind), price in found.items()
                 if kind == place.instance and place.zone in ("", zone)
             ]
             if not prices:
@@ -197,13 +200,19 @@ class Prices:
 
         return [priced(offer) for offer in listed]
 
-    def _live(self, wanted: tuple[tuple[str, str], set[str]]) -> Mapping[tuple[str, str], float]:
-        (cloud, region), instances = wanted
-        try:
-            return self.providers[cloud].spot_prices(region, instances)
-        except (NotAllowedError, CloudUnreachable) as error:
-            log.info("live_prices_missing region=%s/%s reason=%r", cloud, region, str(error))
-            return {}
+
+def _side_by_side(wanted: Collection[K], ask: Callable[[K], V]) -> dict[K, V]:
+    with ThreadPoolExecutor(min(8, len(wanted)), "prices") as pool:
+        return dict(zip(wanted, pool.map(ask, wanted), strict=True))
+
+
+def _told(ask: Callable[[], V], what: str, region: str) -> V | None:
+    """Return what a provider says; None where it does not."""
+    try:
+        return ask()
+    except (NotAllowedError, CloudUnreachable) as error:
+        log.info("not_told what=%s region=%s reason=%r", what, region, str(error))
+        return None
 
 
 def _with_extras(offer: Offer, resources: Mapping[str, Any]) -> Offer:

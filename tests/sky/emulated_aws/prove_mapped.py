@@ -34,12 +34,7 @@ ROWS = [
     for kind, cpus in (("cpu3c-2-8", 2), ("cpu3c-4-16", 4))
 ]
 RESOURCES = {"infra": "runpod", "cpus": "2", "use_spot": False}
-# SkyPilot's own way to say which user a pod's image has.
-POD_TASK = {
-    **TASK,
-    "resources": RESOURCES,
-    "envs": {**TASK["envs"], "SKYPILOT_RUNPOD_DOCKER_USERNAME": "ubuntu"},
-}
+POD_TASK = {**TASK, "resources": RESOURCES}
 step = Steps()
 
 

@@ -54,7 +54,7 @@ class Pod:
         self.listeners = {port: self._map(port) for port in private}
         with (IMAGE / f"{self.id}.log").open("wb") as log:
             self.vm = subprocess.Popen(
-                ["bash", HERE / "vm.sh", self.id, self.address, IMAGE, IMAGE / "host", "ubuntu",
+                ["bash", HERE / "vm.sh", self.id, self.address, IMAGE, IMAGE / "host", "root",
                  key.strip(), ":", *HIDDEN],
                 stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip

@@ -40,9 +40,14 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
     hostname "ip-${address//./-}"
     echo "127.0.0.1 localhost ip-${address//./-}" >etc/hosts
     : >etc/resolv.conf
-    install -d -m700 "home/$user/.ssh"
-    echo "$key" >"home/$user/.ssh/authorized_keys"
-    chown -R --reference="home/$user" "home/$user/.ssh"
+    install -d -m700 home/ubuntu/.ssh
+    echo "$key" >home/ubuntu/.ssh/authorized_keys
+    chown -R --reference=home/ubuntu home/ubuntu/.ssh
+    if [ "$user" = root ]; then  # it has all that the image has for the other one
+      chown -R root:root home/ubuntu/.ssh
+      chown root:root home/ubuntu
+      mount --bind home/ubuntu root
+    fi
     path=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
     docker=
     if [ -d "$image/cgroup" ]; then
