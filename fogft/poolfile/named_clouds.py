@@ -96,3 +96,9 @@ def place(entry: Mapping[str, Any]) -> tuple[str, str, str]:
     named = [str(part or "").strip().lower() for part in (*parts, "", "")]
     cloud, region, zone = ("" if part == "*" else part for part in named[:3])
     return cloud, region, zone
+
+
+def sells(entry: Mapping[str, Any], cloud: str, region: str, zone: str) -> bool:
+    """Whether a place is one that an alternative names, or any."""
+    there = (cloud.lower(), region.lower(), zone.lower())
+    return all(asked in ("", own) for asked, own in zip(place(entry), there, strict=True))

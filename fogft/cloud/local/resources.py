@@ -8,7 +8,7 @@ that name in the local cloud.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
@@ -16,6 +16,7 @@ from fogft.errors import SpecError
 from fogft.model.names import VM_CLOUDS
 from fogft.model.replica import Offer, Placement
 from fogft.poolfile.named_clouds import alternatives as each
+from fogft.poolfile.named_clouds import place
 from fogft.poolfile.tree import nearest, shown
 
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)
@@ -81,33 +82,22 @@ def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Z
         if len(parts) > 3 or not all(parts):
             what = f"{where}.infra: {shown(infra)} is not `cloud/region/zone`"
             raise SpecError(what, "write a place such as `local/us-west-1`")
-        named = dict(zip(("cloud", "region", "zone"), parts, strict=False))
-        keys = dict.fromkeys(named, "infra")
-    else:
-        named = {key: str(entry[key]) for key in _PLACE_KEYS[1:] if entry.get(key) is not None}
-        keys = {key: key for key in named}
-    named = {key: name for key, name in named.items() if name != "*"}
 
-    cloud = named.get("cloud", CLOUD).lower()
-    if cloud not in CLOUDS:
-        what = f"{where}.{keys['cloud']}: there is no cloud {shown(cloud)}"
-        raise SpecError(what, nearest(cloud, CLOUDS))
-    region = named.get("region")
-    if region is not None and region not in catalogue.regions:
-        what = f"{where}.{keys['region']}: the local cloud has no region {shown(region)}"
-        raise SpecError(what, nearest(region, catalogue.regions))
-    there = [zone for zone in catalogue.zones if region in (None, zone.region)]
-    name = named.get("zone")
-    if name is None:
-        return there
+    def wrong(key: str, what: str, name: str, known: Iterable[str]) -> SpecError:
+        key = key if infra is None else "infra"
+        return SpecError(f"{where}.{key}: {what} {shown(name)}", nearest(name, known))
+
+    cloud, region, name = place(entry)
+    if cloud not in ("", *CLOUDS):
+        raise wrong("cloud", "there is no cloud", cloud, CLOUDS)
+    if region and region not in catalogue.regions:
+        raise wrong("region", "the local cloud has no region", region, catalogue.regions)
+    there = [zone for zone in catalogue.zones if region in ("", zone.region)]
     # Other clouds' zones begin with their region: us-west-1a, us-west1-a.
-    found = [z for z in there if name in (z.name, z.region + z.name, f"{z.region}-{z.name}")]
+    found = [z for z in there if name in ("", z.name, z.region + z.name, f"{z.region}-{z.name}")]
     if not found:
-        place = f"region `{region}`" if region else "the local cloud"
-        raise SpecError(
-            f"{where}.{keys['zone']}: {place} has no zone {shown(name)}",
-            nearest(name, {zone.name for zone in there}),
-        )
+        here = f"region `{region}`" if region else "the local cloud"
+        raise wrong("zone", f"{here} has no zone", name, {zone.name for zone in there})
     return found
 
 

@@ -1,7 +1,7 @@
 """What a VM costs besides itself: its disk and its public address. Pure.
 
-List prices of each cloud's cheapest regions, for the disk that SkyPilot orders where no `disk_tier`
-is named. Of clouds that are not listed nothing is known; many sell machines with both.
+List prices of 2024-11 in each cloud's cheapest regions, for the disk that SkyPilot orders where no
+`disk_tier` is named. Of clouds that are not listed nothing is known; many sell machines with both.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 
 from fogft.model.replica import Placement
 
-AS_OF = "2024-11"
 HOURS_A_MONTH = 730.0
 # gp3 on AWS, a balanced disk on GCP; Azure's Premium SSDs have steps, of which this is the usual.
 DISK_USD_PER_GB_MONTH = {"aws": 0.08, "azure": 0.15, "gcp": 0.10}

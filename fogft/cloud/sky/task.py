@@ -20,7 +20,7 @@ from fogft.cloud.sky import naming
 from fogft.errors import CloudError, FogftError, SpecError
 from fogft.model.names import LINK_PORT, NO_VM_CLOUDS, SETUP_LIMIT_S
 from fogft.model.replica import Placement
-from fogft.poolfile.named_clouds import alternatives, place
+from fogft.poolfile.named_clouds import alternatives, place, sells
 
 OURS = "~/.fogft"
 DISK_GB = 64  # where the pool file names none; SkyPilot takes 256
@@ -155,9 +155,8 @@ def _resources(order: Launch, owner: str) -> dict[str, Any]:
 
 def _sells(entry: Mapping[str, Any], placement: Placement) -> bool:
     """Whether a placement can have come from this alternative."""
-    parts = zip(place(entry), (placement.cloud, placement.region, placement.zone), strict=True)
     return (
-        all(asked in ("", sold.lower()) for asked, sold in parts)
+        sells(entry, placement.cloud, placement.region, placement.zone)
         and entry.get("instance_type") in (None, placement.instance.partition("+")[0])
         and entry.get("use_spot") in (None, placement.spot)
     )

@@ -22,7 +22,7 @@ from fogft.cloud.local.catalogue import Instance
 from fogft.cloud.local.resources import alternatives, suffices, use_spot
 from fogft.errors import SpecError
 from fogft.model.replica import Offer, Placement
-from fogft.poolfile.named_clouds import place
+from fogft.poolfile.named_clouds import sells
 from fogft.poolfile.tree import shown
 
 _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
@@ -54,7 +54,7 @@ class PriceTable:
             spot = use_spot(where, entry)
             for row in self._rows:
                 price = row.instance.spot_usd_per_hour if spot else row.instance.usd_per_hour
-                if math.isnan(price) or not _is_there(row, entry) or not _suits(where, row, entry):
+                if math.isnan(price) or not _suits(where, row, entry):
                     continue
                 where_sold = Placement(row.cloud, row.region, row.zone, row.instance.name, spot)
                 offer = Offer(where_sold, price, row.source, row.as_of)
@@ -72,13 +72,9 @@ def _order(offer: Offer) -> tuple[float, Placement]:
     return offer.usd_per_hour, offer.placement
 
 
-def _is_there(row: Row, entry: Mapping[str, Any]) -> bool:
-    has = (row.cloud, row.region, row.zone)
-    return all(asked in ("", own) for asked, own in zip(place(entry), has, strict=True))
-
-
 def _suits(where: str, row: Row, entry: Mapping[str, Any]) -> bool:
-    if entry.get("instance_type") not in (None, row.instance.name):
+    there = sells(entry, row.cloud, row.region, row.zone)
+    if not there or entry.get("instance_type") not in (None, row.instance.name):
         return False
     keys = [key for key in ("accelerators", "cpus", "memory") if entry.get(key) is not None]
     return all(suffices(where, key, entry[key], row.instance) for key in keys)

@@ -126,6 +126,10 @@ def answer(query: str) -> dict[str, Any]:
     if "podTerminate" in query:
         PODS.pop(_field(query, "podId")).end()
         return {"data": {"podTerminate": None}}
+    if "updateUserSettings" in query:
+        return {"data": {"updateUserSettings": {"id": "user", "pubKey": ""}}}
+    if "pubKey" in query:
+        return {"data": {"myself": {"id": "user", "pubKey": "", "networkVolumes": []}}}
     if "podTemplates" in query:
         return {"data": {"myself": {"podTemplates": []}}}
     if "pods" in query:
