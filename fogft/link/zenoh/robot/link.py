@@ -30,7 +30,6 @@ from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.replica import LinkState
-from fogft.requests.load import Handling
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +73,7 @@ class ZenohLink:
         )
         # Written by the link's thread only; `_live` is set exactly while the state is UP.
         self._live: Connection | None = None
+        self.offer: Callable[..., bool] = _decline  # of its attempts, while there is one
         self._state = LinkState.CONNECTING
         # Services that the last probe answer called ready; empty unless UP
         self.ready: frozenset[str] = frozenset()
@@ -112,22 +112,6 @@ class ZenohLink:
         """The certificate (DER) that its open connection uses; empty unless UP."""
         live = self._live
         return b"" if live is None else live.certificate
-
-    def offer(
-        self,
-        service: str,
-        request_id: bytes,
-        payload: bytes,
-        remaining_s: float,
-        *,
-        more: bool = False,
-        handling: Handling = Handling.NORMAL,
-    ) -> bool:
-        """Take one attempt, or return False. Never blocks. With `more`, `send` must follow."""
-        live = self._live
-        return live is not None and live.attempts.offer(
-            service, request_id, payload, remaining_s, more=more, handling=handling
-        )
 
     def send(self) -> None:
         """Send what was offered with `more`. Never blocks."""
@@ -173,8 +157,8 @@ class ZenohLink:
         self._closed = True
         join_at_exit(self._thread)
         self._wake.set()
-        live, self._live = self._live, None
-        self.ready = frozenset()
+        live = self._live
+        self._nothing_live()
         if live is not None:
             live.close()
         self._on_close(self)
@@ -400,18 +384,20 @@ class ZenohLink:
         if self._live is not connection:
             self._state = LinkState.UP
             self._detail = ""
-            self._live = connection
+            self.offer, self._live = connection.attempts.offer, connection
             log.info("link_up replica=%s rtt_s=%.4f", self.peer.id.short, self._probing.rtt_s)
         if self._closed:  # by another thread, just now
-            self._live, self.ready = None, frozenset()
+            self._nothing_live()
         elif news:
             self._changed()
+
+    def _nothing_live(self) -> None:
+        self._live, self.offer, self.ready = None, _decline, frozenset()
 
     def _part(self, connection: Connection) -> None:
         """Let go of a connection: nothing more is offered to it, what is open there is lost."""
         was_up = self._live is not None
-        self._live = None
-        self.ready = frozenset()
+        self._nothing_live()
         self._renew.clear()  # the next one begins with what there is now
         if was_up:
             self._state = LinkState.SUSPECT
@@ -456,3 +442,8 @@ class ZenohLink:
             self._events.changed(self)
         except Exception:
             log.exception("change_not_taken replica=%s", self.peer.id.short)
+
+
+def _decline(*_: object, **__: object) -> bool:
+    """Take no attempt: nothing is live."""
+    return False
