@@ -42,8 +42,6 @@ class OrderMark:
                 disk.make_folder(path.parent)
                 disk.write_whole(path, b"".join(w.to_bytes(8, "little") for w in words))
             with path.open("r+b") as file:
-                if path.stat().st_size == (_WORDS - 1) * 8:  # of a version that knew no versions
-                    file.truncate(_WORDS * 8)
                 self._map = mmap.mmap(file.fileno(), _WORDS * 8)
         except (OSError, ValueError) as error:
             raise StateError(

@@ -42,7 +42,7 @@ from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.records.record import Record, RecordKind, SignedRecord
+from fogft.records.record import Record, RecordKind
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import LazyVerifier
 
@@ -108,6 +108,8 @@ class ZenohListener:
             work=self._work_queue,
             counters=self._counters,
         )
+        # What the pool has signed: taken before `serve`, none of the revoked is ever let in.
+        self.take_records = self._control.take
         self._services: dict[str, str] = {}  # key -> service
 
     @property
@@ -291,10 +293,6 @@ class ZenohListener:
         self._work_queue.offer(partial(on_cancel, ids))
 
     # -- the owner ------------------------------------------------------------------------
-
-    def take_records(self, records: Sequence[SignedRecord]) -> None:
-        """Take what the pool has signed; before `serve`, none of the revoked is ever let in."""
-        self._control.take(records)
 
     def lease(self) -> Record | None:
         """Return the newest lease that the manager signed, of those that robots brought."""
