@@ -52,6 +52,14 @@ class Send(NamedTuple):
     is_copy: bool = False
 
 
+class Reachable(NamedTuple):
+    """The replicas that can be sent to: those that could not be before, all, those to go soon."""
+
+    come: Collection[int]
+    versions: Mapping[int, str]  # what each runs
+    leaving: Collection[int]
+
+
 class Decide:
     """Says what answers mean: the first response is the answer; with `accepts`, the first ok one.
 
@@ -118,13 +126,7 @@ class Decide:
         """Return the request that an attempt is about; None for one that is about none."""
         return id
 
-    def reach(
-        self,
-        come: Collection[int],
-        now: float,
-        versions: Mapping[int, str],
-        leaving: Collection[int],
-    ) -> None:
+    def reach(self, replicas: Reachable, now: float) -> None:
         """Note which replicas can be sent to."""
 
     def take(self, now: float, timeout_s: float) -> Sequence[Send]:

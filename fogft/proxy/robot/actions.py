@@ -17,7 +17,7 @@ import os
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -26,7 +26,7 @@ from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Effect, Refusal
 from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.requests.decide import Decide, Judgement, Means, Send
+from fogft.requests.decide import Decide, Judgement, Means, Reachable, Send
 from fogft.requests.first_response import Pending
 from fogft.topics import goals
 from fogft.topics.goals import Goals, Had
@@ -88,7 +88,6 @@ class _CancelPart(Decide):
         self._sent: OrderedDict[bytes, tuple[bytes, float]] = OrderedDict()  # goal, until when
 
     def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
-        """Note a client's cancellation."""
         goal = goals.goal_of(pending.item.payload)
         if any(goal):  # else it means all goals made by now, and must not come later again
             self._note(request, goal, self._action.clock() + _CANCEL_FOR_S)
@@ -119,20 +118,12 @@ class _CancelPart(Decide):
         return True
 
     def report(self) -> dict[str, Any]:
-        """Return how many replicas are still to be told."""
         return {"to_cancel": len(self._action.to_cancel)}
 
     # -- what replicas must have ----------------------------------------------------------
 
-    def reach(
-        self,
-        come: Collection[int],
-        now: float,
-        versions: Mapping[int, str],
-        leaving: Collection[int],
-    ) -> None:
-        """Note who can be told."""
-        self._replicas = frozenset(versions)
+    def reach(self, replicas: Reachable, now: float) -> None:
+        self._replicas = frozenset(replicas.versions)
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
         """Return what is to be told to those who work in vain, or were not there."""
@@ -211,29 +202,21 @@ class _GoalPart(Decide):
         return True
 
     def report(self) -> dict[str, Any]:
-        """Return how many goals are known."""
         return {"goals": self._action.goals.kept}
 
     # -- what replicas must have ----------------------------------------------------------
 
-    def reach(
-        self,
-        come: Collection[int],
-        now: float,
-        versions: Mapping[int, str],
-        leaving: Collection[int],
-    ) -> None:
+    def reach(self, replicas: Reachable, now: float) -> None:
         """Note who can be given goals; who comes may have missed that some were ended."""
         action = self._action
         with action.lock:
-            for replica in set(action.replicas) - versions.keys():
+            for replica in set(action.replicas) - replicas.versions.keys():
                 action.goals.left(replica)
-            action.replicas = tuple(versions)
+            action.replicas = tuple(replicas.versions)
             for goal in action.goals.unwanted():
-                action.cancel(goal, come, now)
+                action.cancel(goal, replicas.come, now)
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
-        """Return the goals that replicas lack."""
         found = []
         with self._action.lock:
             for replica in self._action.replicas:
@@ -246,7 +229,6 @@ class _GoalPart(Decide):
         return found
 
     def declined(self, id: bytes, replica: int, now: float) -> None:
-        """A replica's link did not take a goal."""
         with self._action.lock:
             self._action.goals.failed(id, replica, now)
 
@@ -276,7 +258,6 @@ class _ResultPart(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
-        """Take a result."""
         if pending is None:
             return super().judge(id, replica, payload, reading, pending)
         action, goal = self._action, goals.goal_of(pending.item.payload)

@@ -16,6 +16,7 @@ from fogft.link.port import Link
 from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
 from fogft.proxy.robot.request import Ledger
+from fogft.requests.decide import Reachable
 from fogft.requests.load import NEVER, Handling
 
 
@@ -93,7 +94,7 @@ class Sender:
             if replication is not None:
                 known = {key: versions.get(x.peer.id, "") for key, x in routed.items()}
                 going = [key for key, link in routed.items() if link.peer.id in leaving]
-                replication.reach(added, now, known, going)
+                replication.reach(Reachable(added, known, going), now)
             told, self._hanging = hang - self._hanging, hang
             for key in told:
                 self._ledger.requests.choose.hangs(key)

@@ -12,14 +12,14 @@ from __future__ import annotations
 import logging
 import secrets
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from typing import Any
 
 from fogft.model.refusal import Refusal
 from fogft.ordering.orders import Op, OrderError, OrderId, decode, encode
 from fogft.ordering.sequencer import Handover, Sequencer
 from fogft.proxy.order_mark import OrderMark
-from fogft.requests.decide import Decide, Judgement, Means, Send
+from fogft.requests.decide import Decide, Judgement, Means, Reachable, Send
 from fogft.requests.first_response import Pending
 
 log = logging.getLogger(__name__)
@@ -46,8 +46,7 @@ class ServiceOrder(Decide):
         self._mark = mark
         self._wake = wake
         self._clock = clock
-        self._versions: Mapping[int, str] = {}
-        self._leaving: Collection[int] = ()
+        self._replicas = Reachable((), {}, ())
         self._requests: dict[int, bytes] = {}  # by number
         self._numbers: dict[bytes, int] = {}
         self._waiting: dict[bytes, bytes] = {}  # no replica can take them yet; oldest first
@@ -167,19 +166,14 @@ class ServiceOrder(Decide):
 
     # -- what is sent ---------------------------------------------------------------------
 
-    def reach(
-        self,
-        come: Collection[int],
-        now: float,
-        versions: Mapping[int, str],
-        leaving: Collection[int],
-    ) -> None:
+    def reach(self, replicas: Reachable, now: float) -> None:
         """Note which replicas can be sent to."""
-        self._versions, self._leaving = versions, leaving
+        self._replicas = replicas
         self._reach(now)
 
     def _reach(self, now: float) -> None:
-        self._term.reach(self._versions, now, versions=self._versions, leaving=self._leaving)
+        _, versions, leaving = self._replicas
+        self._term.reach(versions, now, versions=versions, leaving=leaving)
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
         """Number what waits, and return the orders to send, in their order."""
