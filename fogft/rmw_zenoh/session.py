@@ -9,7 +9,6 @@ Owns: these settings. Not here: those of links (`config`), which never meet such
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -65,11 +64,6 @@ def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
                 'write `key=value;key=value`, such as `connect/endpoints=["tcp/10.0.0.5:7447"]`',
             ) from error
     return made
-
-
-def override(**settings: Any) -> str:
-    """Return a value of `OVERRIDE`; a double underscore stands for a slash in a key."""
-    return ";".join(f"{k.replace('__', '/')}={json.dumps(v)}" for k, v in settings.items())
 
 
 def _overrides(text: str) -> list[tuple[str, str]]:

@@ -37,10 +37,8 @@ class Router:
     @property
     def environ(self) -> dict[str, str]:
         """What nodes need in their environment to find it, and nobody else."""
-        override = session.override(
-            connect__endpoints=[self.endpoint], listen__endpoints=["tcp/127.0.0.1:0"]
-        )
-        return {session.OVERRIDE: override}
+        here = f'connect/endpoints=["{self.endpoint}"]', 'listen/endpoints=["tcp/127.0.0.1:0"]'
+        return {session.OVERRIDE: ";".join(here)}
 
     def start(self) -> None:
         """Start it, and wait until it listens."""
