@@ -100,9 +100,7 @@ def main() -> None:
         presence = Presence(config, proxy.endpoint)
         while not stop.wait(0.05):
             proxy.run_once()
-            known = presence.look(
-                proxy.ready, draining=proxy.draining, in_flight=proxy.responder.in_flight
-            )
+            known = presence.look(proxy.ready, draining=proxy.draining)
             proxy.revoke(known.revoked)
             proxy.renew(known.of(RecordKind.LEASE))
     finally:

@@ -21,11 +21,13 @@ from tests.link.namespaces import can_make_namespaces
 from tests.link.wire_pool import wait_for
 from tests.proxy.gateway_pool import ran
 from tests.soak import schedule
+from tests.soak.clocks import can_set
 from tests.soak.damage import do
 from tests.soak.load import CALM, Load
 from tests.soak.verdict import Outcome, faults_found
 from tests.soak.world import LIMIT_S, World, made
 
+LONG_MIN = 10  # so many minutes have time for the faults that take a minute
 UPLINKS = ("failover", "prefer", "all")
 
 
@@ -38,8 +40,13 @@ def main() -> int:
     given = parser.parse_args()
     kinds, namespaces = list(schedule.KINDS), can_make_namespaces()
     if not namespaces:
-        kinds.remove("uplink loss")
-        print("not run: uplink loss: needs root and `ip`, for network namespaces", file=sys.stderr)
+        kinds = [kind for kind in kinds if "uplink" not in kind]
+        print("not run: faults of uplinks: need root and `ip`, for namespaces", file=sys.stderr)
+    if not can_set():
+        kinds.remove("clock set")
+        print("not run: clock set: needs gcc", file=sys.stderr)
+    if given.minutes < LONG_MIN:
+        kinds = [kind for kind in kinds if kind not in schedule.NIGHTLY]
     with tempfile.TemporaryDirectory(prefix="fogft-soak-") as folder:
         where = given.keep or Path(folder)
         where.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ from tests.soak.schedule import Fault
 from tests.soak.world import REPLICAS, World
 
 SLOW_S = 0.3
+LONG_S = 60.0
 STARVED_BYTES_PER_S = 20_000.0
 
 Damage = Callable[[World, Fault], contextlib.AbstractContextManager[None]]
@@ -124,6 +125,32 @@ def _no_descriptors(world: World, fault: Fault) -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def _clock_set(world: World, fault: Fault) -> Iterator[None]:
+    """Set the clock of one machine, or of all, by an hour either way; and back."""
+    assert world.clocks is not None
+    pids = world.pids()
+    chosen = fault.victim // 2 % (len(pids) + 1)
+    meant = pids if chosen == len(pids) else [pids[chosen]]
+    world.clocks.set(meant, 3600 if fault.victim % 2 else -3600)
+    yield
+    world.clocks.set(meant, 0)
+
+
+@contextlib.contextmanager
+def _new_uplink_address(world: World, fault: Fault) -> Iterator[None]:
+    assert world.cables is not None
+    world.cables.readdress(fault.victim % 2)
+    yield
+
+
+@contextlib.contextmanager
+def _long_suspend(world: World, fault: Fault) -> Iterator[None]:
+    with _suspend(world, fault):
+        time.sleep(LONG_S)
+        yield
+
+
 DAMAGES: dict[str, Damage] = {
     "kill": _kill,
     "freeze": _freeze,
@@ -138,6 +165,9 @@ DAMAGES: dict[str, Damage] = {
     "all killed": _all_killed,
     "suspend": _suspend,
     "no descriptors": _no_descriptors,
+    "clock set": _clock_set,
+    "new uplink address": _new_uplink_address,
+    "long suspend": _long_suspend,
 }
 
 

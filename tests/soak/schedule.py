@@ -24,7 +24,11 @@ KINDS = (
     "all killed",
     "suspend",
     "no descriptors",
+    "clock set",
+    "new uplink address",
+    "long suspend",
 )
+NIGHTLY = ("long suspend",)  # a minute each
 SHORTEST_S, LONGEST_S = 1.5, 4.0
 
 

@@ -49,8 +49,9 @@ def test_any_failure_fails_a_soak(change, why):
 
 
 def test_the_faults_are_those_that_a_pool_has_to_bear():
-    assert len(KINDS) == 13
+    assert len(KINDS) == 16
     assert {"all killed", "suspend", "no descriptors"} <= set(KINDS)
     assert {"kill", "freeze", "blackhole", "slow", "starve", "address change"} <= set(KINDS)
     assert {"rendezvous death", "gateway death"} <= set(KINDS)
-    assert {"uplink loss", "certificate rotation"} <= set(KINDS)
+    assert {"uplink loss", "new uplink address", "certificate rotation"} <= set(KINDS)
+    assert {"clock set", "long suspend"} <= set(KINDS)

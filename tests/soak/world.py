@@ -31,6 +31,7 @@ from tests.link.wire_pool import POOL_UID
 from tests.ports import free_port
 from tests.proxy.gateway_pool import GatewayPool, Robot, ran, start_server
 from tests.records.rendezvous_pool import Rendezvous
+from tests.soak.clocks import Clocks, can_set
 
 ADDRESS = "10.82.9.9"
 REPLICAS = 3
@@ -45,6 +46,7 @@ class Cables:
         self.made = Namespaces()
         self.robot, self.rest = self.made.add("robot"), self.made.add("rest")
         self.interfaces = []
+        self._last = [1, 1]  # number of the robot's address on each cable
         for number in (1, 2):
             near, _ = self.made.join(
                 self.robot, f"10.82.{number}.1", self.rest, f"10.82.{number}.2"
@@ -55,10 +57,18 @@ class Cables:
 
     def stall(self, number: int) -> None:
         """Let nothing come back on a cable; nobody is told."""
-        self.made.blackhole(self.rest, f"10.82.{number + 1}.1")
+        self.made.blackhole(self.rest, f"10.82.{number + 1}.{self._last[number]}")
+
+    def readdress(self, number: int) -> None:
+        """Give the robot's end of a cable another address."""
+        old, new = self._last[number], 1 if self._last[number] > 1 else 77
+        self._last[number] = new
+        base, cable = f"10.82.{number + 1}", self.interfaces[number]
+        self.made.readdress(self.robot, cable, f"{base}.{old}", f"{base}.{new}")
+        self.made.route(self.robot, ADDRESS, f"{base}.2", cable, metric=number + 1)
 
     def heal(self, number: int) -> None:
-        self.made.restore(self.rest, f"10.82.{number + 1}.1")
+        self.made.restore(self.rest, f"10.82.{number + 1}.{self._last[number]}")
 
 
 class Replica:
@@ -89,7 +99,8 @@ class World(GatewayPool):
     """
 
     def __init__(self, folder: Path, cables: Cables | None, uplinks: str) -> None:
-        super().__init__(folder, timeout_s=60.0, services=f", uplink_policy: {uplinks}")
+        super().__init__(folder, timeout_s=180.0, services=f", uplink_policy: {uplinks}")
+        self.clocks = Clocks(folder) if can_set() else None
         self.host = ADDRESS if cables is not None else "127.0.0.1"
         self.delays_s = (0.002, 0.01, 0.02)
         self.cables = cables
