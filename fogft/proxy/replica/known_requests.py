@@ -3,17 +3,18 @@
 A robot that lost its link sends what was in flight again, under the same id. So an id is known
 until its deadline, and its answer is kept for copies as long as there is room.
 
-Owns: ids, their deadlines, kept answers and their bounds. Called under the responder's lock.
+Owns: ids, their deadlines, kept answers and their bounds. Called under the owner's lock.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+import heapq
+from collections import OrderedDict
 from typing import NamedTuple
 
 from fogft.proxy.replica.service_queue import Job
 
-_DEADLINES_KEPT = 1024  # of a service, of jobs that were forgotten
+_DEADLINES_KEPT = 1024  # of jobs that were forgotten
 
 
 class Remembered(NamedTuple):
@@ -38,8 +39,7 @@ class KnownRequests:
         self._kept_ids = kept_ids
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
         self.get = self._jobs.get  # a job that is known, by its id
-        # One queue a service: its requests share a time-out, so the oldest expires first.
-        self._deadlines: dict[str, deque[tuple[float, bytes]]] = {}
+        self._deadlines: list[tuple[float, bytes]] = []  # a heap
         self._kept: OrderedDict[bytes, Job] = OrderedDict()
         self._kept_bytes = 0
         self.held = 0
@@ -48,8 +48,8 @@ class KnownRequests:
     @property
     def remembered(self) -> Remembered:
         """How much is remembered, answered requests included."""
-        deadlines = sum(map(len, self._deadlines.values()))
-        return Remembered(len(self._jobs), deadlines, len(self._kept), self._kept_bytes)
+        deadlines, kept = len(self._deadlines), len(self._kept)
+        return Remembered(len(self._jobs), deadlines, kept, self._kept_bytes)
 
     def unanswered(self, service: str | None) -> list[Job]:
         """Return the jobs that somebody waits for, of one service or of all."""
@@ -62,17 +62,14 @@ class KnownRequests:
     def add(self, job: Job) -> None:
         """Hold a new job."""
         self._jobs[job.id] = job
-        deadlines = self._deadlines.setdefault(job.service, deque())
-        deadlines.append((job.deadline, job.id))
-        if len(deadlines) > 2 * len(self._jobs) + _DEADLINES_KEPT:
-            self._deadlines[job.service] = self._live(deadlines)
+        heapq.heappush(self._deadlines, (job.deadline, job.id))
+        if len(self._deadlines) > 2 * len(self._jobs) + _DEADLINES_KEPT:
+            # Without those of jobs that were forgotten, or run anew.
+            live = ((due, self._jobs.get(due[1])) for due in self._deadlines)
+            self._deadlines = [due for due, job in live if job and job.deadline == due[0]]
+            heapq.heapify(self._deadlines)
         self.held += 1
         self.held_bytes += job.size
-
-    def _live(self, deadlines: deque[tuple[float, bytes]]) -> deque[tuple[float, bytes]]:
-        """Return the deadlines without those of jobs that were forgotten or run anew."""
-        live = ((due, self._jobs.get(due[1])) for due in deadlines)
-        return deque(due for due, job in live if job is not None and job.deadline == due[0])
 
     def release(self, job: Job) -> None:
         """A job is held no more."""
@@ -109,14 +106,13 @@ class KnownRequests:
     def expired(self, now: float) -> list[bytes]:
         """Forget what is past its deadline; return the ids that somebody still waits for."""
         late = []
-        for deadlines in self._deadlines.values():
-            while deadlines and deadlines[0][0] <= now:
-                _, id = deadlines.popleft()
-                job = self._jobs.get(id)
-                if job is None or job.deadline > now:
-                    continue
-                if job.waiting is None:
-                    self._drop(job)
-                else:
-                    late.append(id)
+        while self._deadlines and self._deadlines[0][0] <= now:
+            _, id = heapq.heappop(self._deadlines)
+            job = self._jobs.get(id)
+            if job is None or job.deadline > now:
+                continue
+            if job.waiting is None:
+                self._drop(job)
+            else:
+                late.append(id)
         return late

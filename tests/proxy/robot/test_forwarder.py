@@ -104,6 +104,13 @@ def test_a_deadline_ends_it(scene):
     assert scene.request(2, remaining_s=0.0).outcome == [refused(Refusal.EXPIRED)]
 
 
+def test_a_short_deadline_does_not_wait_for_a_long_one_before_it(scene):
+    patient, hasty = scene.request(1, remaining_s=60.0), scene.request(2, remaining_s=1.0)
+    scene.clock.now += 1.1
+    scene.forwarder.tick(READY)
+    assert (patient.outcome, hasty.outcome) == ([], [refused(Refusal.EXPIRED)])
+
+
 def test_with_nobody_behind_it_refuses_and_hands_back_what_it_holds(scene):
     held = scene.request()
     scene.forwarder.tick(frozenset())
