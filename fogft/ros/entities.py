@@ -153,7 +153,8 @@ class Client:
         mismatch: Callable[[], str] = str,
     ) -> None:
         self.handle = client.handle
-        self.mismatch = mismatch
+        self._mismatch = mismatch
+        self._trouble: tuple[int, str] = 0, ""  # with so many servers
         self._count = count
         self._client = client
         self._end: ClientEnd | None = end
@@ -178,6 +179,13 @@ class Client:
             return self._count(self._client.srv_name)
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
             return 0
+
+    def mismatch(self) -> str:
+        """Say why no server that is there can be called; looked up when others are there."""
+        count = self.servers()
+        if not count or count != self._trouble[0]:
+            self._trouble = count, self._mismatch()
+        return self._trouble[1]
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         """Send a serialised request; return its ticket."""
