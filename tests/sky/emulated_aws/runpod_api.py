@@ -73,6 +73,7 @@ class Pod:
                 except OSError:
                     outer.close()
                     continue
+                inner.settimeout(None)
                 for ends in ((outer, inner), (inner, outer)):
                     threading.Thread(target=_pump, args=ends, daemon=True).start()
 
