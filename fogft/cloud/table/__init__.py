@@ -90,13 +90,14 @@ def _rows(file: Path) -> Iterator[Row]:
                     f"{file}: has no column `{missing[0]}`",
                     "write a table in the columns of SkyPilot's catalogues",
                 )
+            usual = file.resolve().parent.name
             for number, raw in enumerate(reader, 2):
-                yield _row(file, number, raw)
+                yield _row(file, number, raw, usual)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SpecError(f"{file}: cannot be read: {error}") from error
 
 
-def _row(file: Path, number: int, raw: Mapping[str, str | None]) -> Row:
+def _row(file: Path, number: int, raw: Mapping[str, str | None], usual: str) -> Row:
     def number_in(key: str, default: float) -> float:
         text = (raw.get(key) or "").strip()
         try:
@@ -111,7 +112,7 @@ def _row(file: Path, number: int, raw: Mapping[str, str | None]) -> Row:
     name = (raw.get("InstanceType") or "").strip()
     devices = (raw.get("AcceleratorName") or "").strip()
     return Row(
-        cloud=(raw.get("Cloud") or file.resolve().parent.name).strip().lower(),
+        cloud=(raw.get("Cloud") or usual).strip().lower(),
         region=(raw.get("Region") or "").strip().lower(),
         zone=(raw.get("AvailabilityZone") or "").strip().lower(),
         instance=Instance(
