@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,6 +25,10 @@ def simulate(
     traces: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Replay the spot traces in this folder."),
+    ] = None,
+    prices: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Let spot prices change as recorded in this folder."),
     ] = None,
     fit: Annotated[
         bool, typer.Option("--fit", help="Generate markets that resemble the traces.")
@@ -57,15 +62,21 @@ def simulate(
 
     if plot is not None:
         check(plot)
-    report = run.simulate(
-        file,
-        traces=traces,
-        fit=fit,
-        model=model,
-        days=days,
-        seeds=range(first_seed, first_seed + seeds),
-        cloud=cloud,
-    )
+    with contextlib.ExitStack() as shown:
+        show = None
+        if output.is_terminal(sys.stderr):
+            show = shown.enter_context(output.redrawn(sys.stderr))
+        report = run.simulate(
+            file,
+            traces=traces,
+            prices=prices,
+            fit=fit,
+            model=model,
+            days=days,
+            seeds=range(first_seed, first_seed + seeds),
+            cloud=cloud,
+            told=lambda done, of: show(f"simulated {done} of {of} runs") if show else None,
+        )
     if as_json:
         output.json_data(report.to_json())
     else:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from fogft.cloud.port import Launch
-from fogft.errors import NoCapacity
+from fogft.errors import CloudError
 from fogft.model.replica import Offer, ReplicaId
 from fogft.simulation.world import NEVER, Target, World
 
@@ -40,7 +40,7 @@ class Fleet:
     def _launch(self, order: Launch, refused: Callable[[], None]) -> None:
         try:
             self.world.launch(order)
-        except NoCapacity:
+        except CloudError:
             self.ordered.pop(order.id, None)
             refused()
         else:

@@ -58,6 +58,8 @@ class Scenario:
     seeds: Sequence[int] = tuple(range(20))  # one run each
     # Location -> its own MTTF and MTTR, where they are not the model's.
     zones: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    # Location -> price of a spot machine over time, where it is not what `find` says.
+    prices: Mapping[str, Timeline] = field(default_factory=dict)
 
     @property
     def length_s(self) -> float:
@@ -75,11 +77,14 @@ class Scenario:
                 chance,
                 self.zones,
             )
-            return Market(self.find, lines, self.timing)
+            return Market(self.find, lines, self.timing, self.prices)
         known_s = min(line.length_s for line in self.recorded.values())
         begin_s = chance.uniform(0, known_s - self.length_s) if known_s > self.length_s else 0.0
-        lines = {p: t.window(begin_s, self.length_s) for p, t in self.recorded.items()}
-        return Market(self.find, lines, self.timing)
+        lines, prices = (
+            {place: line.window(begin_s, self.length_s) for place, line in known.items()}
+            for known in (self.recorded, self.prices)
+        )
+        return Market(self.find, lines, self.timing, prices)
 
 
 def spot_locations(spec: PoolSpec, find: FindOffers) -> list[str]:
@@ -214,15 +219,17 @@ def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
     return chosen
 
 
-def compare(scenario: Scenario, told: Callable[[int], None] = lambda done: None) -> list[Row]:
-    """Run every policy in every market; `told` is called with the number of runs done."""
+def compare(
+    scenario: Scenario, told: Callable[[int, int], None] = lambda done, of: None
+) -> list[Row]:
+    """Run every policy in every market; `told` hears how many runs of how many are done."""
     made = policies(scenario)
     outcomes: dict[str, list[Outcome]] = {name: [] for name in made}
     curves: dict[str, tuple[tuple[float, int], ...]] = {}
     for index, seed in enumerate(scenario.seeds):
         market = scenario.market(seed)
         for number, (name, make) in enumerate(made.items()):
-            told(index * len(made) + number)
+            told(index * len(made) + number, len(made) * len(scenario.seeds))
             world = World(market, seed=seed, length_s=scenario.length_s, settle_s=SETTLE_S)
             with unlogged():
                 meter = world.run(make(world))

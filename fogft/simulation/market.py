@@ -38,6 +38,8 @@ class Market:
     find: FindOffers
     timelines: Mapping[str, Timeline]
     timing: Timing = field(default_factory=Timing)
+    # Location -> price of a spot machine over time, where it is not what `find` says.
+    prices: Mapping[str, Timeline] = field(default_factory=dict)
 
     def offers(self, resources: Mapping[str, Any]) -> list[Offer]:
         """Return what suits and is not spot in a location that nothing is known of."""

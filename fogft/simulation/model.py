@@ -32,6 +32,9 @@ class Timing:
     on_demand_mttf_s: float = (
         Assumption.on_demand_uptime_s
     )  # mean time to the failure of an on-demand machine; 0: never
+    on_demand_refused: float = 0.0  # share of the orders of on-demand machines
+    launch_fails: float = 0.0  # share of the machines that are accepted and never serve
+    spot_quota: float = 0.0  # the most spot machines of a region; 0: any number
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def staying(model: MarketModel, timing: Timing) -> float:
 
 
 _POSITIVE = ("mttf_s", "mttr_s", "regime_s")
-_BELOW = {"together": 1.0, "correlation": MAX_CORRELATION}
+_SHARES = ("together", "on_demand_refused", "launch_fails")
 _FRACTIONS = ("correlation_region", "correlation_cloud", "correlation_world")
 MARKET_KEYS = ("correlation", *(f.name for f in fields(MarketModel)))
 TIMING_KEYS = tuple(f.name for f in fields(Timing))
@@ -143,7 +146,8 @@ def _number(key: str, text: str) -> float:
     if not math.isfinite(value) or value < 0 or (key in _POSITIVE and value == 0):
         range_ = "above 0" if key in _POSITIVE else "0 or more"
         raise FogftError(f"--model: `{key}` must be {range_} and finite, not `{text:.40}`", HINT)
-    most = _BELOW.get(key.split("_", maxsplit=1)[0], math.inf)
+    most = MAX_CORRELATION if key.startswith("correlation") else math.inf
+    most = 1.0 if key in _SHARES else most
     if value > most:
         raise FogftError(f"--model: `{key}` must be from 0 to {most:g}, not `{text:.40}`", HINT)
     return value

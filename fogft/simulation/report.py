@@ -74,7 +74,7 @@ def simulate(
     scenario: Scenario,
     *,
     notes: Sequence[str] = (),
-    told: Callable[[int], None] = lambda done: None,
+    told: Callable[[int, int], None] = lambda done, of: None,
 ) -> Report:
     """Run a scenario. Raises FogftError: it is too long, or longer than what was recorded."""
     scenario, more = _fitting(scenario)

@@ -19,6 +19,7 @@ from fogft.simulation.comparison import Scenario, spot_locations
 from fogft.simulation.market import FindOffers, remembered
 from fogft.simulation.model import MARKET_KEYS, MarketModel, Timing, applied, read_values
 from fogft.simulation.report import Report
+from fogft.simulation.timeline import PER_USD
 from fogft.simulation.traces import located, read
 
 
@@ -26,24 +27,26 @@ def simulate(
     file: Path,
     *,
     traces: Path | None = None,
+    prices: Path | None = None,
     fit: bool = False,
     model: str = "",
     days: float = 7.0,
     seeds: Sequence[int] = tuple(range(20)),
     cloud: str | None = None,
-    told: Callable[[int], None] = lambda done: None,
+    told: Callable[[int, int], None] = lambda done, of: None,
 ) -> Report:
     """Run a pool file and fixed baselines side by side. Launches nothing.
 
     Args:
         file: The pool file.
         traces: A folder of recorded traces; None to make markets up.
+        prices: A folder of spot prices, laid out like the traces, in US dollars per hour.
         fit: Make markets up that are like the traces.
         model: ``KEY=VALUE,...``, see `fogft.simulation.model`.
         days: Measured by each seed.
         seeds: One run of each policy a seed.
         cloud: Whose prices; None for the one that the pool file names, else `local`.
-        told: Called with the number of runs done.
+        told: Called with how many runs are done, and of how many.
     """
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.parent)
@@ -92,7 +95,15 @@ def simulate(
             )
     market, timing = applied(market, timing, values)
     scenario = Scenario(
-        spec, find, timing, market, recorded=lines, days=days, seeds=tuple(seeds), zones=zones
+        spec,
+        find,
+        timing,
+        market,
+        recorded=lines,
+        days=days,
+        seeds=tuple(seeds),
+        zones=zones,
+        prices={} if prices is None else located(read(prices, PER_USD), _everything(spec, find)),
     )
     return report.simulate(scenario, notes=notes, told=told)
 

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 UNLIMITED = 1 << 30
+PER_USD = 1_000_000  # a timeline of prices is in millionths of a US dollar per hour
 
 
 @dataclass(frozen=True)

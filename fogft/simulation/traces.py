@@ -37,8 +37,13 @@ class Trace:
     timeline: Timeline
 
 
-def read(folder: Path) -> list[Trace]:
-    """Read every ``.json`` file in and below a folder; one that is no trace is an error."""
+def read(folder: Path, per_unit: int = 1) -> list[Trace]:
+    """Read every ``.json`` file in and below a folder; one that is no trace is an error.
+
+    Args:
+        folder: Where they are.
+        per_unit: What one of what was sampled counts: 1 for machines, `PER_USD` for prices.
+    """
     if not folder.is_dir():
         raise FogftError(f"{folder}: is not a folder of traces", FORMAT)
     try:
@@ -47,10 +52,10 @@ def read(folder: Path) -> list[Trace]:
         raise FogftError(f"{folder}: cannot be read: {error.strerror}") from None
     if not files:
         raise FogftError(f"{folder}: there is no trace (`*.json`) in it", FORMAT)
-    return [_read_file(path, folder) for path in files]
+    return [_read_file(path, folder, per_unit) for path in files]
 
 
-def _read_file(path: Path, folder: Path) -> Trace:
+def _read_file(path: Path, folder: Path, per_unit: int) -> Trace:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise FogftError(f"{path}: is larger than {MAX_BYTES >> 20} MiB", FORMAT)
@@ -62,11 +67,11 @@ def _read_file(path: Path, folder: Path) -> Trace:
     inner = path.relative_to(folder).with_suffix("").parts
     zone = inner[-1].split("_")[0]
     place = "/".join((*inner[:-1], zone)) if len(inner) == 3 else zone
-    timeline = parse(value, str(path))
+    timeline = parse(value, str(path), per_unit)
     return Trace(str(path), place, float(value["metadata"]["gap_seconds"]), timeline)
 
 
-def parse(value: Any, file: str) -> Timeline:
+def parse(value: Any, file: str, per_unit: int = 1) -> Timeline:
     """Return the timeline of a trace. Raises FogftError, which names the place in the file."""
     if not isinstance(value, Mapping):
         raise FogftError(f"{file}: must be a JSON object", FORMAT)
@@ -79,19 +84,21 @@ def parse(value: Any, file: str) -> Timeline:
         raise FogftError(f"{file}: data: must be a list of numbers", FORMAT)
     if not data:
         raise FogftError(f"{file}: data: the trace is empty", "remove the file, or record again")
+    of = "of machines" if per_unit == 1 else "from 0"
     for index, sample in enumerate(data):
         if sample is None:
             raise FogftError(
                 f"{file}: data[{index}]: the trace has a gap here ({gap_s:g} s a sample)",
                 "cut the trace before it or after it: what happened meanwhile is not known",
             )
-        if not _is_number(sample) or sample < 0 or sample != int(sample):
+        whole = per_unit > 1 or (_is_number(sample) and sample == int(sample))
+        if not _is_number(sample) or sample < 0 or not whole:
             raise FogftError(
-                f"{file}: data[{index}]: must be a number of machines, not `{sample!r:.40}`", FORMAT
+                f"{file}: data[{index}]: must be a number {of}, not `{sample!r:.40}`", FORMAT
             )
     if "times" in value:
         _check_times(value["times"], len(data), float(gap_s), file)
-    return of_samples([int(sample) for sample in data], float(gap_s))
+    return of_samples([round(sample * per_unit) for sample in data], float(gap_s))
 
 
 def _check_times(times: Any, samples: int, gap_s: float, file: str) -> None:

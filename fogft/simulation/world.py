@@ -12,15 +12,17 @@ import heapq
 import itertools
 import random
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
 from fogft.cloud.port import Launch
-from fogft.errors import NoCapacity
-from fogft.model.replica import LinkReport, Machine, MachinePhase, Offer, ReplicaId
+from fogft.errors import CloudError, NoCapacity, QuotaExceeded
+from fogft.model.replica import LinkReport, Machine, MachinePhase, Offer, Placement, ReplicaId
+from fogft.planning.placement import crowding
 from fogft.simulation.market import Change, Market, changes, remembered, rounded_up
 from fogft.simulation.meter import Meter
+from fogft.simulation.timeline import PER_USD
 
 EPOCH = 1_704_067_200.0  # a Monday, 00:00 UTC: simulated time is a time of day as well
 TICK_S = 1.0
@@ -81,6 +83,10 @@ class World:
         self._capacity: dict[str, int] = {}
         self._queue: list[tuple[float, int, Happening]] = []
         self._order = itertools.count()
+        self._prices: dict[str, float] = {}  # location -> of a spot machine, where it is recorded
+        for place, line in market.prices.items():
+            for at_s, price in line.changes:
+                self.at(EPOCH + rounded_up(at_s, TICK_S), partial(self._reprice, place, price))
         for change in changes(market, TICK_S):
             if change.at_s <= length_s:
                 self.at(EPOCH + change.at_s, partial(self._change, change))
@@ -125,7 +131,7 @@ class World:
             for vm in self.vms.values():
                 if vm.gone_at == NEVER:
                     ready += vm.ready
-                    usd_per_hour += vm.order.usd_per_hour
+                    usd_per_hour += self._price(vm.order.placement, vm.order.usd_per_hour)
             self.meter.pass_time(
                 moment,
                 moment - self.now,
@@ -149,6 +155,20 @@ class World:
                 vm.machine = vm.report = None
             self.at(EPOCH + change.ends_s, partial(self._lose, vm))
         return None
+
+    def _reprice(self, place: str, price: int) -> None:
+        self._prices[place] = price / PER_USD
+        self._find = remembered(self._sold)
+
+    def _sold(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
+        """Return what the market sells at the prices of now."""
+        return [
+            replace(offer, usd_per_hour=self._price(offer.placement, offer.usd_per_hour))
+            for offer in self.market.offers(resources)
+        ]
+
+    def _price(self, place: Placement, usual: float) -> float:
+        return self._prices.get(place.location, usual) if place.spot else usual
 
     def _spot_machines(self, location: str) -> list[Vm]:
         """Return who takes up room there: not those that are already to go."""
@@ -200,18 +220,38 @@ class World:
         if order.id in self.vms:
             return
         timing, place = self.market.timing, order.placement
-        if place.spot:
-            room = self._capacity.get(place.location, 0) - len(self._spot_machines(place.location))
-            if room <= 0:
-                self.meter.refusals += self.meter.counts(self.now)
-                raise NoCapacity(f"no capacity in `{place.location}`")
+        refusal = self._refusal(place)
+        if refusal is not None:
+            self.meter.refusals += self.meter.counts(self.now)
+            raise refusal
         vm = self.vms[order.id] = Vm(order, self.now)
         self.meter.launches += self.meter.counts(self.now)
         boot_s = timing.boot_s * self._chance.uniform(0.75, 1.25)
-        self.after(max(boot_s - timing.answer_s, 0.0), lambda: self._boot(vm))
+        fails = self._happens(timing.launch_fails)
+        self.after(
+            max(boot_s - timing.answer_s, 0.0),
+            lambda: self._forget(vm) if fails else self._boot(vm),
+        )
         if not place.spot and timing.on_demand_mttf_s:
             lives_s = self._chance.expovariate(1 / timing.on_demand_mttf_s)
             self.after(lives_s, lambda: self._lose(vm))
+
+    def _happens(self, share: float) -> bool:
+        return bool(share) and self._chance.random() < share
+
+    def _refusal(self, place: Placement) -> CloudError | None:
+        """Return why an order is refused; None where it is accepted."""
+        timing = self.market.timing
+        if not place.spot:
+            refused = self._happens(timing.on_demand_refused)
+            return NoCapacity(f"no capacity in `{place.location}`") if refused else None
+        if self._capacity.get(place.location, 0) <= len(self._spot_machines(place.location)):
+            return NoCapacity(f"no capacity in `{place.location}`")
+        region = place.domains[1]
+        spot = crowding(vm.order.placement for vm in self.vms.values() if vm.order.placement.spot)
+        if timing.spot_quota and spot[region] >= timing.spot_quota:
+            return QuotaExceeded(f"no more spot machines in `{region}`")
+        return None
 
     def terminate(self, id: ReplicaId) -> None:
         """End a machine at once."""

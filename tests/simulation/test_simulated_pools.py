@@ -21,7 +21,7 @@ from fogft.simulation.comparison import (
 from fogft.simulation.market import Market
 from fogft.simulation.model import MarketModel, Timing, moving, staying
 from fogft.simulation.report import simulate
-from fogft.simulation.timeline import UNLIMITED, of_changes, of_samples
+from fogft.simulation.timeline import PER_USD, UNLIMITED, of_changes, of_samples
 from fogft.simulation.world import World
 from tests.needs import needs
 from tests.nightly import by_day
@@ -245,6 +245,69 @@ def test_an_on_demand_machine_may_fail():
     outcome = run(wanted, "one on-demand")[1].outcome()
     assert outcome.preemptions > 2
     assert 0.98 < outcome.available < 1.0
+
+
+def test_refused_on_demand_machines_are_asked_for_again():
+    wanted = scenario(spec(1), days=1.0, timing=Timing(on_demand_refused=0.5))
+    outcomes = [run(wanted, "one on-demand", seed)[1].outcome() for seed in range(8)]
+    assert all(outcome.available == 1.0 for outcome in outcomes)  # after the first hour
+    lost = scenario(
+        spec(1), days=9.0, timing=Timing(on_demand_mttf_s=3600.0, on_demand_refused=0.5)
+    )
+    outcome = run(lost, "one on-demand")[1].outcome()
+    assert outcome.refusals > outcome.launches / 2
+
+
+@pytest.mark.parametrize("policy", ["fogft", "naive"])
+def test_machines_that_were_accepted_and_never_serve_are_replaced(policy):
+    pool = spec(2, on_demand=OnDemandSpec(fallback=True))
+    usual = scenario(pool, days=5.0)
+    failing = replace(usual, timing=Timing(launch_fails=0.5))
+    good, bad = (run(one, policy)[1].outcome() for one in (usual, failing))
+    assert bad.launches > 1.5 * good.launches
+    assert bad.under_target > good.under_target
+    assert bad.available > 0.98
+
+
+@pytest.mark.parametrize("policy", ["fogft", "naive"])
+def test_no_region_has_more_spot_machines_than_the_quota(policy):
+    """Room everywhere, six wanted, and one in each of the local cloud's regions."""
+    pool = spec(6, on_demand=OnDemandSpec(fallback=True))
+    wanted = always(scenario(pool, days=0.2, timing=Timing(spot_quota=1.0)))
+    chosen, _ = run(wanted, policy)
+    spot = [vm.order.placement for vm in chosen.world.vms.values() if vm.order.placement.spot]
+    regions = {place.domains[1] for place in spot}
+    assert len(regions) == len(spot) > 1
+
+
+def test_machines_cost_what_the_hour_costs():
+    """From hour 13 on all spot prices are the double: so is the bill."""
+    steady = always(scenario(spec(2, migration=None), days=1.0))
+    offers = steady.find({"use_spot": True})
+    prices = {
+        offer.placement.location: of_changes(
+            [(0, round(PER_USD * usd)), (13 * HOUR_S, round(2 * PER_USD * usd))], 26 * HOUR_S
+        )
+        for offer in offers
+        for usd in [offer.usd_per_hour]
+    }
+    before = run(steady)[1].outcome().usd_per_hour
+    assert run(replace(steady, prices=prices))[1].outcome().usd_per_hour == pytest.approx(
+        1.5 * before, rel=0.01
+    )
+
+
+def test_a_replica_leaves_a_location_that_has_become_dear():
+    """It moves once it has stayed for an hour."""
+    steady = always(scenario(spec(1), days=1.0))
+    chosen, _ = run(steady)
+    [here] = [vm.order.placement for vm in chosen.world.vms.values()]
+    usd = min(o.usd_per_hour for o in steady.find({"use_spot": True}) if o.placement == here)
+    risen = of_changes(
+        [(0, round(PER_USD * usd)), (6 * HOUR_S, round(3 * PER_USD * usd))], 26 * HOUR_S
+    )
+    moved, _ = run(replace(steady, prices={here.location: risen}))
+    assert [vm.order.placement.location for vm in moved.world.vms.values()] != [here.location]
 
 
 def test_recorded_traces_shorter_than_asked_are_used_whole():
