@@ -251,10 +251,8 @@ def test_refused_on_demand_machines_are_asked_for_again():
     wanted = scenario(spec(1), days=1.0, timing=Timing(on_demand_refused=0.5))
     outcomes = [run(wanted, "one on-demand", seed)[1].outcome() for seed in range(8)]
     assert all(outcome.available == 1.0 for outcome in outcomes)  # after the first hour
-    lost = scenario(
-        spec(1), days=9.0, timing=Timing(on_demand_mttf_s=3600.0, on_demand_refused=0.5)
-    )
-    outcome = run(lost, "one on-demand")[1].outcome()
+    often = Timing(on_demand_mttf_s=3600.0, on_demand_refused=0.5)
+    outcome = run(scenario(spec(1), days=9.0, timing=often), "one on-demand")[1].outcome()
     assert outcome.refusals > outcome.launches / 2
 
 
@@ -264,17 +262,16 @@ def test_machines_that_were_accepted_and_never_serve_are_replaced(policy):
     usual = scenario(pool, days=5.0)
     failing = replace(usual, timing=Timing(launch_fails=0.5))
     good, bad = (run(one, policy)[1].outcome() for one in (usual, failing))
-    assert bad.launches > 1.5 * good.launches
+    assert bad.launches > 1.2 * good.launches
     assert bad.under_target > good.under_target
     assert bad.available > 0.98
 
 
-@pytest.mark.parametrize("policy", ["fogft", "naive"])
-def test_no_region_has_more_spot_machines_than_the_quota(policy):
+def test_no_region_has_more_spot_machines_than_the_quota():
     """Room everywhere, six wanted, and one in each of the local cloud's regions."""
     pool = spec(6, on_demand=OnDemandSpec(fallback=True))
     wanted = always(scenario(pool, days=0.2, timing=Timing(spot_quota=1.0)))
-    chosen, _ = run(wanted, policy)
+    chosen, _ = run(wanted)
     spot = [vm.order.placement for vm in chosen.world.vms.values() if vm.order.placement.spot]
     regions = {place.domains[1] for place in spot}
     assert len(regions) == len(spot) > 1
