@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from enum import Enum
 from typing import Any
 
@@ -149,7 +149,7 @@ def from_content(content: Any) -> Membership:
     return membership
 
 
-def checksum(content: Mapping[str, Any]) -> str:
-    """Return what a membership's JSON form is checked by."""
+def checksum(content: Any) -> str:
+    """Return what stored JSON data, such as a membership's, is checked by."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]

@@ -9,6 +9,7 @@ definitions; `rmw_validate_full_topic_name` and rosidl's own patterns.
 from __future__ import annotations
 
 import re
+from functools import partial
 
 from fogft.model.keys import only
 
@@ -45,21 +46,6 @@ def is_below(name: str, namespace: str) -> bool:
     return name.startswith(namespace.rstrip("/") + "/")
 
 
-def is_service_type(name: str) -> bool:
-    """Whether this has the form ``package/srv/Name``."""
-    return _is_type(name, "srv")
-
-
-def is_message_type(name: str) -> bool:
-    """Whether this has the form ``package/msg/Name``."""
-    return _is_type(name, "msg")
-
-
-def is_action_type(name: str) -> bool:
-    """Whether this has the form ``package/action/Name``."""
-    return _is_type(name, "action")
-
-
 def _is_type(name: str, kind: str) -> bool:
     parts = name.split("/")
     return (
@@ -68,6 +54,11 @@ def _is_type(name: str, kind: str) -> bool:
         and parts[1] == kind
         and bool(_INTERFACE.fullmatch(parts[2]))
     )
+
+
+is_service_type = partial(_is_type, kind="srv")  # ``package/srv/Name``
+is_message_type = partial(_is_type, kind="msg")
+is_action_type = partial(_is_type, kind="action")
 
 
 # Every node has these: parameters, loggers, its types, its life cycle.

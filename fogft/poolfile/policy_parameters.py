@@ -6,7 +6,7 @@ pool file could not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -15,7 +15,7 @@ from fogft.model.keys import LONGEST_S, keys_of
 from fogft.model.plain import to_plain
 from fogft.model.spec import OnTimeout, Part, ServiceSpec
 from fogft.poolfile.reader import ADVANCED, Reader
-from fogft.poolfile.rules import RULES
+from fogft.poolfile.rules import NOT_WITH_QUORUM, NOT_WITH_STATE, RULES
 from fogft.poolfile.tree import Section, tree
 
 Value: TypeAlias = "bool | float | str"
@@ -23,8 +23,6 @@ FieldCheck: TypeAlias = "Callable[[str, str], str | None]"  # of a type and a bo
 
 KEYS = tuple(entry.name for entry in keys_of(ServiceSpec) if entry.key.parameter)
 _ADVANCED = frozenset(entry.name for entry in keys_of(ServiceSpec) if entry.key.advanced)
-_NOT_WITH_STATE = frozenset({"hedging", "ok_field", "trace"})
-_NOT_WITH_QUORUM = frozenset({"hedging", "ok_field"})
 
 
 def prefix(service: str) -> str:
@@ -36,9 +34,9 @@ def shown(spec: ServiceSpec) -> dict[str, Value]:
     """Return a service's policy by key, as parameters show it."""
     if spec.part is not Part.NONE:
         return {"timeout_s": spec.timeout_s}
-    unfit: frozenset[str] = _NOT_WITH_QUORUM if spec.quorum > 1 else frozenset()
+    unfit: Sequence[str] = NOT_WITH_QUORUM if spec.quorum > 1 else ()
     if spec.state is not None:
-        unfit = _NOT_WITH_STATE
+        unfit = NOT_WITH_STATE
     values = {key: getattr(spec, key) for key in KEYS if key not in unfit}
     values["advertise"] = spec.advertised
     return {key: getattr(value, "value", value) for key, value in values.items()}

@@ -25,6 +25,8 @@ from fogft.model.topology import Topology, find_loop
 from fogft.poolfile.tree import Section, shown
 
 DAY_END_S = 86_400
+NOT_WITH_QUORUM = ("ok_field", "hedging", "cancel")
+NOT_WITH_STATE = (*NOT_WITH_QUORUM, "concurrency", "quorum", "trace")
 _LAST_REPLICA_PORT = 65535 - FIRST_BY_HAND
 
 
@@ -50,7 +52,7 @@ def _stateful(section: Section, made: ServiceSpec) -> None:
     if made.state is None:
         return
     what = "does not go with `state`: every replica applies every request"
-    _apart(section, made, ("ok_field", "hedging", "concurrency", "cancel", "quorum", "trace"), what)
+    _apart(section, made, NOT_WITH_STATE, what)
     for key, value in (("freshness", "latest"), ("advertise", Advertise.WHILE_READY.value)):
         chosen = getattr(made, key)
         if chosen is not None and chosen.value == value:
@@ -67,7 +69,7 @@ def _with_quorum(section: Section, made: ServiceSpec) -> None:
         raise section.error("tolerance", what, "write `quorum: 2`, or remove it")
     if section.has("quorum"):
         what = "does not go with `quorum`: every replica is asked, and every answer counts"
-        _apart(section, made, ("ok_field", "hedging", "cancel"), what)
+        _apart(section, made, NOT_WITH_QUORUM, what)
 
 
 def _apart(section: Section, made: ServiceSpec, keys: Sequence[str], what: str) -> None:

@@ -8,8 +8,6 @@ Owns: the file. Not here: when it is written, and what stands in a record.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
+from fogft.model.membership import checksum
 from fogft.model.plain import stored
 from fogft.records.record import RecordError, SignedRecord, from_plain, to_plain
 from fogft.records.record_set import RecordSet
@@ -38,7 +37,7 @@ class _File:
 def write(path: Path, records: Sequence[SignedRecord], *, durable: bool = True) -> None:
     """Replace the file."""
     content = [to_plain(one) for one in records]
-    whole = {"version": VERSION, "checksum": _checksum(content), "records": content}
+    whole = {"version": VERSION, "checksum": checksum(content), "records": content}
     disk.write_json(path, whole, durable=durable)
 
 
@@ -55,7 +54,7 @@ def read(path: Path) -> list[SignedRecord]:
     if read.version != VERSION:
         raise StateError(f"`{path}` is of version {read.version}, not {VERSION}")
     try:
-        if read.checksum != _checksum(read.records):
+        if read.checksum != checksum(read.records):
             raise StateError(f"`{path}` is damaged: its checksum is wrong")
         return [from_plain(one) for one in read.records]
     except (RecursionError, RecordError) as error:
@@ -76,8 +75,3 @@ def restore(path: Path, records: RecordSet, ca: Path) -> bool:
     for one in known:
         records.restore(one, any_time)
     return True
-
-
-def _checksum(content: Any) -> str:
-    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
