@@ -15,6 +15,7 @@ from fogft import disk
 from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption, Slot
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from fogft.pool.folder.store import PoolStore
@@ -52,7 +53,7 @@ def drain(slot: Slot, wait: Wait = False, pool: PoolOption = None) -> None:
     The old one finishes its requests and is then ended.
     """
     from fogft.cli import progress
-    from fogft.pool.commands import change, composition
+    from fogft.pool.commands import change
     from fogft.pool.commands.outcome import Settled
 
     store = composition.store_of(pool)
@@ -79,7 +80,7 @@ def exclude(
     pool: PoolOption = None,
 ) -> None:
     """Stop using a location, and move replicas out of it."""
-    from fogft.pool.commands import change, composition
+    from fogft.pool.commands import change
 
     store = composition.store_of(pool)
     is_new = change.exclude(store, location, composition.cloud_of(store.identity()))
@@ -98,7 +99,7 @@ def include(
     pool: PoolOption = None,
 ) -> None:
     """Allow an excluded location again."""
-    from fogft.pool.commands import change, composition
+    from fogft.pool.commands import change
 
     store = composition.store_of(pool)
     change.include(store, location)
@@ -108,7 +109,7 @@ def include(
 
 def retry(pool: PoolOption = None) -> None:
     """Launch replicas again after a pool file was given up."""
-    from fogft.pool.commands import change, composition
+    from fogft.pool.commands import change
 
     store = composition.store_of(pool)
     change.retry(store, time.time())
@@ -118,7 +119,7 @@ def retry(pool: PoolOption = None) -> None:
 
 def _scale(pool: str | None, by: int, *, wait: bool) -> None:
     from fogft.cli import progress
-    from fogft.pool.commands import change, composition
+    from fogft.pool.commands import change
     from fogft.pool.commands.outcome import Settled
 
     store = composition.store_of(pool)

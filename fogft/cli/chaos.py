@@ -10,6 +10,7 @@ from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption, Slot
 from fogft.errors import FogftError, known_slots
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from fogft.cloud.local.chaos import Chaos
@@ -131,13 +132,11 @@ def clear() -> None:
 
 def _chaos() -> Chaos:
     from fogft.cloud.local.chaos import Chaos
-    from fogft.pool.commands import composition
 
     return Chaos(composition.local_root())
 
 
 def _machine(pool: str | None, slot: int) -> ReplicaId:
-    from fogft.pool.commands import composition
 
     identity = composition.store_of(pool).identity()
     machines = composition.cloud_of(identity).machines(identity.uid)

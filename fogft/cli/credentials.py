@@ -17,7 +17,9 @@ from fogft import disk
 from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolOption
+from fogft.cli.status_text import utc
 from fogft.errors import CredentialError, FogftError
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from fogft.model.credentials import Holder, Role
@@ -60,7 +62,6 @@ def issue(
     file.
     """
     from fogft.model.credentials import Role
-    from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import issue_credentials
     from fogft.pool.credentials.bundle import new_passphrase
 
@@ -85,9 +86,7 @@ def list_(
     pool: PoolOption = None,
 ) -> None:
     """List the certificates that the pool's CA has issued, without their keys."""
-    from fogft.cli.status_text import utc
     from fogft.cli.table import table
-    from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import certificates
 
     now = time.time()
@@ -115,7 +114,6 @@ def revoke(
 
     A replica whose certificate is revoked is replaced.
     """
-    from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import revoke_credentials
 
     holders, told = revoke_credentials(composition.store_of(pool), _role(role), name)
@@ -144,7 +142,6 @@ def rotate(
     machine, issue a new bundle, join there, and revoke the old generation.
     """
     from fogft.model.credentials import Role
-    from fogft.pool.commands import composition
     from fogft.pool.commands.credentials import rotate_replicas, rotate_robot
 
     store, which = composition.store_of(pool), _role(role)
@@ -220,7 +217,7 @@ def export(
     This machine manages it no more; only `fogft import` makes it manageable again, here or there.
     Replicas and this machine's client proxy go on answering.
     """
-    from fogft.pool.commands import composition, moving
+    from fogft.pool.commands import moving
     from fogft.pool.credentials.bundle import new_passphrase
     from fogft.pool.folder.paths import home
 

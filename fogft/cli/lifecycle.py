@@ -13,6 +13,7 @@ from fogft import __version__
 from fogft.cli import options, output
 from fogft.cli.options import DEFAULT_FILE, Cloud, PoolArgument, PoolFile, PoolOption, Yes
 from fogft.errors import FogftError
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from fogft.pool.commands.status import Seen
@@ -146,7 +147,7 @@ def services_at_fault(status: PoolStatus) -> list[str]:
 def not_answering(seen: Seen, what: str) -> FogftError:
     """Return the error of an `up` that failed, with all that is known of the reason."""
     from fogft import logfile
-    from fogft.pool.commands import composition, logs
+    from fogft.pool.commands import logs
     from fogft.pool.commands.outcome import is_given_up
 
     status = seen.status
@@ -177,7 +178,6 @@ def down(
     Works even if the manager is dead, and is safe to repeat. Of a pool that was exported, ends
     only what this machine still runs.
     """
-    from fogft.pool.commands import composition
     from fogft.pool.manager import shutdown
     from fogft.ros import shared_memory
 

@@ -11,6 +11,8 @@ from typing import Annotated
 
 import typer
 
+from fogft.pool.commands import composition
+
 
 def _offer(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """Return a completion that offers what is known and begins as typed."""
@@ -25,7 +27,6 @@ def _offer(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
 
 
 def _pools() -> list[str]:
-    from fogft.pool.commands import composition
 
     return composition.pools()
 
@@ -48,7 +49,6 @@ def _locations() -> list[str]:
 
 
 def _excluded() -> list[str]:
-    from fogft.pool.commands import composition
 
     return sorted({x for p in _pools() for x in composition.make_store(p).intent().excluded})
 

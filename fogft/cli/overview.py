@@ -12,7 +12,9 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import AsJson, PoolArgument, PoolOption
+from fogft.cli.status_text import age, price
 from fogft.errors import PoolNotFound, StateError
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -26,9 +28,7 @@ _ANSWERS = {True: ("yes", "green"), False: ("no", "bold red"), None: ("?", "yell
 
 def list(as_json: AsJson = False) -> None:
     """List the pools on this machine."""
-    from fogft.cli.status_text import age, price
     from fogft.cli.table import table
-    from fogft.pool.commands import composition
     from fogft.pool.commands.status import every
 
     found: dict[str, dict[str, Any]] = {}
@@ -84,7 +84,6 @@ def events(
     """
     from fogft.cli.table import table
     from fogft.model.plain import to_plain
-    from fogft.pool.commands import composition
 
     store = composition.store_of(pool or named)
     if as_json:

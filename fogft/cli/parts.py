@@ -13,6 +13,7 @@ import typer
 from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from fogft.pool.commands.service import Unit
@@ -112,7 +113,6 @@ def manager(
     ] = False,
 ) -> None:
     """Run a pool's manager: it observes the pool, plans and launches."""
-    from fogft.pool.commands import composition
     from fogft.pool.manager.manager import run
 
     run(
@@ -163,7 +163,6 @@ service = group("Have systemd start what a pool needs at boot, and restart it.")
 def _units(
     pool: str | None, gateway: Path | None, rendezvous: Path | None, *, system: bool
 ) -> list[Unit]:
-    from fogft.pool.commands import composition
     from fogft.pool.commands import service as units
 
     if gateway is not None:
@@ -185,7 +184,6 @@ def install(
 
     They get the present environment: source ROS 2 first. What runs already hands over.
     """
-    from fogft.pool.commands import composition
     from fogft.pool.commands import service as units
 
     where = units.services(system=system)

@@ -13,8 +13,9 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from fogft import __version__, logfile
-from fogft.cli import output
+from fogft.cli import output, status_text
 from fogft.errors import FogftError
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from fogft.model.spec import PoolSpec
@@ -135,7 +136,6 @@ def settle(store: PoolStore, settled: Settled, what: str) -> None:
     Raises:
         FogftError: It is not within the time that an `up` waits, or there is no manager.
     """
-    from fogft.pool.commands import composition
     from fogft.pool.commands.outcome import Outcome
 
     is_local = store.identity().cloud == composition.LOCAL
@@ -155,7 +155,6 @@ def _shown() -> Iterator[Callable[[Seen], None]]:
     if not output.is_terminal(sys.stderr):
         yield PhaseLines(output.say)
         return
-    from fogft.cli import status_text
 
     width = output.width(sys.stderr)
     with output.redrawn(sys.stderr) as show:

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fogft import __version__
-from fogft.cli import options, output
+from fogft.cli import options, output, status_text
 from fogft.cli.options import PoolArgument, PoolOption
+from fogft.cli.status_text import age
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -59,8 +61,6 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
         output.json_data(status_schema())
         return
     pool = pool or named
-    from fogft.cli import status_text
-    from fogft.pool.commands import composition
     from fogft.pool.commands.status import checked, read, refreshed
 
     paths = composition.paths_of(pool)
@@ -79,7 +79,6 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
 
 
 def _watch(paths: PoolPaths, *, as_json: bool) -> None:
-    from fogft.cli import status_text
     from fogft.pool.commands.status import read
 
     def looks() -> Iterator[Seen]:
@@ -105,8 +104,6 @@ def _remark(seen: Seen) -> None:
             f"restart it with `fogft up {seen.status.file}`, or remove it with `fogft down`"
         )
     elif not seen.manager_alive:
-        from fogft.cli.status_text import age
-
         goes_on = "requests continue, but lost replicas are not replaced"
         if seen.lease_left_s is not None:
             goes_on += f", and the others shut down in {age(seen.lease_left_s)}"
@@ -147,7 +144,6 @@ def logs(
     Each line starts with the name of its log: `manager`, `proxy` or `slot.generation`.
     """
     from fogft.cli.status import Tail, in_order
-    from fogft.pool.commands import composition
     from fogft.pool.commands.logs import find
 
     slot = int(of) if of is not None and of.isdecimal() else None

@@ -10,6 +10,7 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import Yes
+from fogft.cli.status_text import age, price
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
@@ -64,7 +65,6 @@ def sweep(
 
 
 def _show(found: Swept) -> None:
-    from fogft.cli.status_text import age, price
     from fogft.cli.table import table
 
     if found.cloud == "sky":

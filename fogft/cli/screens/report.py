@@ -14,7 +14,9 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import PoolArgument, PoolOption
+from fogft.cli.status_text import milliseconds, utc
 from fogft.errors import FogftError
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from fogft.planning.observed.history import Event
@@ -41,7 +43,6 @@ def report(
 
     From the manager's own history, which keeps old events only while a decision needs them.
     """
-    from fogft.pool.commands import composition
     from fogft.simulation.plot import needs_matplotlib
 
     needs_matplotlib()
@@ -58,7 +59,6 @@ def _page(store: Any, now: float) -> str:
     import sys
 
     from fogft.cli.overview import event_rows
-    from fogft.cli.status_text import milliseconds, utc
     from fogft.pool.commands.status import read
     from fogft.pool.folder.costs import read_all
     from fogft.pool.folder.paths import home

@@ -8,8 +8,9 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from fogft.cli import output
+from fogft.cli import output, status_text
 from fogft.cli.options import PoolArgument, PoolOption
+from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -31,7 +32,6 @@ def top(pool: PoolArgument = None, named: PoolOption = None) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from fogft.pool.commands import composition
     from fogft.pool.commands.status import read
 
     store = composition.store_of(pool or named)
@@ -67,7 +67,6 @@ def _screen(
 ) -> RenderableType:
     from rich.console import Group
 
-    from fogft.cli import status_text
     from fogft.cli.overview import event_rows
     from fogft.cli.table import table
 
