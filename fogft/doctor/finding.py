@@ -23,8 +23,6 @@ class Finding:
     """One thing that was looked at.
 
     Attributes:
-        check: What was looked at, in one or two words.
-        text: What was found.
         advice: What to do; empty when there is nothing to do.
     """
 
@@ -39,10 +37,7 @@ class Situation:
     """What the checks may look at.
 
     Attributes:
-        home: fogft's state folder.
-        pools: Names of the pools in it.
         spec: The pool file asked about, if any.
-        now: Seconds since the epoch, by this machine's clock.
     """
 
     home: Path

@@ -135,7 +135,6 @@ class Machine:
         endpoint: ``host:port`` where the server proxy listens, once known.
         notice: A preemption notice was given: the machine ends soon.
         spec_hash: `PoolSpec.replica_hash` at its launch; another one means outdated.
-        launched_at: Seconds since the epoch.
         failure: Why the phase is FAILED, with the cloud's words (a log's last lines after a
             line break); None otherwise.
         progress: What the cloud says is being done there until it serves, for people.
@@ -251,7 +250,6 @@ class Observed:
     """All that a plan depends on besides the spec: the world as seen at `now`.
 
     Attributes:
-        now: Seconds since the epoch.
         machines: The cloud's own list; None when the cloud could not tell.
         links: What the client proxy reports; None when there is no fresh report.
         offers: What can be bought now, in any order.

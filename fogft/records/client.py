@@ -42,9 +42,7 @@ class Known:
     """What is known at one moment. Immutable, so any thread may read it.
 
     Attributes:
-        connected: How many rendezvous are connected.
         seen_host: Our own address, as a rendezvous saw it; empty if none did.
-        revoked: Common names of certificates that are good no more.
     """
 
     records: tuple[Record, ...] = ()

@@ -80,7 +80,6 @@ class Record:
         generation: The slot's, the manager's epoch, or that of the robot's or gateway's
             certificate.
         sequence: Counts what the writer wrote within a generation.
-        content: Plain JSON data; `roster` knows what it means.
     """
 
     pool_uid: PoolUid
@@ -106,8 +105,6 @@ class SignedRecord:
     """A record as it travels and is kept.
 
     Attributes:
-        body: The record's bytes, as its writer signed them.
-        certificate: The writer's certificate (DER).
         signature: Over `signed_bytes(body)`, with that certificate's key (DER).
     """
 
@@ -121,7 +118,6 @@ class Writer:
     """Who signed something, by a certificate that was found to be good.
 
     Attributes:
-        role: ``manager``, ``replica``, ``robot``, ``gateway``, ``rendezvous``.
         common_name: From `model.names`.
         serial: The certificate's serial number, lower-case hexadecimal.
     """

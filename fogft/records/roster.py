@@ -33,8 +33,6 @@ class SlotState:
         endpoint: ``host:port`` where it can be reached, as it was told; empty if it was not.
         observed_endpoint: The same as a rendezvous saw it: only a guess.
         dials_out: It cannot be reached: it dials robots and gateways itself.
-        services: Names of the services that it can answer now.
-        draining: It asked to be left alone.
     """
 
     endpoint: EndpointOrEmpty = ""

@@ -50,7 +50,6 @@ class Joined:
 
     Attributes:
         config: The configuration to start with: ``fogft <command> --config <config>``.
-        command: ``proxy``, ``serve``, ``gateway`` or ``rendezvous``.
         alone: No rendezvous tells it of what changes, nor told whether it is the first to join.
     """
 

@@ -34,13 +34,10 @@ class PlanShown:
     """A plan with what it rests on.
 
     Attributes:
-        now: Seconds since the epoch.
         cloud: The adapter or the table that the prices are from.
         distances: ``cloud/region`` -> how far it is, and how that is known.
         traffic: Service name -> what its client proxy counted, where the file says nothing.
-        notes: What may surprise, besides the plan's own notes.
         ready_p90_s: By when nine in ten of this pool's launches were ready; None for too few.
-        launches: How many of them there were.
     """
 
     spec: PoolSpec
@@ -166,7 +163,6 @@ class Measured:
 
     Attributes:
         over_s: For how long, in seconds.
-        requests: How many came meanwhile.
     """
 
     traffic: TrafficSpec

@@ -40,7 +40,6 @@ class Preview:
     """What applying a pool file would do.
 
     Attributes:
-        wanted: Replicas wanted now: the file's number, or what follows from it.
         launches: Of a new pool; by slot. Of one that exists: what it would get if it were new.
         observed_at: When the launches' prices were asked for, in seconds since the epoch.
         costs_money: Its machines are paid for: nothing is ordered unasked.
@@ -48,7 +47,6 @@ class Preview:
         changes: Of a pool that exists: what the file now says otherwise, in words.
         new_before_old: The budget has room for a replica and its successor at once.
         rolled_back: Why this very file was given up before; empty where it was not.
-        notes: What may surprise: fewer placements than replicas, no prices now.
     """
 
     spec: PoolSpec

@@ -45,7 +45,6 @@ class Seen:
 
     Attributes:
         age_s: Since the manager observed the pool; None when it has not yet.
-        manager_alive: Whether a manager runs now.
         report_age_s: Since the client proxy reported its links; None for no report.
         links_known: Whether that is recent, and the client proxy runs now.
         answers: Whether a request to each service would be answered now; None for unknown.

@@ -30,7 +30,6 @@ class Unowned:
     """A machine that nobody looks after.
 
     Attributes:
-        why: Why it is nobody's, in words.
         known: Its pool's folder is here.
     """
 

@@ -32,9 +32,7 @@ class Identity:
     """What a pool is, for good.
 
     Attributes:
-        uid: 16 random hexadecimal digits.
         file: Absolute path of the pool file.
-        created_at: Seconds since the epoch.
     """
 
     name: str

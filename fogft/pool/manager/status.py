@@ -48,21 +48,17 @@ WORDS = {
 
 @dataclass(frozen=True)
 class ReplicaStatus:
-    """One replica. Ages and durations in seconds; None for unknown.
+    """One replica, with what `LinkReport` says of it. Ages and durations in seconds; None: unknown.
 
     Attributes:
         link: ``connecting``, ``up`` or ``suspect``; empty when there is no link.
         verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
             ``at risk``.
         age_s: Since its launch; None where that was somebody else's.
-        differs: The type of a service is not the same there as here; `detail` says how.
-        differing: The services of such types.
         reason: Why the verdict is not ``good``, as ``{cause, ...}``; None when it is.
         known: Whether `phase` and `link` are known now; else `phase` is what was last seen.
         has_served: Whether it was ready before: one that is ``starting`` then has lost its
             service, or cannot be reached.
-        lease_left_s: Until it shuts down unless it hears of the manager again.
-        version: Of fogft on the replica; empty where it is not known.
         provisioning_s: From its order until the machine ran; then `setup_s` until `setup` was done
             and `starting_s` until it was ready. None where it is not known, or not over.
         ready_after_s: From its order until it was ready for the first time.
@@ -175,9 +171,7 @@ class UpdateStatus:
     Attributes:
         state: ``in progress``, ``stopped`` or ``rolled back``.
         done: Replicas of the version that is wanted now which serve.
-        of: How many are wanted.
         fault: Why it was given up, in words; empty while it was not.
-        reason: The same as ``{cause, ...}``.
     """
 
     state: str
@@ -192,7 +186,6 @@ class EventStatus:
     """Something that happened.
 
     Attributes:
-        at: Seconds since the epoch.
         event: In a word or three; see `WORDS`.
         replica: ``slot.generation``; empty for what is of no replica.
         detail: Why, in words; `reason` is the same as ``{cause, ...}``.
@@ -245,11 +238,9 @@ class PoolStatus:
     """The whole pool.
 
     Attributes:
-        observed_at: Seconds since the epoch.
         cloud_reachable: Whether the cloud could say what exists; if not, `replicas` is
             what was seen last and `ready` is 0.
         by_hand: Replicas that people started themselves, beside those of `replicas`.
-        target: Replicas wanted now.
         ready: Replicas whose services answer and that are to stay.
         credentials_end_at: When the cloud's credentials end, in seconds since the epoch; None where
             no end is known.
@@ -260,10 +251,8 @@ class PoolStatus:
         version: Of this schema; see `fogft.pool.commands.status_schema`.
         topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
             how this machine's robot finds its gateways; empty where there are none.
-        events: The last things that happened.
         applied: Digest of the pool file that was applied last.
         manager_version: Of fogft, by which the manager runs; empty before 0.2.0.
-        proxy_version: The same of the client proxy.
     """
 
     pool: str

@@ -25,7 +25,6 @@ class Known:
     """What is remembered of a pool's machines, for when its cloud does not answer.
 
     Attributes:
-        pool: Its name.
         running: Replicas that were launched and have not ended as far as was seen, in words.
         clouds: Where any were ever launched.
         unmanaged_max_hours: When replicas without a manager end by themselves; None if not known.
