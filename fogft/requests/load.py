@@ -92,12 +92,6 @@ class ReplicaLoad:
         ended_at: When it last ended an attempt, with an answer or too late for one.
     """
 
-    __slots__ = (
-        *("_at_work", "_avoided_s", "_avoided_until", "_delay_holds_until", "_delay_s"),
-        *("_others", "_others_until", "_rtt_s"),
-        *("_service_s", "_slots", "asked_at", "doubted", "ended_at", "latencies"),
-    )
-
     def __init__(self) -> None:
         self.latencies = Latencies()
         self.doubted = False

@@ -45,8 +45,6 @@ _ONE_DEATH_S = 1.0
 class _Open:
     """A goal that has no answer yet."""
 
-    __slots__ = ("begun_at", "holds", "payload", "size", "ticket", "unheard", "waiting")
-
     def __init__(self, payload: bytes) -> None:
         self.payload = payload
         self.size = len(payload)

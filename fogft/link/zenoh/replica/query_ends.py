@@ -48,8 +48,6 @@ class QueryEnd:
         refusal: What is said before; empty for nothing.
     """
 
-    __slots__ = ("_ended", "query", "refusal", "turn")
-
     def __init__(self, query: zenoh.Query, turn: int) -> None:
         self.query = query
         self.turn = turn

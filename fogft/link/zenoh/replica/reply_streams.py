@@ -136,8 +136,6 @@ LIMIT = 1024  # a replica has 128 sessions; the others are those of connections 
 class Stream:
     """One connection's open query, with `ReplyCredit`'s methods for that connection. Any thread."""
 
-    __slots__ = ("query", "seen", "send", "send_at_once")
-
     def __init__(self, query: zenoh.Query, credit: ReplyCredit | None = None) -> None:
         self.query = query
         credit = credit or ReplyCredit()
