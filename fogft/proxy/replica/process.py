@@ -86,6 +86,8 @@ def run(
         stop.set()
 
     signal.signal(signal.SIGTERM, end)
+    died = threading.Event()
+    signal.signal(signal.SIGCHLD, lambda *_: died.set())
     middleware.prepare(config.rmw)
     traced = frozenset(service.name for service in config.services if service.trace)
     spans = wanted("fogft-replica", config.pool) if traced else None
@@ -106,13 +108,13 @@ def run(
         scrape.at(config.metrics)
         presence = Presence(config, proxy.endpoint)
         start.settle()
-        _loop(config, proxy, presence, stop)
+        _loop(config, proxy, presence, stop, died)
         if machine_ends.is_set() and watching is not None and watching.silent:
             # No other notice exists on RunPod, Vast and others: this is theirs, and it is short.
             proxy.noticed(Notice(NoticeKind.PREEMPTION, None, "signal", "SIGTERM"))
             log.warning("notice_received kind=preemption source=signal ends_in_s=%.0f", _LEAVE_S)
             stop.clear()
-            _loop(config, proxy, presence, stop, time.monotonic() + _LEAVE_S)
+            _loop(config, proxy, presence, stop, died, time.monotonic() + _LEAVE_S)
     finally:
         scrape.close()
         if presence is not None:
@@ -178,10 +180,14 @@ def _loop(
     proxy: ServerProxy,
     presence: Presence,
     stop: threading.Event,
+    died: threading.Event,
     until: float = math.inf,
 ) -> None:
     memory = memory_tuning.Trimmer()
-    while time.monotonic() < until and not stop.wait(_IDLE_TICK_S if proxy.idle else _TICK_S):
+    while time.monotonic() < until and not stop.is_set():
+        # A death is told before robots hedge what has caused it at the next replica.
+        died.wait(_IDLE_TICK_S if proxy.idle else _TICK_S)
+        died.clear()
         proxy.run_once()
         memory.look()
         known = presence.look(proxy.ready, draining=proxy.draining)
