@@ -108,13 +108,13 @@ def run(
         scrape.at(config.metrics)
         presence = Presence(config, proxy.endpoint)
         start.settle()
-        _loop(config, proxy, presence, stop, died)
+        _loop(proxy, presence, stop, died)
         if machine_ends.is_set() and watching is not None and watching.silent:
             # No other notice exists on RunPod, Vast and others: this is theirs, and it is short.
             proxy.noticed(Notice(NoticeKind.PREEMPTION, None, "signal", "SIGTERM"))
             log.warning("notice_received kind=preemption source=signal ends_in_s=%.0f", _LEAVE_S)
             stop.clear()
-            _loop(config, proxy, presence, stop, died, time.monotonic() + _LEAVE_S)
+            _loop(proxy, presence, stop, died, time.monotonic() + _LEAVE_S)
     finally:
         scrape.close()
         if presence is not None:
@@ -176,7 +176,6 @@ def run_environment(config: ServerProxyConfig) -> dict[str, str]:
 
 
 def _loop(
-    config: ServerProxyConfig,
     proxy: ServerProxy,
     presence: Presence,
     stop: threading.Event,
