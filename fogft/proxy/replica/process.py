@@ -109,6 +109,8 @@ def run(
         presence = Presence(config, proxy.endpoint)
         start.settle()
         _loop(proxy, presence, stop, died)
+        if proxy.lease_is_over:
+            log.error("lease_over replica=%s reason='no manager was heard of'", config.id)
         if machine_ends.is_set() and watching is not None and watching.silent:
             # No other notice exists on RunPod, Vast and others: this is theirs, and it is short.
             proxy.noticed(Notice(NoticeKind.PREEMPTION, None, "signal", "SIGTERM"))
@@ -193,5 +195,4 @@ def _loop(
         proxy.revoke(known.revoked)
         proxy.renew(known.of(RecordKind.LEASE))
         if proxy.lease_is_over:
-            log.error("lease_over replica=%s reason='no manager was heard of'", config.id)
             return
