@@ -1,4 +1,4 @@
-"""The page of dependencies names every dependency of pyproject.toml, and no other, with a reason."""
+"""The page of dependencies names each dependency of pyproject.toml, and no other."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ import re
 import pytest
 
 from tests.docs.documents import ROOT, table_rows
+from tests.needs import need
 
 
 @pytest.fixture
 def declared():
     """Return (who installs it, package) of each entry, read by a TOML parser."""
-    toml = pytest.importorskip("tomllib", reason="needs Python 3.11").loads(
-        (ROOT / "pyproject.toml").read_text()
-    )
+    need("tomllib", whole_file=False)
+    import tomllib
+
+    toml = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project = toml["project"]
     lists = {
         "building the wheel": toml["build-system"]["requires"],
