@@ -202,10 +202,10 @@ def test_a_robot_and_a_replica_one_minor_version_apart_work_together(parts, call
     replicas = [parts.replica(0), parts.replica(1)]
     parts.tree = ROOT if old == "replica" else before
     robot = parts.robot("robot", *replicas)
+    wait_for(lambda: robot.ready() == [0, 1], "both replicas")
     caller = call(robot)
     caller.ask(200)
     assert caller.all_answered()
-    assert robot.ready() == [0, 1]
 
 
 def test_a_proxy_ends_when_its_folder_is_gone(parts):
