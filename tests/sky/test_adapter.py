@@ -163,16 +163,18 @@ def test_a_launch_that_fails_after_the_vm_was_made_leaves_no_vm(scene: Scene):
     assert not scene.provider.found
 
 
-def test_a_failed_launch_whose_vm_cannot_be_ended_stays_listed(scene: Scene):
+def test_a_failed_launch_whose_end_skypilot_refuses_is_ended_by_the_provider_and_stays_listed(
+    scene: Scene,
+):
     scene.cloud.launch(scene.order())
     scene.sky.boot(NAME)
     scene.sky.down_fails = 99
     scene.sky.fail(NAME, "RuntimeError", "ray did not start")
     scene.work()
+    assert not scene.provider.found
     assert scene.machine().phase is MachinePhase.FAILED
     scene.sky.down_fails = 0
     scene.cloud.terminate(ID)
-    assert not scene.provider.found
     assert not scene.machines()
 
 

@@ -9,6 +9,7 @@ Not here: which replicas shall end (`fogft.planning.planner`).
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -61,6 +62,8 @@ class Ending:
             except (CloudUnreachable, RefusedError) as error:
                 trouble = error
                 log.warning("end_failed replica=%s reason=%r", id.short, str(error))
+                with contextlib.suppress(CloudUnreachable, RefusedError):
+                    self._left(id, name)  # what SkyPilot cannot end the provider may
                 continue
             quiet = 0 if left else quiet + 1
             if quiet >= enough:

@@ -1,7 +1,7 @@
 """The policy of docs/how-to/clouds.md, as the emulated AWS enforces it on whoever launches.
 
-Judged are an action's name, of `CreateTags` what is tagged, and of `TerminateInstances` whether
-what it ends carries our label. The VMs have the role's: `ec2:Describe*`, and `TerminateInstances`
+Judged are an action's name, of `CreateTags` what is tagged, and of what is about instances
+whether these carry our label. The VMs have the role's: `ec2:Describe*`, and `TerminateInstances`
 under the same condition. A test takes single permissions away.
 """
 
@@ -17,6 +17,7 @@ from typing import Any
 PAGE = Path(__file__).parents[3] / "docs/how-to/clouds.md"
 ANYBODY = ("sts:GetCallerIdentity",)  # needs no permission on AWS
 _ACCOUNT = "arn:aws:ec2:us-east-1:ACCOUNT:"
+_BESIDE_AN_INSTANCE = "arn:aws:ec2:*:ACCOUNT:security-group/*"
 _CONDITION = {"Null": {"aws:ResourceTag/fogft-pool": "false"}}
 OF_VMS: list[Mapping[str, Any]] = [
     {"Action": "ec2:Describe*"},
@@ -65,6 +66,8 @@ class Policy:
             tagged = f"{_ACCOUNT}{kind}/x"
             if kind and not any(fnmatchcase(tagged, one) for one in rule["Resource"]):
                 continue
+            if rule.get("Resource") == _BESIDE_AN_INSTANCE:
+                continue  # another statement judges the instance
             condition = rule.get("Condition")
             if condition is None:
                 return True
