@@ -181,10 +181,11 @@ def down(
     from fogft.pool.manager import shutdown
     from fogft.ros import shared_memory
 
-    if not (pool or named or composition.pools()):
+    name = pool or named
+    if not composition.pools() and not (name and composition.is_exported(name)):
         output.say("no pools on this machine")
         return
-    store = composition.store_of(pool or named)
+    store = composition.store_of(name)
     elsewhere = store.paths.exported.exists()
     paid = not elsewhere and store.identity().cloud != composition.LOCAL
     asks = paid and not yes and output.is_terminal(sys.stdin)

@@ -32,6 +32,11 @@ def pools() -> list[str]:
     return sorted(one.name for one in folders if PoolPaths(one).identity.exists())
 
 
+def is_exported(name: str) -> bool:
+    """Tell whether another machine manages a pool that this one managed."""
+    return PoolPaths.of(name).exported.exists()
+
+
 def paths_of(name: str | None = None) -> PoolPaths:
     """Return where the pool that is named is kept, else the only one there is.
 
@@ -42,7 +47,7 @@ def paths_of(name: str | None = None) -> PoolPaths:
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
         raise PoolNotFound(f"there are {len(known)} pools: {listed}", "say which one you mean")
-    if name is not None and name not in known and not PoolPaths.of(name).exported.exists():
+    if name is not None and name not in known and not is_exported(name):
         hint = f"there are: {listed}" if known else "start one with `fogft up FILE`"
         raise PoolNotFound(f"there is no pool `{name}`", hint)
     if name is None and not known:
