@@ -111,12 +111,6 @@ def _show(report: Report) -> None:
     else:
         costs = best.estimate("usd_per_hour").mean
         output.data(f"Cheapest for {percent(report.target)}: {best.name}, at ${costs:.4f}/h.")
-    if report.expected is not None:
-        moving, staying = (percent(report.expected[k]) for k in ("moving", "staying"))
-        output.data(
-            f"If replicas failed independently: {moving} with replacement elsewhere, "
-            f"{staying} where they stay."
-        )
 
 
 def _cells(row: Row) -> list[str | Text]:

@@ -252,7 +252,7 @@ class Buyer:
     def _price(self, replica: Assessment) -> float:
         """Return what a machine costs: as ordered, or more where its spot price has risen."""
         placement = replica.placement
-        return max(replica.machine.usd_per_hour, self._catalogue.prices.get(placement, 0.0))
+        return max(replica.machine.usd_per_hour, self._catalogue.cheapest.get(placement, 0.0))
 
     def _choose(self, need: Need, budget: float | None) -> tuple[Choice, Reason]:
         old = need.replaces

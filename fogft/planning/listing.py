@@ -72,11 +72,6 @@ class Catalogue:
         self._listings: dict[object, Listing] = {}
 
     @cached_property
-    def prices(self) -> Mapping[Placement, float]:
-        """Placement -> US dollars per hour."""
-        return {offer.placement: offer.usd_per_hour for offer in self.offers}
-
-    @cached_property
     def cheapest(self) -> Mapping[Placement, float]:
         """Placement -> the least that is asked for it, of whichever group."""
         out: dict[Placement, float] = {}

@@ -24,10 +24,13 @@ from fogft.model.replica import Observed, Offer
 from fogft.model.schedule import Wish, wish
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
-from fogft.planning.availability import Expected, expected, unavailability_of
+from fogft.planning.availability import expected, unavailability_of
 from fogft.planning.listing import catalogue
 from fogft.planning.placement import Market
 from fogft.planning.reliability import replicas_needed
+
+# Where a target is out of reach, no replica is had that would take away less of the outages.
+MUCH_THE_SAME = 1.1
 
 
 class Size(NamedTuple):
@@ -99,12 +102,7 @@ def layout(
 
 
 class Markets:
-    """The offers of each group, apart by spot and on-demand where the group tells them apart.
-
-    Args:
-        offers: All that can be bought.
-        market: Makes a market of some of them.
-    """
+    """The offers of each group, apart by spot and on-demand where the group tells them apart."""
 
     def __init__(self, offers: Sequence[Offer], scale: Scale, excluded: Iterable[str]) -> None:
         self._catalogue = catalogue(offers)
@@ -143,7 +141,7 @@ class Markets:
 def _for_target(
     spec: PoolSpec, intent: Intent, observed: Observed, cap: float | None, running: int
 ) -> tuple[int, Reason | None]:
-    """Return the fewest replicas that reach the target; the most within the cap if none do.
+    """Return the fewest replicas that reach the target, or all but reach what can be reached.
 
     The reason says why the target cannot be reached; None where it can.
     """
@@ -156,20 +154,21 @@ def _for_target(
         return min(MAX_REPLICAS, max(spec.replicas, running, needed)), None
     scale = Scale(spec.placement.latency_weight, observed.rtt_s)
     markets = Markets(observed.offers, scale, intent.excluded)
-    laid = [o for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
-    best = Expected(0.0, 0.0)
-    for count in range(max(1, spec.replicas), len(laid) + 1):
-        best = expected([o.placement for o in laid[:count]], asked)
-        if best.correlated >= asked.target - 1e-12:
+    laid = [o.placement for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
+    down: list[float] = []
+    for count in range(1, len(laid) + 1):
+        down.append(1.0 - expected(laid[:count], asked).correlated)
+        if down[-1] <= 1.0 - asked.target + 1e-12 and count >= spec.replicas:
             return count, None
+    enough = next((n for n, share in enumerate(down, 1) if share <= MUCH_THE_SAME * down[-1]), 0)
     # Not below what runs: near the cap, prices that waver would make the number waver.
-    count = max(1, spec.replicas, len(laid), min(running, MAX_REPLICAS))
+    count = max(1, spec.replicas, enough, min(running, len(laid)))
     most = Reason(Cause.MOST_REPLICAS, count=MAX_REPLICAS)
     why = Reason(Cause.OVER_CAP) if len(laid) < MAX_REPLICAS else most
     note = Reason(
         Cause.TARGET_UNMET,
-        count=len(laid),
-        share=best.correlated,
+        count=enough,
+        share=1.0 - down[enough - 1] if down else 0.0,
         target=asked.target,
         because=(why,),
     )

@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields, replace
 
 from fogft.errors import FogftError
 from fogft.model.choices import Assumption
-from fogft.planning.reliability import unavailability
 
 MAX_CORRELATION = 0.95
 HINT = "write `KEY=VALUE,...`, such as `mttf_s=54000,mttr_s=3600,correlation=0.22,boot_s=240`"
@@ -95,24 +94,6 @@ def rates(model: MarketModel) -> Rates:
             "lower them, or make `regime_s` longer",
         )
     return Rates(strikes, 2 * same / (1 + same), world, cloud, region)
-
-
-def moving(model: MarketModel, timing: Timing) -> float:
-    """Return the unavailability of a replica that is at once launched elsewhere when lost.
-
-    It is away from its loss until its successor answers, the notice subtracted. That some
-    location always has room is assumed.
-    """
-    recovery_s = timing.boot_s + timing.detect_s - timing.notice_s
-    return unavailability(model.mttf_s, max(recovery_s, 0.0))
-
-
-def staying(model: MarketModel, timing: Timing) -> float:
-    """Return the unavailability of a replica that waits for room where it was.
-
-    Of each time with room, exponential with mean `mttf_s`, the boot is lost.
-    """
-    return 1 - model.availability * math.exp(-timing.boot_s / model.mttf_s)
 
 
 _POSITIVE = ("mttf_s", "mttr_s", "regime_s")

@@ -5,17 +5,14 @@ Not here: running it (`comparison`) and drawing it (`plot`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from fogft.errors import FogftError
-from fogft.planning.reliability import system_unavailability
 from fogft.pool.manager.offers import ask
 from fogft.simulation.comparison import BOUND, Row, Scenario, compare, replicas_of
-from fogft.simulation.fitting import fit
 from fogft.simulation.meter import DAY_S
-from fogft.simulation.model import moving, staying
 from fogft.simulation.world import World
 
 MAX_POOL_DAYS = 1_000_000
@@ -28,9 +25,6 @@ class Report:
     scenario: Scenario
     rows: tuple[Row, ...]
     replicas: int  # how many the planner wants outside of the schedule's windows
-    # What independent arithmetic says of as many replicas that move, and that stay; None
-    # where the traces cannot be fitted.
-    expected: Mapping[str, float] | None
     notes: tuple[str, ...] = ()  # what a reader should know, in sentences
 
     @property
@@ -65,7 +59,6 @@ class Report:
             "policies": [row.to_json() for row in self.rows],
             "target": self.target,
             "cheapest": self.cheapest.name if self.cheapest else None,
-            "independent": dict(self.expected) if self.expected else None,
             "notes": list(self.notes),
         }
 
@@ -81,8 +74,7 @@ def simulate(
     rows = compare(scenario, told)
     world = World(scenario.market(scenario.seeds[0]), seed=0, length_s=0.0)
     replicas = replicas_of(scenario.spec, ask(world, scenario.spec))
-    expected = _expected(scenario, replicas)
-    return Report(scenario, tuple(rows), replicas, expected, (*notes, *more))
+    return Report(scenario, tuple(rows), replicas, (*notes, *more))
 
 
 def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
@@ -113,14 +105,3 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
         scenario = replace(scenario, days=most)
         notes.append(f"the traces cover {most:.1f} days after the first hour: all are used")
     return scenario, notes
-
-
-def _expected(scenario: Scenario, wanted: int) -> dict[str, float] | None:
-    model, timing = scenario.model, scenario.timing
-    if scenario.recorded:
-        try:
-            model = fit(scenario.recorded)
-        except FogftError:
-            return None
-    alone = {"moving": moving(model, timing), "staying": staying(model, timing)}
-    return {how: 1 - system_unavailability([one] * wanted) for how, one in alone.items()}

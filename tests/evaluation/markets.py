@@ -10,12 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from fogft.planning.reliability import system_unavailability
-from fogft.simulation.model import MarketModel, Timing, staying
+from fogft.simulation.model import MarketModel, Timing
 from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
 from tests.evaluation.samples import Samples
 from tests.evaluation.simulated import unavailable
+from tests.simulation.arithmetic import staying
 
 REPLICAS = (1, 2, 3, 4)
 _MODEL, _TIMING = MarketModel(), Timing()

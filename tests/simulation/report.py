@@ -22,9 +22,10 @@ from fogft.simulation import plot
 from fogft.simulation.comparison import SETTLE_S, Row, Scenario, estimate, policies, unlogged
 from fogft.simulation.market import remembered
 from fogft.simulation.meter import HOURS_A_MONTH
-from fogft.simulation.model import MarketModel, Timing, moving, staying
+from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.report import Report, simulate
 from fogft.simulation.world import World
+from tests.simulation.arithmetic import moving, staying
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "simulation"
@@ -160,12 +161,6 @@ def table(report: Report) -> Iterator[str]:
     yield "| policy | available | under target | $/month | launches/day | longest outage |"
     yield "|---|---|---|---|---|---|"
     yield from (f"| {' | '.join(cells(row))} |" for row in report.rows)
-    if report.expected is not None:
-        yield ""
-        yield (
-            "If replicas failed independently, two that move would be available "
-            f"{percent(report.expected['moving'])} of the time."
-        )
 
 
 def cells(row: Row) -> Iterator[str]:

@@ -19,12 +19,13 @@ from fogft.simulation.comparison import (
     unlogged,
 )
 from fogft.simulation.market import Market
-from fogft.simulation.model import MarketModel, Timing, moving, staying
+from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.report import simulate
 from fogft.simulation.timeline import PER_USD, UNLIMITED, of_changes, of_samples
 from fogft.simulation.world import World
 from tests.needs import needs
 from tests.nightly import by_day
+from tests.simulation.arithmetic import moving, staying
 from tests.simulation.markets import INDEPENDENT, any_scenario, scenario, spec
 
 HOUR_S = 3600.0
@@ -313,7 +314,6 @@ def test_recorded_traces_shorter_than_asked_are_used_whole():
     report = simulate(replace(wanted, recorded=lines))
     assert report.scenario.days == pytest.approx(47 / 24)
     assert report.notes == ("the traces cover 2.0 days after the first hour: all are used",)
-    assert report.expected is None  # nothing ever changes: nothing can be fitted
 
 
 def test_boots_that_the_pool_file_does_not_wait_for_are_told():
