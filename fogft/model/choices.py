@@ -85,10 +85,10 @@ class Correlation:
     """How much replicas are down together: in one zone, in one region, in one cloud.
 
     Each is in [0, 1], and none above the one before. Those for a region and a cloud were measured
-    (docs/design/availability.md); that for a zone is assumed, above them.
+    (docs/design/availability.md). A zone that has no room takes all of its machines: they are one.
     """
 
-    zone: float = 0.5
+    zone: float = 1.0
     region: float = 0.43
     cloud: float = 0.14
 

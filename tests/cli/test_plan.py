@@ -278,10 +278,10 @@ def test_it_is_told_which_replicas_are_of_which_group(pool, capsys):
     assert main.run(["plan", str(pool)]) == 0
     out = capsys.readouterr().out
     assert "slot 0 (steady)" in out
-    assert "slot 100 (fast)" in out
+    assert "slot 200 (fast)" in out
     assert main.run(["plan", str(pool), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)["replicas"]
-    assert [(one["slot"], one["spot"]) for one in shown] == [(0, False), (100, True)]
+    assert [(one["slot"], one["spot"]) for one in shown] == [(0, False), (200, True)]
     assert [one["services"] for one in shown] == 2 * [["/plan", "/map"]]
 
 
