@@ -26,6 +26,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     from tests.bench import (
         commands,
         faults,
+        first,
         graph,
         hostile,
         load,
@@ -58,6 +59,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["ordering"] = ordering.ordering
     found["graph"] = graph.graph
     found["bursts"] = graph.bursts
+    found["first"] = first.first
     found["uplink"] = uplink.uplink
     return found
 
