@@ -56,5 +56,6 @@ def test_there_is_a_measurement_for_each_promise():
         "ordering",
         "graph",
         "bursts",
+        "first",
         "uplink",
     ]
