@@ -65,8 +65,7 @@ class UplinksLink:
         self._current: int | None = None
         self._closed = False
         self._links: list[Link] = []
-        self._interfaces = dialer.interfaces
-        for interface in self._interfaces:
+        for interface in dialer.interfaces:
             one = replace(peer, interface=interface)
             self._links.append(dialer.inner.dial(one, services, self))
 
@@ -207,7 +206,7 @@ class UplinksLink:
 
     def answered(self, link: Link, answer: Answer) -> None:
         """Take the end of an attempt on one uplink: the first answer, or the last refusal."""
-        index = self._interfaces.index(link.peer.interface)
+        index = self._links.index(link)
         with self._lock:
             attempt = self._attempts.get(answer.request_id)
             if attempt is None:
