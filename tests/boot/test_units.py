@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+import fogft
 from tests.boot.machine import ROOT, Machine, machine, wait
 from tests.needs import needs
 
@@ -67,6 +68,10 @@ class Robot:
         """Run a command as the user."""
         command = [sys.executable, "-m", "fogft", *words]
         return self.machine.run(*command, user="robot", environ=self._own, ok=ok, limit_s=240)
+
+    def path(self, path: str) -> None:
+        """Have commands find fogft there."""
+        self._own["PYTHONPATH"] = path
 
     def service(self, *words: str) -> str:
         """Run `fogft service`, for units of the machine as root, as `sudo` does."""
@@ -231,3 +236,30 @@ def test_a_pool_goes_on_whatever_dies_and_after_each_boot(robot: Robot) -> None:
     assert left == "", left
     # Before, a unit whose cgroup holds the local cloud's machines is not forgotten.
     assert robot.systemctl("list-units", "--all", "--no-legend", "fogft*") == ""
+
+
+def test_an_upgrade_hands_the_client_proxy_over_on_an_overlay(tmp_path: Path) -> None:
+    """Where the kernel's list of locks knows a file by another device, the lock's file tells."""
+    with machine(tmp_path / "machine") as made:
+        robot = Robot(made, system=True)
+        before = f"{HOME}/before"
+        made.run("mkdir", before, user="robot")
+        made.run("cp", "-r", f"{ROOT}/fogft", f"{ROOT}/templates", before, user="robot")
+        version = f's/"{fogft.__version__}"/"0.0.9"/'
+        made.run("sed", "-i", version, f"{before}/fogft/__init__.py", user="robot")
+        robot.path(f"{before}:{ROOT}")
+        robot.fogft("up", f"{HOME}/pool.yaml", "--yes")
+        robot.whole()
+        old = json.loads(robot.read("proxy-status.json"))
+        assert old["version"] == "0.0.9"
+        robot.path(str(ROOT))
+        client = robot.client()
+        robot.fogft("up", f"{HOME}/pool.yaml", "--yes")
+
+        def new() -> bool:
+            report = json.loads(robot.read("proxy-status.json"))
+            return bool(report["version"] == fogft.__version__ and report["pid"] != old["pid"])
+
+        wait(new, robot.told)
+        assert client.finish()["failed"] == 0
+        robot.fogft("down", "--yes")
