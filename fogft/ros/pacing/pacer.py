@@ -41,17 +41,6 @@ class Probes(Protocol):
         """Send a probe; `on_answer` comes from the take loop, or never."""
 
 
-class NoProbes:
-    """No client's node answers."""
-
-    def answers(self, client: bytes) -> bool | None:
-        """Return that it does not."""
-        return False
-
-    def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
-        """Do nothing."""
-
-
 def _client(handle: Any) -> bytes:
     """Return who asked. rclpy's own handles do not tell: those clients share a pace."""
     return handle[:_GUID_BYTES] if isinstance(handle, bytes) else b""
@@ -62,7 +51,7 @@ class Pacer:
 
     Args:
         send: Sends a response; may raise RosError.
-        probes: Asks the clients' nodes.
+        probes: Asks the clients' nodes; None where none answers.
         client_of: Returns who asked, of a request's handle.
     """
 
@@ -75,7 +64,8 @@ class Pacer:
     ) -> None:
         self._client_of = client_of
         self._send = send
-        self._probes = probes or NoProbes()
+        self._probe_answers = probes.answers if probes is not None else lambda client: False
+        self._send_probe = probes.send if probes is not None else lambda client, answered: None
         self._clock = clock
         self._pace = Pace()
         self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
@@ -158,7 +148,7 @@ class Pacer:
                     log.warning("response_refused reason=%r", error.message)
             for id, count in probed:
                 for _ in range(count):
-                    self._probes.send(id, partial(self._answered, id))
+                    self._send_probe(id, partial(self._answered, id))
             for id in asked:
                 self._ask(id)
 
@@ -194,7 +184,7 @@ class Pacer:
 
     def _ask(self, id: bytes) -> None:
         """Find out whether a client's node answers probes."""
-        answers = self._probes.answers(id)
+        answers = self._probe_answers(id)
         now = self._clock()
         with self._wake:
             until = self._asked.get(id, now)
