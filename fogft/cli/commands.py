@@ -97,8 +97,8 @@ def _elsewhere(name: str) -> Any:
     def refuse() -> None:
         raise FogftError(
             f"`fogft {name}` needs Linux; this is {sys.platform}",
-            f"here work: {', '.join(f'`fogft {one}`' for one in sorted(ANYWHERE))}; in WSL, in a "
-            "container or on a Linux machine, everything does",
+            f"available here: {', '.join(f'`fogft {one}`' for one in sorted(ANYWHERE))}; "
+            "every command works in WSL, in a container or on a Linux machine",
         )
 
     alone = typer.Typer(add_completion=False)

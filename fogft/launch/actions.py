@@ -97,7 +97,7 @@ class CloudNode(Node):  # type: ignore[misc]
         """Run it on this machine, in a fog pool that stays here."""
         if not _stays_here(context):
             raise FogftError(
-                "a cloud node is in no fog pool", "put it into a `FogPool` (`fog_pool`)"
+                "a cloud node is outside of any fog pool", "put it into a `FogPool` (`fog_pool`)"
             )
         result: list[Action] | None = super().execute(context)
         return result

@@ -72,7 +72,7 @@ def run_text(nodes: Sequence[NodeCommand]) -> str:
         FogftError: There is no node, or a parameter file is too large to be carried.
     """
     if not nodes:
-        raise FogftError("a fog pool holds no cloud node", "move a node into it as a cloud node")
+        raise FogftError("a fog pool contains no cloud node", "move a node into it as a cloud node")
     lines: list[str] = []
     if any(node.package for node in nodes):
         lines.append(_FIND)
@@ -131,7 +131,7 @@ def pool_tree(
     if base.get("run"):
         raise FogftError(
             "the pool file of a fog pool has a `run` of its own",
-            "remove it: what runs is what the launch file's cloud nodes say",
+            "remove it: replicas run the cloud nodes of the launch file",
         )
     tree = {**base, **task, "run": run}
     ours = base.get("fogft")
@@ -139,5 +139,5 @@ def pool_tree(
     if name:
         tree["name"] = name
     if not tree.get("name"):
-        raise FogftError("a fog pool has no name", "give it one, such as `name: perception`")
+        raise FogftError("a fog pool needs a name", "give it one, such as `name: perception`")
     return tree

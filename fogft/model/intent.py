@@ -70,25 +70,25 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
     """
     if spec.availability is not None:
         raise FogftError(
-            f"`{spec.name}` has as many replicas as `availability` needs: it cannot be scaled",
-            "change `fogft.availability` or `fogft.replicas` in the pool file, and `fogft up` it",
+            f"`{spec.name}` cannot be scaled: `availability` sets its number of replicas",
+            "change `fogft.availability` or `fogft.replicas` in the pool file and run `fogft up`",
         )
     wanted = intent.wanted(spec) + change
     if wanted < 1:
         raise FogftError(
-            f"cannot scale `{spec.name}` to {wanted} replicas: at least 1 must stay",
+            f"cannot scale `{spec.name}` to {wanted} replicas: the minimum is 1",
             "`fogft down` ends a pool",
         )
     if wanted > MAX_REPLICAS:
         raise FogftError(
-            f"cannot scale `{spec.name}` to {wanted} replicas: at most {MAX_REPLICAS} can be had"
+            f"cannot scale `{spec.name}` to {wanted} replicas: the maximum is {MAX_REPLICAS}"
         )
     for service in spec.services:
         if service.quorum > wanted:
             raise FogftError(
                 f"cannot scale `{spec.name}` to {wanted} replicas: `{service.name}` has a quorum "
                 f"of {service.quorum}, and no answer could win",
-                "change `quorum` in the pool file, and `fogft up` it",
+                "change `quorum` in the pool file and run `fogft up`",
             )
     if wanted == spec.replicas:
         return replace(intent, target=None, scaled_from=None)

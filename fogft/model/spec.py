@@ -362,7 +362,7 @@ class PoolSpec:
     spread: Spread = key(
         OneOf(Spread),
         "With `on_demand.fallback`, how many spot machines one location gets while on-demand ones "
-        "can be had: at most half of them (`prefer`), or one (`require`).",
+        "are available: at most half of them (`prefer`), or one (`require`).",
         default=Spread.PREFER,
     )
     groups: tuple[GroupSpec, ...] = key(

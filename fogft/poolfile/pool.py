@@ -160,10 +160,10 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
     for section, group in zip(ours.sections("groups", ""), made.groups, strict=True):
         rules.on_demand(section.section("on_demand"), group.on_demand, group.replicas)
     if len(made.groups) > MAX_GROUPS:
-        raise ours.error("groups", f"are {len(made.groups)}, and at most {MAX_GROUPS} can be had")
+        raise ours.error("groups", f"are {len(made.groups)}, the maximum is {MAX_GROUPS}")
     total = sum(group.replicas for group in made.groups)
     if total > MAX_REPLICAS:
-        raise ours.error("groups", f"ask for {total} replicas; at most {MAX_REPLICAS} can be had")
+        raise ours.error("groups", f"ask for {total} replicas; the maximum is {MAX_REPLICAS}")
     return tuple(replace(g, resources={**shared, **g.resources}) for g in made.groups)
 
 

@@ -75,7 +75,7 @@ def simulate(
             )
         if not lines:
             raise FogftError(
-                "none of the traces is of a location that the pool may use",
+                "no trace covers a location that the pool may use",
                 "name the traces' regions under `resources.any_of`",
             )
         told_by_traces = sorted(set(values) & set(MARKET_KEYS))
@@ -90,7 +90,7 @@ def simulate(
             lines = {}
         elif told_by_traces:
             raise FogftError(
-                f"--model: `{told_by_traces[0]}` is told by the traces",
+                f"--model: `{told_by_traces[0]}` is taken from the traces",
                 "add `--fit` to change what was fitted to them",
             )
     market, timing = applied(market, timing, values)

@@ -89,7 +89,7 @@ def parse(value: Any, file: str, per_unit: int = 1) -> Timeline:
         if sample is None:
             raise FogftError(
                 f"{file}: data[{index}]: the trace has a gap here ({gap_s:g} s a sample)",
-                "cut the trace before it or after it: what happened meanwhile is not known",
+                "cut the trace before or after it: the state in between is unknown",
             )
         whole = per_unit > 1 or (_is_number(sample) and sample == int(sample))
         if not _is_number(sample) or sample < 0 or not whole:
@@ -115,13 +115,13 @@ def _check_times(times: Any, samples: int, gap_s: float, file: str) -> None:
         if step <= 0:
             raise FogftError(
                 f"{file}: times[{index}]: the clock jumps back by {-step:g} s",
-                "cut the trace there: which of the samples came first is not known",
+                "cut the trace there: the order of the samples is unknown",
             )
         if not 0.5 * gap_s <= step <= 1.5 * gap_s:
             raise FogftError(
                 f"{file}: times[{index}]: {step:g} s after the sample before it, where "
                 f"`gap_seconds` says {gap_s:g}: a gap or a clock that jumped",
-                "cut the trace there: what happened meanwhile is not known",
+                "cut the trace there: the state in between is unknown",
             )
 
 
@@ -157,7 +157,7 @@ def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, 
         if places[0] in found:
             raise FogftError(
                 f"{trace.file}: is of `{places[0]}`, as {found[places[0]][0]} is",
-                "keep the one of the instance that the pool uses",
+                "keep the trace of the instance type that the pool uses",
             )
         found[places[0]] = trace.file, trace.timeline
     for other in traces[1:]:
@@ -165,7 +165,7 @@ def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, 
             raise FogftError(
                 f"{other.file}: gap_seconds is {other.gap_s:g}, but {traces[0].gap_s:g} in "
                 f"{traces[0].file}",
-                "simulate traces of one recording: others do not speak of the same moments",
+                "use traces of one recording: others cover different times",
             )
     return {place: timeline for place, (_, timeline) in found.items()}
 

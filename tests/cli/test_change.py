@@ -35,7 +35,7 @@ def test_the_last_replica_stays(home, capsys):
     assert main.run(["scale", "down", "3"]) == 1
     said = capsys.readouterr()
     assert said.err == (
-        "error: cannot scale `planner` to 0 replicas: at least 1 must stay\n\n"
+        "error: cannot scale `planner` to 0 replicas: the minimum is 1\n\n"
         "hint: `fogft down` ends a pool\n"
     )
     assert wish(paths)["target"] is None

@@ -108,7 +108,7 @@ def test_what_cannot_be_is_told_before_anything_runs(file, capsys, arguments, me
 def test_traces_and_numbers_that_contradict_them_are_refused(file, traces, capsys):
     arguments = ["--traces", str(traces), "--model", "mttf_s=3"]
     assert main.run(["simulate", str(file), *arguments]) == 1
-    assert "`mttf_s` is told by the traces" in capsys.readouterr().err
+    assert "`mttf_s` is taken from the traces" in capsys.readouterr().err
 
 
 def test_a_region_that_does_not_exist_is_told_with_its_line(file, capsys):

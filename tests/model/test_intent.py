@@ -77,7 +77,7 @@ def test_scale_gives_way_even_if_nobody_told_it_of_the_change() -> None:
 
 def test_scale_below_one_is_refused_with_a_hint() -> None:
     """A pool without replicas is what `down` is for."""
-    with pytest.raises(FogftError, match="at least 1") as caught:
+    with pytest.raises(FogftError, match="the minimum is 1") as caught:
         intents.scale(Intent(), spec(2), -2)
     assert "fogft down" in caught.value.hint
 

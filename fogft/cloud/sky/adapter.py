@@ -317,5 +317,5 @@ def _refusal(error: RefusedError, order: Launch) -> CloudError:
         )
     hint = ""
     if not order.dials_out and error.kind == "NotSupportedError":
-        hint = "where a cloud opens no port the replica can dial the robot: `fogft.dial_in`"
+        hint = "where a cloud cannot open ports, let replicas dial the robot: `fogft.dial_in`"
     return CloudError(f"SkyPilot refuses to launch in {where}: {failure.words}", hint)

@@ -96,7 +96,7 @@ def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
     """See that whoever joins can find the others, or be found by them."""
     if spec.rendezvous:
         return
-    add = "add `fogft.rendezvous` to the pool file, and `fogft up` it"
+    add = "add `fogft.rendezvous` to the pool file and run `fogft up`"
     if role is Role.REPLICA and Found.of(spec) is Found.BY_CLOUD:
         raise CredentialError(
             f"nobody could find replica `{name}`: no rendezvous could tell where it is",
@@ -259,6 +259,6 @@ def destroy(file: Path, size: int) -> None:
         file.unlink()
     except OSError as error:
         raise FogftError(
-            f"all is set up, but `{file}` cannot be removed: {error.strerror}",
+            f"the machine has joined, but `{file}` cannot be removed: {error.strerror}",
             "remove it by hand: it cannot be used again",
         ) from None

@@ -139,7 +139,7 @@ def import_(
     label, content = bundle.open_sealed(data, passphrase, now)
     if label.holder.role is not Role.MANAGER:
         raise FogftError(f"`{file}` lets a machine join a pool", "use it with `fogft join`")
-    brought = stored(_Moved, content, "the file holds no pool")
+    brought = stored(_Moved, content, "the file contains no pool")
     was = brought.identity
     place = (pool_file or Path(was.file)).resolve()
     if not place.is_file():

@@ -89,7 +89,7 @@ class Services:
                 ["systemctl", *scope, *words], capture_output=True, text=True, check=False
             )
         except FileNotFoundError:
-            raise FogftError("there is no systemd here", "run the parts by hand") from None
+            raise FogftError("this machine has no systemd", "start each process by hand") from None
 
 
 def services(*, system: bool, environ: Mapping[str, str] = os.environ) -> Services:

@@ -129,7 +129,7 @@ def _taken(done: Callable[[str], None], what: str, path: Path) -> Iterator[None]
             break
     else:
         raise FogftError(
-            f"the {what} of `{path.parent.name}` does not end",
+            f"the {what} of `{path.parent.name}` does not exit",
             "it belongs to another user, or hangs in the kernel; end "
             "it, then run `fogft down` again",
         )
