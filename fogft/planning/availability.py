@@ -30,11 +30,6 @@ from fogft.model.choices import Assumption, Correlation
 from fogft.model.replica import Placement
 from fogft.planning.reliability import system_unavailability, unavailability
 
-HOUR_S = 3600.0
-
-
-INDEPENDENT = Correlation(0.0, 0.0, 0.0)
-
 
 def unavailability_of(assumed: Assumption, *, spot: bool) -> float:
     """Return the fraction of time that one replica does not answer."""

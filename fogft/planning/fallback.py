@@ -105,17 +105,13 @@ def spare(
     Beside one that is held, and serves, a spot machine needs no time to settle.
     """
     settled_s = 0.0 if held and any(s.serving for s in standing_in) else SETTLED_S
-    settled = sum(_has_served(s, settled_s, now) for s in (*here.good, *here.replaced))
+    settled = sum(has_served(s, settled_s, now) for s in (*here.good, *here.replaced))
     kept = sum(not s.unwanted for s in standing_in)
     return kept - max(0, wanted - settled)
 
 
-def has_stayed(replica: Assessment, now: float) -> bool:
-    """Whether a stand-in may make way for a spot machine that the cap has no room for besides."""
-    return _has_served(replica, STAYS_S, now)
-
-
-def _has_served(replica: Assessment, for_s: float, now: float) -> bool:
+def has_served(replica: Assessment, for_s: float, now: float) -> bool:
+    """Whether one serves, and was first ready so long ago."""
     record = replica.record
     if not replica.serving or record is None or record.first_ready_at is None:
         return False

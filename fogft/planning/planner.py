@@ -345,7 +345,7 @@ def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessm
         return None
     for replica in buyer.standing_in:
         here = group_of(buyer.groups, replica.slot) is need.group
-        stayed = here and fallback.has_stayed(replica, buyer.observed.now)
+        stayed = here and fallback.has_served(replica, fallback.STAYS_S, buyer.observed.now)
         if stayed and buyer.fits_instead(need, replica):
             buyer.notes.append(Reason(Cause.OLD_BEFORE_NEW, slot=need.slot))
             return replica

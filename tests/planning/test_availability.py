@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from fogft.model.replica import Placement
 from fogft.planning.availability import (
-    INDEPENDENT,
     Assumption,
     Correlation,
     expected,
@@ -24,6 +23,7 @@ ZONE = replace(A, instance="m2")
 REGION = replace(A, zone="b")
 CLOUD = replace(A, region="us-west-2")
 OTHER = replace(A, cloud="gcp")
+INDEPENDENT = Correlation(0.0, 0.0, 0.0)
 
 placements = st.builds(
     Placement,
