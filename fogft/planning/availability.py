@@ -23,7 +23,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from fogft.model.choices import Assumption, Correlation
@@ -109,7 +109,7 @@ class _Grid:
         def given(start: float) -> float:
             return math.prod(follow * (start < q) + (1 - follow) * q for q in members)
 
-        return self._of(given)
+        return [given(start) for start in self._starts]
 
     def followed(self, inner: list[float], follow: float) -> list[float]:
         """Return a domain's function, given the value of the domain that it lies in."""
@@ -121,6 +121,3 @@ class _Grid:
 
     def mean(self, function: Sequence[float]) -> float:
         return math.fsum(w * v for w, v in zip(self._widths, function, strict=True))
-
-    def _of(self, function: Callable[[float], float]) -> list[float]:
-        return [function(start) for start in self._starts]

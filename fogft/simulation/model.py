@@ -27,10 +27,8 @@ class Timing:
     # Until the cloud accepts or refuses an order; as measured through SkyPilot on an emulated AWS.
     answer_s: float = 28.0
     detect_s: float = 5.0  # until the loss of a machine without a notice is seen
-    # As `availability` assumes.
-    on_demand_mttf_s: float = (
-        Assumption.on_demand_uptime_s
-    )  # mean time to the failure of an on-demand machine; 0: never
+    # Mean time to the failure of an on-demand machine, as `availability` assumes; 0: never.
+    on_demand_mttf_s: float = Assumption.on_demand_uptime_s
     on_demand_refused: float = 0.0  # share of the orders of on-demand machines
     launch_fails: float = 0.0  # share of the machines that are accepted and never serve
     spot_quota: float = 0.0  # the most spot machines of a region; 0: any number
