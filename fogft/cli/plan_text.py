@@ -158,7 +158,7 @@ def _summary(shown: PlanShown) -> list[str]:
     if shown.ready_p90_s is not None:
         out.append(
             f"ready         within {shown.ready_p90_s:.0f} s of the order (p90 of {shown.launches} "
-            "launches; taken for the time away below)"
+            "launches; used as the time away below)"
         )
     for name, one in shown.traffic.items():
         out.append(
@@ -196,10 +196,10 @@ def _verdict(shown: PlanShown) -> list[str]:
     target = plan.expected.correlated if plan.target is None else plan.target
     asked = f"for {100 * target:.6g} %"
     if plan.is_cheapest is None:
-        return [f"cheapest      {asked} neither this pool nor one on-demand machine is enough"]
+        return [f"cheapest      {asked}: neither this pool nor one on-demand machine is enough"]
     if plan.is_cheapest:
-        return [f"cheapest      {asked} this pool is"]
-    return [f"cheapest      {asked} one on-demand machine is, without fogft"]
+        return [f"cheapest      {asked}: this pool"]
+    return [f"cheapest      {asked}: one on-demand machine, without fogft"]
 
 
 def _availability(shown: PlanShown) -> list[str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".png", ".svg", ".pdf")
 _COLOURS = ("#0072b2", "#666666", "#e69f00", "#009e73", "#cc79a7")  # told apart by all eyes
-_MARKS = ("o", "s", "^", "D", "v")
+MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">", "p")  # told apart without colour
 _SHOWN_DAYS = 3.0
 _STYLE: Any = {"font.size": 9, "axes.spines.right": False, "axes.spines.top": False}
 
@@ -52,10 +54,11 @@ def draw(report: Report, path: Path) -> None:
         figure = Figure(figsize=(11, 1.9 + 0.75 * len(rows)), layout="constrained")
         left, right = cast(Any, figure.subfigures(1, 2, width_ratios=(1, 1.25)))
         _costs(left.subplots(), rows)
-        _curves(right.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0], report)
+        drawn = [row for row in rows if row.curve]  # a bound has none
+        _curves(right.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0], report, drawn)
         right.supylabel("replicas serving", fontsize=9)
         scenario = report.scenario
-        market = "recorded traces" if scenario.recorded else "a modelled market"
+        market = "recorded traces" if scenario.recorded else "a simulated market"
         figure.suptitle(
             f"{scenario.spec.name}: {report.replicas} replicas, {market}, "
             f"{len(scenario.seeds)} seeds of {scenario.days:.4g} days"
@@ -79,7 +82,7 @@ def _costs(axes: Any, rows: tuple[Row, ...]) -> None:
     means = [row.estimate("available").mean for row in rows]
     measured = [1 - mean for mean in means if mean < 1]
     never_down = 10 ** math.floor(math.log10(min(measured, default=1e-3)) - 1)
-    for row, colour, mark in zip(rows, _COLOURS, _MARKS, strict=False):
+    for row, colour, mark in zip(rows, cycle(_COLOURS), cycle(MARKS), strict=False):
         cost, up = row.estimate("usd_per_hour"), row.estimate("available")
         x = cost.mean * HOURS_A_MONTH
         down = [max(1 - value, never_down) for value in (up.mean, up.high, up.low)]
@@ -102,12 +105,12 @@ def _costs(axes: Any, rows: tuple[Row, ...]) -> None:
     axes.legend(frameon=False, fontsize=8, loc="best")
 
 
-def _curves(axes: Any, report: Report) -> None:
+def _curves(axes: Any, report: Report, rows: Sequence[Row]) -> None:
     shown = min(_SHOWN_DAYS, report.scenario.days)
     wanted = report.replicas
-    top = max((ready for row in report.rows for _, ready in row.curve), default=1)
-    for ax, row, colour in zip(axes, report.rows, _COLOURS * len(axes), strict=False):
-        points = [(at / DAY_S, ready) for at, ready in row.curve] or [(0.0, 0)]
+    top = max((ready for row in rows for _, ready in row.curve), default=1)
+    for ax, row, colour in zip(axes, rows, cycle(_COLOURS), strict=False):
+        points = [(at / DAY_S, ready) for at, ready in row.curve]
         points.append((report.scenario.days, points[-1][1]))
         times, ready = zip(*points, strict=True)
         ax.step(times, ready, where="post", color=colour, linewidth=1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fogft.simulation.plot import check, save
+from fogft.simulation.plot import MARKS, check, save
 
 if TYPE_CHECKING:
     from fogft.pool.commands.plan import PlanShown
@@ -30,11 +30,11 @@ def draw(shown: PlanShown, path: Path) -> None:
             (apart if one.rtt_s is None else one.rtt_s * 1000, one.offer.usd_per_hour)
             for one in offers
         ]
-        colour = f"C{n}"
-        axes.plot(*zip(*points, strict=True), "o", color=colour, fillstyle="none", label=cloud)
+        colour, mark = f"C{n}", MARKS[n % len(MARKS)]
+        axes.plot(*zip(*points, strict=True), mark, color=colour, fillstyle="none", label=cloud)
         for one, point in zip(offers, points, strict=True):
             if one.slots:
-                axes.plot(*point, "o", color=colour, markersize=9)
+                axes.plot(*point, mark, color=colour, markersize=9)
                 slots = ",".join(map(str, one.slots))
                 axes.annotate(f"slot {slots}", point, (6, -3), textcoords="offset points")
     axes.set(
@@ -42,8 +42,10 @@ def draw(shown: PlanShown, path: Path) -> None:
         xlabel="round trip in milliseconds",
         ylabel="US dollars per hour",
     )
+    axes.margins(x=0.12)
     if len(known) < len(considered):
-        axes.axvline(1.1 * apart / 1.2, color="0.7", linewidth=0.8)
+        if known:
+            axes.axvline(1.1 * apart / 1.2, color="0.7", linewidth=0.8)
         shown_at = [at for at in axes.get_xticks() if 0 <= at < 1.05 * apart / 1.2] if known else []
         axes.set_xticks([*shown_at, apart], [*(f"{at:g}" for at in shown_at), "unknown"])
     axes.set_ylim(bottom=0)
