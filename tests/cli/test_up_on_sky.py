@@ -166,7 +166,8 @@ def test_files_that_every_vm_gets_are_told_before_anything_is_launched(
     said = capsys.readouterr().err
     assert "warning: SkyPilot gives every VM these files of yours" in said
     assert "`~/.runpod/config.toml`" in said
-    assert "port 7448 of every VM is open to the world" in said
+    assert "port 7448" in said
+    assert "are open to the world: `fogft.allow_from` names who may connect" in said
     assert started == []
 
 

@@ -94,7 +94,13 @@ def export(
             unfinished.unlink(missing_ok=True)
             startup.start_manager(store)
             raise
-        os.replace(unfinished, file)
+        try:
+            os.replace(unfinished, file)
+        except OSError as error:
+            raise FogftError(
+                f"`{unfinished}` cannot be renamed: {error.strerror}",
+                "the pool is exported into it: use it as it is",
+            ) from None
     return identity
 
 
