@@ -18,7 +18,7 @@ from fogft.ros import shared_memory
 
 
 def segments(_: Situation) -> Iterator[Finding]:
-    """No shared memory of ROS is without a process."""
+    """No shared memory of ROS is left over from dead processes."""
     abandoned = shared_memory.abandoned()
     if not abandoned:
         yield ok("leftovers", "no shared memory left by dead processes")
@@ -36,7 +36,7 @@ def segments(_: Situation) -> Iterator[Finding]:
 
 
 def orphaned_processes(situation: Situation) -> Iterator[Finding]:
-    """No replica of the local cloud runs without a pool that it belongs to."""
+    """No replica of the local cloud runs without its pool."""
     uids = []
     for pool in situation.pools:
         with contextlib.suppress(FogftError):
@@ -55,7 +55,7 @@ def orphaned_processes(situation: Situation) -> Iterator[Finding]:
 
 
 def chaos(situation: Situation) -> Iterator[Finding]:
-    """Nothing that `fogft chaos` did to locations lasts."""
+    """No faults injected by `fogft chaos` are in force."""
     broken = faults.read_cloud(situation.home / "local")
     found = [f"`{place}` is out" for place in broken.out(situation.now)]
     found += [

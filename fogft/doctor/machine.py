@@ -27,7 +27,7 @@ _DISK_WANTED_BYTES = 200 << 20
 
 
 def python(_: Situation) -> Iterator[Finding]:
-    """Python is of a version that is tested."""
+    """The Python version is a tested one."""
     text = ".".join(map(str, sys.version_info[:3]))
     if not _PYTHON_FIRST <= sys.version_info[:2] <= _PYTHON_LAST:
         yield fail("python", f"Python {text} is not supported", "use Python 3.10 to 3.13")
@@ -36,7 +36,7 @@ def python(_: Situation) -> Iterator[Finding]:
 
 
 def installation(_: Situation) -> Iterator[Finding]:
-    """fogft and what it depends on are installed, and the command is found."""
+    """fogft and its dependencies are installed, and the command is on the PATH."""
     missing = [name for module, name in _NEEDED_MODULES.items() if find_spec(module) is None]
     if missing:
         yield fail("fogft", f"not installed: {', '.join(missing)}", "run `pip install fogft`")
@@ -87,7 +87,7 @@ def state_folder(situation: Situation) -> Iterator[Finding]:
 
 
 def shared_memory(_: Situation) -> Iterator[Finding]:
-    """There is room in /dev/shm, through which ROS passes messages on one machine."""
+    """/dev/shm, which ROS uses for shared memory, has free space."""
     advice = "in a container, start it with `--shm-size=1g` (or `--ipc=host`)"
     if not _SHARED_MEMORY.is_dir() or not os.access(_SHARED_MEMORY, os.W_OK):
         yield fail("shared memory", "there is no writable /dev/shm", advice)
@@ -101,7 +101,7 @@ def shared_memory(_: Situation) -> Iterator[Finding]:
 
 
 def ports(_: Situation) -> Iterator[Finding]:
-    """Loopback can be bound, and the usual port of a server proxy is free."""
+    """A loopback port can be opened, and a server proxy's default port is free."""
     try:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))

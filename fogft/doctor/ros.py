@@ -67,7 +67,7 @@ def judge_middleware(rmw: str) -> Finding:
 
 
 def domain(_: Situation) -> Iterator[Finding]:
-    """The ROS domain and the range of discovery make sense."""
+    """The ROS domain and the discovery range are valid."""
     yield from judge_domain(os.environ)
 
 

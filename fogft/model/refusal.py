@@ -39,19 +39,19 @@ class Refusal(str, Enum):
     CRASHED = "crashed", Effect.FAULT | Effect.GOALS_LOST
     # Its deadline had passed on arrival
     EXPIRED = "expired", Effect.FINAL
-    # It was run, but the answer is no longer kept
+    # The request was run, but its answer is no longer stored
     FORGOTTEN = "forgotten", Effect.FINAL
     # The request, or the response, could not be read
     MALFORMED = "malformed", Effect.FINAL | Effect.FAULT
-    # Who asks may not, or did not say who it is
+    # The sender has not been admitted
     NOT_ADMITTED = "not-admitted", Effect.BLAMELESS
-    # The certificate of who asks was taken back
+    # The sender's certificate was revoked
     REVOKED = "revoked", Effect.BLAMELESS
-    # By the replica's clock
+    # The sender's certificate has expired by the replica's clock
     EXPIRED_CERTIFICATE = "expired-certificate"
-    # Dropped, because the robot had its answer from elsewhere
+    # Dropped, because another replica answered first
     CANCELLED = "cancelled"
-    # It was run, but the robot had its answer from elsewhere
+    # It was run, but another replica answered first
     LATE = "late"
     # A spare copy that would have had to wait
     BUSY = "busy", Effect.BLAMELESS
@@ -68,7 +68,7 @@ class Refusal(str, Enum):
 
     # Made on the robot: a newer request took its place before it was sent
     SUPERSEDED = "superseded", Effect.BLAMELESS
-    # Over this link it would not have arrived in time
+    # It would not arrive in time over this link
     TOO_SLOW = "too-slow", Effect.BLAMELESS | Effect.OTHER_UPLINK
     # The link died before an answer came
     LOST = "lost", Effect.BLAMELESS | Effect.OTHER_UPLINK | Effect.GOALS_LOST
