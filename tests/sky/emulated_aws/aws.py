@@ -233,7 +233,8 @@ def enforce() -> None:
         mine = flask.request.remote_addr == "127.0.0.1"
 
         def tags() -> list[dict[str, str]]:
-            wanted = set(self._get_param("InstanceIds", []) or self._get_multi_param("InstanceId"))
+            one = self._get_param("InstanceId", None)
+            wanted = set(self._get_param("InstanceIds", None) or [one])
             found = [i for _, _, i in all_instances() if i.id in wanted]
             return [{tag["key"]: tag["value"] for tag in one.get_tags()} for one in found]
 
