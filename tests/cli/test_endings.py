@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+import fogft
 from fogft.cli import main
 from fogft.errors import PoolNotFound
 from fogft.pool.commands import composition
@@ -55,7 +56,7 @@ def test_an_interrupt_is_one_line_and_130(monkeypatch, capsys):
 def test_version_is_data(capsys):
     assert main.run(["--version"]) == 0
     said = capsys.readouterr()
-    assert said.out == "fogft 0.1.0\n"
+    assert said.out == f"fogft {fogft.__version__}\n"
     assert said.err == ""
 
 
