@@ -167,9 +167,10 @@ def _order(data: bytes) -> None:
 
 def _judge_greeting(data: bytes) -> None:
     greeting = frame.decode_greeting(data)
-    _sessions().greet(greeting)
-    good = {ROBOT}
-    assert set(_sessions().names) <= good, "somebody was let in who holds no certificate"
+    sessions = _sessions()
+    sessions.greet(greeting)
+    said = "somebody was let in who holds no certificate"
+    assert sessions.holder(greeting.token) == ROBOT, said
 
 
 def _greeting() -> bytes:

@@ -25,7 +25,7 @@ from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records import frames
-from fogft.records.record import Record, RecordKind
+from fogft.records.record import VERSION, Record, RecordKind
 from fogft.records.roster import admission_content
 from fogft.records.signing import Signer
 from tests import certificate_names
@@ -212,7 +212,7 @@ def test_noise_replays_and_impostors_at_a_door(scene, tmp_path, whose):
         for kind, make in hostile.JUNK.items():
             hostile.throw(door, make(dice))
             expected["greeting_failed" if kind == "nothing" else "noise"] += 1
-        for message in ({"type": "greeting", "v": 9}, {"type": "greeting", "v": 1}):
+        for message in ({"type": "greeting", "v": 9}, {"type": "greeting", "v": VERSION}):
             hostile.throw(door, frames.frame(message))
         expected.update({"greeting_version": 1, "noise": 1})
         for files, event in hostile.impostors(scene.authority, tmp_path):
