@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from fogft.child import tied
+
 ROOT = Path(__file__).parents[2]
 SYSTEMD = Path("/usr/lib/systemd/systemd")
 CGROUPS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
@@ -37,8 +39,9 @@ class Machine:
         kept = {str(ROOT), sys.prefix, sys.base_prefix} - {"/", "/usr"}
         self._log = (folder.parent / f"{folder.name}.log").open("w+b")
         script = str(Path(__file__).with_name("boot.sh"))
+        boots = ["unshare", *_NAMESPACES, "bash", script, str(folder), str(cgroup), *sorted(kept)]
         self._holder = subprocess.Popen(
-            ["unshare", *_NAMESPACES, "bash", script, str(folder), str(cgroup), *sorted(kept)],
+            tied(boots),  # whatever ends the tests ends the machine
             stdin=subprocess.DEVNULL, stdout=self._log, stderr=self._log, start_new_session=True,
         )  # fmt: skip
 

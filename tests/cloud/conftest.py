@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import shutil
 import sys
 from pathlib import Path
 
@@ -94,4 +95,7 @@ class Local:
 def local(tmp_path):
     made = Local(tmp_path / "local")
     yield made
+    shutil.rmtree(
+        made.root, ignore_errors=True
+    )  # what is only starting is not found yet: it ends without its folder
     processes.end(processes.find(pool_uid=made.uid))
