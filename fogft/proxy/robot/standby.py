@@ -14,34 +14,35 @@ Owns: the place in line, and that order. Not here: a client proxy's work (`proce
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import logging
+import os
 import threading
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from fogft import disk
-from fogft.errors import PoolBusy
+from fogft.errors import PoolBusy, StateError
+from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.proxy_config import ClientProxyConfig
 from fogft.process import Watchdog, notify
 from fogft.proxy import middleware
+from fogft.proxy.robot.client import ClientProxy
 from fogft.records.signing import Signer
 
 if TYPE_CHECKING:
     from fogft.ros.participant.joining import EarlyJoin
-import hashlib
-import os
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
-
-from fogft.errors import StateError
-from fogft.model.names import REQUEST_ID_BYTES
-from fogft.proxy.robot.client import ClientProxy
 
 log = logging.getLogger(__name__)
 
 LOOK_S = 0.2
+BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
+KNOWN_AFTER_S = 0.5  # once it offers them and knows the callers: until they know its services
+FINISH_LIMIT_S = 60.0
+_PACED_S = 0.5  # until responses that are spread for their client are out
 # What a client proxy imports only when it needs it.
 _NEEDED = ("fogft.link.zenoh.robot.dialer", "fogft.proxy.robot.process", "fogft.ros.goal_status")
 
@@ -102,12 +103,6 @@ def _taken(lock: disk.Lock) -> threading.Event:
 
     threading.Thread(target=take, name="standby", daemon=True).start()
     return taken
-
-
-BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
-KNOWN_AFTER_S = 0.5  # once it offers them and knows the callers: until they know its services
-FINISH_LIMIT_S = 60.0
-_PACED_S = 0.5  # until responses that are spread for their client are out
 
 
 def request_ids(key: Path) -> Callable[[str, Any], bytes]:
