@@ -5,8 +5,10 @@ A target takes any bytes. It returns, or raises what is listed; anything else is
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import json
+import shutil
 import tempfile
 import zlib
 from collections.abc import Callable
@@ -70,6 +72,7 @@ class Target:
 @lru_cache(maxsize=1)
 def _signers() -> tuple[Path, Callable[[str], Signer]]:
     folder = Path(tempfile.mkdtemp(prefix="fogft-fuzz-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     authority.create_authority(folder, UID)
 
     @cache
