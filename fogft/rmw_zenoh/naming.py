@@ -19,6 +19,7 @@ import threading
 from dataclasses import dataclass
 
 from fogft.model import ros_names
+from fogft.ros.port import ClientNode
 
 ROOT = "@ros2_lv"
 NODE, SERVER, CLIENT = "NN", "SS", "SC"
@@ -189,15 +190,15 @@ class Graph:
         wanted = (kind, name, type_name)
         return sorted(t.hash for t in self._all() if (t.kind, t.service, t.type) == wanted)
 
-    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
-        """Return name and namespace of the node that calls a service, if there is only one.
+    def node_of(self, service: str, client: bytes) -> ClientNode | None:
+        """Return the node that calls a service, if there is only one.
 
         Of several, `client` (a GID) does not tell which: it is a hash of the token in a way of
         `rmw_zenoh`'s own.
         """
         tokens = self._all()
         nodes = {(t.node, t.namespace) for t in tokens if (t.kind, t.service) == (CLIENT, service)}
-        return nodes.pop() if len(nodes) == 1 else None
+        return ClientNode(*nodes.pop(), unique=True) if len(nodes) == 1 else None
 
     def services_of(self, name: str, namespace: str) -> list[str]:
         """Return the names of a node's services."""

@@ -26,7 +26,7 @@ from fogft.ros.entities import Client, Server
 from fogft.ros.pacing.client_probes import NodeProbes, ServiceProbes
 from fogft.ros.participant import farewell
 from fogft.ros.participant.joining import EarlyJoin, bare_node, new_context
-from fogft.ros.port import OnBurst
+from fogft.ros.port import ClientNode, OnBurst
 from fogft.ros.topic_ends import Publisher, Reader, Subscription
 from fogft.ros.types import load_message_type, load_service_type
 from fogft.ros.visible import VisibleNode
@@ -216,8 +216,8 @@ class SerialisedNode:
                     found.setdefault(service, kinds[0])
         return found
 
-    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
-        """Return name and namespace of the node that a client of a service belongs to.
+    def node_of(self, service: str, client: bytes) -> ClientNode | None:
+        """Return the node that a client of a service belongs to.
 
         Args:
             service: Its absolute name.
@@ -228,10 +228,13 @@ class SerialisedNode:
             readers = find(f"rr{service}Reply", no_mangle=True)
         except Exception:  # rclpy's InvalidHandle: closed meanwhile
             return None
-        for reader in readers:
-            if bytes(reader.endpoint_gid)[: len(client)] == client:
-                return reader.node_name, reader.node_namespace
-        return None
+        nodes = {bytes(r.endpoint_gid)[:16]: (r.node_name, r.node_namespace) for r in readers}
+        if client not in nodes:
+            return None
+        processes = {
+            reader[: farewell.PREFIX_BYTES] for reader in nodes if nodes[reader] == nodes[client]
+        }
+        return ClientNode(*nodes[client], unique=len(processes) == 1)
 
     def participant(self, service: str) -> bytes:
         """Return the first bytes of our participant's id; empty before it offers `service`."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from fogft.errors import RosError
 from fogft.model.topic import Quality
@@ -23,6 +23,14 @@ OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where 
 
 class NotFoundYet(RosError):
     """Discovery has not found the client yet: sending again may help."""
+
+
+class ClientNode(NamedTuple):
+    """The node of a client; `unique` where no other process has a node of that name."""
+
+    name: str
+    namespace: str
+    unique: bool
 
 
 class RosServer(Protocol):

@@ -10,6 +10,7 @@ import pytest
 
 from fogft.errors import RosError
 from fogft.ros.pacing.client_probes import KEPT, NodeProbes, ServiceProbes
+from fogft.ros.port import ClientNode
 
 CLIENT = b"c" * 16
 
@@ -37,11 +38,11 @@ class End:
 
 class Graph:
     def __init__(self) -> None:
-        self.nodes: dict[bytes, tuple[str, str]] = {CLIENT: ("arm", "/left")}
+        self.nodes = {CLIENT: ClientNode("arm", "/left", unique=True)}
         self.services = ["/left/arm/get_parameter_types"]
         self.ends: dict[str, Any] = {}
 
-    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
+    def node_of(self, service: str, client: bytes) -> ClientNode | None:
         assert service == "/detect"
         return self.nodes.get(client)
 
@@ -64,6 +65,10 @@ def test_a_node_with_parameters_answers_probes():
     for on_response in end.asked:
         on_response(b"")
     assert len(answers) == 3
+    assert probes.unique(CLIENT)
+    graph.nodes[CLIENT] = graph.nodes[CLIENT]._replace(unique=False)
+    assert not probes.unique(CLIENT)
+    assert not probes.unique(b"?" * 16)
 
 
 def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
@@ -105,7 +110,7 @@ def test_of_many_nodes_the_first_are_let_go():
     probes = ServiceProbes("/detect", nodes)
     for n in range(KEPT + 10):
         client = n.to_bytes(16, "big")
-        graph.nodes[client] = (f"n{n}", "/")
+        graph.nodes[client] = ClientNode(f"n{n}", "/", unique=True)
         graph.services = [f"/n{n}/get_parameter_types"]
         assert probes.answers(client)
     assert sum(end.closed for end in graph.ends.values()) == 10

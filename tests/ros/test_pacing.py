@@ -297,6 +297,41 @@ def test_one_clients_burst_does_not_hold_up_another():
     pacer.close()
 
 
+@pytest.mark.parametrize("unique", [True, False])
+def test_a_node_that_was_started_again_releases_nothing_of_its_predecessor(unique):
+    """It answers what that was asked; ten responses to that one would push out its own."""
+    now, sent, asked = [0.0], [], threading.Event()
+
+    class Node:
+        def answers(self, client):
+            return True
+
+        def send(self, client, on_answer):
+            self.answered = on_answer
+            asked.set()
+
+        def unique(self, client):
+            return unique
+
+    node = Node()
+    pacer = Pacer(lambda handle, payload: sent.append(handle), node, clock=lambda: now[0])
+    for number in range(30):
+        pacer.requested(handle(1, number), together=True)
+    for number in range(30):
+        pacer.respond(handle(1, number), b"")
+    assert asked.wait(30)
+    before = len(sent)
+    assert before <= QUEUE
+    now[0] = 2.0  # it has answered nothing for long
+    node.answered()
+    asked.clear()
+    now[0] = 4.0
+    pacer.requested(handle(2, 0))
+    assert asked.wait(30)  # the pacer has had a turn since
+    pacer.close()
+    assert (len(sent) > before) is unique
+
+
 def test_clients_that_are_gone_are_forgotten():
     pacer = Pacer(lambda handle, payload: None)
     for client in range(200):

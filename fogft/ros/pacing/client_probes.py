@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from fogft.errors import RosError
-from fogft.ros.port import RosClient
+from fogft.ros.port import ClientNode, RosClient
 
 _SERVICE, _TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTypes"
 _OF_NO_PARAMETER = b"\x00\x01\x00\x00" + bytes(4)  # a list of names, which is empty
@@ -27,8 +27,8 @@ class Graph(Protocol):
     def client(self, name: str, type_name: str) -> RosClient:
         """Make a client of a service."""
 
-    def node_of(self, service: str, client: bytes) -> tuple[str, str] | None:
-        """Return name and namespace of the node that a client of a service belongs to."""
+    def node_of(self, service: str, client: bytes) -> ClientNode | None:
+        """Return the node that a client of a service belongs to."""
 
     def services_of(self, name: str, namespace: str) -> Sequence[str]:
         """Return the names of a node's services."""
@@ -38,25 +38,25 @@ class NodeProbes:
     """Probes of the nodes in one ROS domain, for all services. Any thread."""
 
     def __init__(self, graph: Graph) -> None:
-        self._graph = graph
+        self.graph = graph
         self._ends: dict[str, RosClient] = {}
         self._lock = threading.Lock()
 
     def end(self, service: str, client: bytes) -> RosClient | bool | None:
         """Return the way to a client's node; False for none, None while it is not known."""
-        found = self._graph.node_of(service, client)
+        found = self.graph.node_of(service, client)
         if found is None:
             return None
-        name, namespace = found
+        name, namespace, _ = found
         asked = f"{namespace.rstrip('/')}/{name}/{_SERVICE}"
-        if asked not in self._graph.services_of(name, namespace):
+        if asked not in self.graph.services_of(name, namespace):
             return False
         with self._lock:
             end = self._ends.get(asked)
             if end is None:
                 if len(self._ends) >= KEPT:
                     self._ends.pop(next(iter(self._ends))).close()
-                end = self._ends[asked] = self._graph.client(asked, _TYPE)
+                end = self._ends[asked] = self.graph.client(asked, _TYPE)
         return end if end.available() else None
 
 
@@ -80,6 +80,15 @@ class ServiceProbes:
             self._ends.pop(next(iter(self._ends)))
         self._ends[client] = end
         return True
+
+    def unique(self, client: bytes) -> bool:
+        """Whether only the client's own node can have answered.
+
+        A node that was killed and started again answers what its predecessor was asked, which
+        discovery lists until its lease ends.
+        """
+        found = self._nodes.graph.node_of(self._service, client)
+        return found is not None and found.unique
 
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
         """Send a probe. One that cannot be sent is not answered."""

@@ -40,6 +40,9 @@ class Probes(Protocol):
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
         """Send a probe; `on_answer` comes from the take loop, or never."""
 
+    def unique(self, client: bytes) -> bool:
+        """Whether only the client's own node can have answered."""
+
 
 def _client(handle: Any) -> bytes:
     """Return who asked. rclpy's own handles do not tell: those clients share a pace."""
@@ -66,6 +69,7 @@ class Pacer:
         self._send = send
         self._probe_answers = probes.answers if probes is not None else lambda client: False
         self._send_probe = probes.send if probes is not None else lambda client, answered: None
+        self._answered_itself = probes.unique if probes is not None else lambda client: True
         self._clock = clock
         self._pace = Pace()
         self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
@@ -195,6 +199,10 @@ class Pacer:
 
     def _answered(self, id: bytes) -> None:
         now = self._clock()
+        with self._wake:
+            silent = self._pace.client(id, now).silent(now)
+        if silent and not self._answered_itself(id):
+            return  # or all that its killed predecessor left open would push out its responses
         with self._wake:
             self._pace.client(id, now).answered_probe(now)
             self._wake.notify()
