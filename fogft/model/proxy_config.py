@@ -90,6 +90,7 @@ class ServerProxyConfig:
 
     Attributes:
         run: Command that starts the services in `workdir`; empty where they are started otherwise.
+        spare: Whether a second process of it is kept, which takes over when the first dies.
         domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
         notice: Where preemption notices come from.
         max_in_flight: Most requests held at once.
@@ -105,6 +106,7 @@ class ServerProxyConfig:
     services: tuple[ServiceSpec, ...]
     credentials: CredentialPaths
     run: str = ""
+    spare: bool = False
     listen: Endpoint = f"0.0.0.0:{LINK_PORT}"
     workdir: Path = Path()
     envs: Mapping[str, str] = field(default_factory=dict)

@@ -464,6 +464,13 @@ class PoolSpec:
         "Actions that every replica runs. Not with `topology`.",
         default=(),
     )
+    spare: bool = key(
+        Flag(),
+        "Keep a second process of `run` on each replica, started and idle in a ROS domain of its "
+        "own, which takes over when the first dies. For services that take long to start; needs "
+        "their memory twice.",
+        default=False,
+    )
     unmanaged_max_hours: float = key(
         Number(MAX_HOURS, "hours"),
         "How long replicas go on serving after the manager was last heard of. Then they shut their "
@@ -513,6 +520,8 @@ class PoolSpec:
             asked["link_port"] = self.link_port
         if self.allow_from:
             asked["allow_from"] = self.allow_from
+        if self.spare:
+            asked["spare"] = True
         if self.rmw.replica is not Speaks.RCLPY:
             asked["rmw"] = self.rmw.replica.value
         kinds = _kinds_of_machine(resources)

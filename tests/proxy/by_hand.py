@@ -120,6 +120,7 @@ class Replica:
             f"notice: {notice}\n"
             f"credentials: {{ca: ca/ca.crt, certificate: {stem}.crt, key: {stem}.key}}\n{extra}"
         )
+        self.log = config.with_suffix(".log")
         self._start = lambda: parts.start("serve", config, environ)
         self.process = self._start()
 
@@ -130,15 +131,16 @@ class Replica:
 
     def run_pid(self) -> int:
         """Return the process id of the user's command."""
+        return int(wait_for(self.run_pids, "the user's command")[0])
 
-        def find() -> int:
-            children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-            for pid in children.read_text().split():
-                if self._node.name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes():
-                    return int(pid)
-            return 0
-
-        return int(wait_for(find, "the user's command"))
+    def run_pids(self) -> list[int]:
+        """Return the process ids of the user's command, which is started."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return [
+            int(pid)
+            for pid in children.read_text().split()
+            if self._node.name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
+        ]
 
 
 class Robot:

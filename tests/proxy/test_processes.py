@@ -15,7 +15,7 @@ from fogft.ros import environment
 from tests.cloud.fake_metadata import serving
 from tests.freezing import freeze
 from tests.needs import BEFORE, needs
-from tests.proxy.by_hand import LIMIT_S, ROOT, Caller, Parts, Robot, wait_for
+from tests.proxy.by_hand import LIMIT_S, ROOT, Caller, Parts, Replica, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 environment.prepare(os.environ)
@@ -108,6 +108,28 @@ def test_what_a_dying_command_worked_on_is_answered_by_the_next(parts, call):
     assert caller.all_answered()
     assert replica.run_pid() != first
     wait_for(lambda: robot.links()[0]["restarts"] == 1, "the restart in the report")
+
+
+def test_a_spare_process_takes_over_when_the_one_at_work_dies(parts, call):
+    """What was open is answered by it: it ran before, and was started no second time."""
+    replica = Replica(parts, 0, 0.02, {}, extra="spare: true\n")
+    robot = parts.robot("robot", replica)
+    caller = call(robot)
+    at_work, spare = wait_for(
+        lambda: len(pids := replica.run_pids()) == 2 and sorted(pids), "two processes"
+    )
+    log = replica.log
+    wait_for(lambda: log.read_text().count("run_started") == 2, "both in the log")
+    caller.ask(30)
+    caller.spin(0.1)
+    os.kill(at_work, signal.SIGKILL)
+    assert caller.all_answered()
+    assert log.read_text().count("spare_takes_over") == 1
+    wait_for(lambda: len(replica.run_pids()) == 2, "another spare one")
+    assert spare in replica.run_pids()
+    replica.process.terminate()
+    replica.process.wait(30)
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (at_work, spare)), "the end")
 
 
 def test_a_membership_change_under_load_loses_nothing(parts, call):

@@ -24,7 +24,7 @@ from fogft import child, disk, logfile
 from fogft.cloud.local import faults, guard, processes, task_commands
 from fogft.cloud.local.ending import sweep_shared_memory
 from fogft.cloud.local.folder import LINK, LOCK, NOTICE, MachineFolder, Record, State
-from fogft.cloud.local.reservations import Reservation, reserve_domain, reserve_port
+from fogft.cloud.local.reservations import Reservation, own_domain, reserve_domain, reserve_port
 from fogft.errors import FogftError, StateError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
@@ -161,7 +161,7 @@ class Machine:
     # -- serve ------------------------------------------------------------------------------
 
     def _serve(self, workdir: Path) -> None:
-        domain = reserve_domain({task_commands.robot_domain()})
+        domain = reserve_domain({own_domain()})  # not that of whoever launched it
         port = reserve_port()
         if domain is None or port is None:
             missing = "ROS domain" if domain is None else "port"

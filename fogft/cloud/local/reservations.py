@@ -8,9 +8,10 @@ the ports that are bound.
 from __future__ import annotations
 
 import contextlib
+import os
 import random
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,14 @@ class Reservation:
     def release(self) -> None:
         """Give the number back. Repeatable."""
         self._socket.close()
+
+
+def own_domain(environ: Mapping[str, str] = os.environ) -> int:
+    """Return the ROS domain that an environment names."""
+    try:
+        return int(environ.get("ROS_DOMAIN_ID") or 0)
+    except ValueError:
+        return 0
 
 
 def reserve_domain(not_these: Iterable[int] = ()) -> Reservation | None:

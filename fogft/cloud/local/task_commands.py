@@ -48,14 +48,6 @@ def sourced(command: list[str], workdir: Path) -> list[str]:
     return ["bash", "-c", '. "$0"; exec "$@"', str(setup), *command]
 
 
-def robot_domain(environ: Mapping[str, str] = os.environ) -> int:
-    """Return the ROS domain of whoever launched the machine: a replica must not be in it."""
-    try:
-        return int(environ.get("ROS_DOMAIN_ID") or 0)
-    except ValueError:
-        return 0
-
-
 def turn_file(root: Path, workdir: Path) -> Path:
     """Return the file whose lock a `setup` in a folder holds."""
     name = hashlib.sha256(str(workdir.resolve()).encode()).hexdigest()[:16]

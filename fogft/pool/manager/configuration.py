@@ -167,6 +167,7 @@ def replica_config(
         generation=id.generation,
         services=spec.services,
         run=str(spec.task.get("run") or ""),
+        spare=spec.spare,
         credentials=CredentialPaths(Path("ca.crt"), Path("replica.crt"), Path("replica.key")),
         envs={str(k): "" if v is None else str(v) for k, v in envs.items()},
         rendezvous=spec.rendezvous,

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fogft.cloud import notice
+from fogft.cloud.local.reservations import own_domain, reserve_domain
 from fogft.cloud.notice import Notice, NoticeKind
 from fogft.link.zenoh import runtime
 from fogft.metrics import proxies
@@ -30,6 +31,7 @@ from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.service_queue import Job
+from fogft.proxy.replica.spare import WithSpare
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.records import cache
 from fogft.records.record import RecordKind
@@ -140,24 +142,40 @@ def _make(config: ServerProxyConfig, answered: Callable[[Job, float], None] | No
 
     def make_node() -> RosNode:
         name = f"fogft_replica_{config.id.slot}"
-        joined[:] = [middleware.join(config.rmw, name, config.domain_id, environ=environ)]
+        joined[:] = [middleware.join(config.rmw, name, supervisor.domain_id, environ=environ)]
         return joined[0].node
 
     handshakes = HandshakeLog()
     listener = ZenohListener(config.listen, config.credentials, config.id, handshakes=handshakes)
     listener.take_records(cache.read(config.announcements) if config.announcements else ())
-    return ServerProxy(
+
+    def command(domain: int | None) -> Supervisor:
+        return Supervisor(
+            config.run, config.workdir, environ, domain_id=domain, stdout=handshakes.stdout
+        )
+
+    first = command(config.domain_id)
+    reserved = reserve_domain({own_domain(first.environ)}) if config.spare else None
+    if config.spare and reserved is None:
+        log.error("spare_off reason='no ROS domain is free here'")
+    supervisor = (
+        WithSpare(first, command(reserved.number), lambda: proxy.complete, reserved)
+        if reserved is not None
+        else first
+    )
+    proxy = ServerProxy(
         config.id,
         config.services,
         listener,
         make_node,
-        Supervisor(config.run, config.workdir, environ, stdout=handshakes.stdout),
+        supervisor,
         make_state=StateBytes,
         define=define,
         topics=config.topics,
         max_in_flight=config.max_in_flight,
         answered=answered,
     )
+    return proxy
 
 
 def run_environment(config: ServerProxyConfig) -> dict[str, str]:
@@ -172,8 +190,6 @@ def run_environment(config: ServerProxyConfig) -> dict[str, str]:
         environ["VIRTUAL_ENV"] = sys.prefix
         environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
     environ.update(config.envs)
-    if config.domain_id is not None:
-        environ["ROS_DOMAIN_ID"] = str(config.domain_id)
     return environ
 
 

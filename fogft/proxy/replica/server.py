@@ -37,6 +37,7 @@ from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.replica.responder import Responder
 from fogft.proxy.replica.service_queue import Job, limits_of
 from fogft.proxy.replica.serving_lease import HeldLease
+from fogft.proxy.replica.spare import WithSpare
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
 from fogft.records.record import Record
@@ -69,7 +70,7 @@ class ServerProxy:
         services: tuple[ServiceSpec, ...],
         listener: Listener,
         make_node: Callable[[], RosNode],
-        supervisor: Supervisor,
+        supervisor: Supervisor | WithSpare,
         *,
         make_state: Callable[[StateSpec], StateBytes] | None = None,
         define: Callable[[str], Definition] | None = None,
@@ -219,10 +220,15 @@ class ServerProxy:
         return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
 
     @property
+    def complete(self) -> bool:
+        """Whether all services can be called here."""
+        return len(self.ready) == len(self._offering.services) > 0
+
+    @property
     def idle(self) -> bool:
         """Whether all can answer, and nobody waits for it."""
         return (
-            len(self.ready) == len(self._offering.services) > 0
+            self.complete
             and not self.responder.in_flight
             and not (self._topics or self._goals or self._ordered)
         )
@@ -359,8 +365,7 @@ class ServerProxy:
         )
 
     def _detail(self) -> str:
-        services = self._offering.services
-        if services and len(self.ready) == len(services):
+        if self.complete:
             return self._state_detail() or self._topics.trouble or self._hanging_detail()
         for why in self._not_usable.values():
             return why

@@ -33,6 +33,7 @@ class Supervisor:
         backoff_s: Second and longest wait between a death and the next start; the first start
             after a death is at once. A run longer than the longest wait resets it, and so does a
             death while requests were at work.
+        domain_id: The ROS domain that it gets; None for what `environ` says.
         stdout: Descriptor for its standard output; None for our own.
     """
 
@@ -42,6 +43,7 @@ class Supervisor:
         workdir: Path,
         environ: Mapping[str, str],
         *,
+        domain_id: int | None = None,
         clock: Callable[[], float] = time.monotonic,
         backoff_s: tuple[float, float] = (0.5, 15.0),
         stdout: int | None = None,
@@ -49,7 +51,10 @@ class Supervisor:
         self._stdout = stdout
         self._command = command
         self._workdir = workdir
-        self._environ = dict(environ)
+        self.domain_id = domain_id
+        self.environ = dict(environ)
+        if domain_id is not None:
+            self.environ["ROS_DOMAIN_ID"] = str(domain_id)
         self._clock = clock
         self._backoff_s = backoff_s
         self._wait_s = 0.0  # the first restart is at once
@@ -115,7 +120,7 @@ class Supervisor:
             self._child = subprocess.Popen(
                 tied(["bash", "-c", self._command]),
                 cwd=self._workdir,
-                env=self._environ,
+                env=self.environ,
                 stdin=subprocess.DEVNULL,
                 stdout=self._stdout,
                 start_new_session=True,
