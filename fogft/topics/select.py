@@ -29,11 +29,15 @@ class Leader:
         self._last = 0.0
         self._quiet_s = QUIET_LIMIT_S
 
+    def would_pass(self, replica: int, now: float) -> bool:
+        """Whether a message of a replica's would be the robot's (`now`: monotonic seconds)."""
+        return self._leader in (None, replica) or now - self._last > self._quiet_s
+
     def passes(self, replica: int, now: float) -> bool:
-        """Whether a message of a replica's is the robot's (`now`: monotonic seconds)."""
+        """Take a message of a replica's; return whether it is the robot's."""
+        if not self.would_pass(replica, now):
+            return False
         if replica != self._leader:
-            if self._leader is not None and now - self._last <= self._quiet_s:
-                return False
             self._leader, self._quiet_s = replica, QUIET_LIMIT_S
         else:
             self._quiet_s = min(max(QUIET_S, 2 * (now - self._last)), QUIET_LIMIT_S)
@@ -62,6 +66,10 @@ class Selection:
         if self._select is Select.GOAL:
             return self._of_goal(message[_GOAL]).passes(replica, now)
         return self._select is not Select.LEADER or self._leader.passes(replica, now)
+
+    def wants(self, replica: int, now: float) -> bool:
+        """Whether to ask a replica for messages: not where all that it says would be dropped."""
+        return self._select is not Select.LEADER or self._leader.would_pass(replica, now)
 
     def _first_of_its_stamp(self, replica: int, message: bytes, now: float) -> bool:
         stamp = message[:2] + message[_STAMP]

@@ -190,6 +190,39 @@ def test_every_message_of_a_replica_comes_back_once_and_in_order(seed):
     assert world.robot_node.published["/back"] == said
 
 
+def test_only_the_leader_is_asked_and_another_one_when_it_is_silent_or_gone():
+    """What the others say would be dropped, so it is not sent; nor passed later, as old news."""
+    world = World(BACK, replicas=2)
+    both = range(2)
+
+    def say(slots, message) -> list[bytes]:
+        for slot in slots:
+            world.nodes[slot].heard["/back"](message)
+        before = len(world.robot_node.published["/back"])
+        for _ in range(3):
+            world.carry()
+        return world.robot_node.published["/back"][before:]
+
+    for _ in range(3):
+        world.carry()
+    for number in range(10):
+        world.clock.now += 0.1
+        assert say(both, b"m%d" % number) == [b"m%d" % number]
+    counted = world.robot.report()["/back"]
+    assert counted["dropped"] <= 1  # of the pull that was out when nobody led
+    assert counted["passed"] == 10
+    follower = 1  # the first answers first
+    world.clock.now += 0.5
+    assert say([follower], b"while the leader is quiet") == []
+    world.clock.now += 1.0
+    assert say([], b"") == []  # it is asked from now on
+    assert say([follower], b"now") == [b"now"]
+    world.links.pop(follower)
+    world.route()
+    assert say([0], b"old") == []
+    assert say([0], b"new") == [b"new"]
+
+
 def test_a_pull_is_held_until_there_is_something_and_not_for_ever():
     world = World(BACK)
     world.carry()  # where to begin

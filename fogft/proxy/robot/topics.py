@@ -152,6 +152,8 @@ class RobotTopic:
                 continue
             if self.topic.origin is Origin.ROBOT:
                 self._send_messages(way, link)
+            elif not (self.topic.latched or self._selection.wants(key, now)):
+                way.session = frames.NO_SESSION  # later, it begins with what comes then
             elif not way.out:
                 pull = frames.encode_pull(way.session, way.after)
                 self._offer(way, link, 0, pull, _PULL_S)
