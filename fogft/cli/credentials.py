@@ -214,8 +214,8 @@ def export(
 ) -> None:
     """Write a sealed file that moves a pool to another machine.
 
-    This machine manages it no more; only `fogft import` makes it manageable again, here or there.
-    Replicas and this machine's client proxy go on answering.
+    This machine stops managing it; `fogft import` resumes that, here or there. Replicas and this
+    machine's client proxy continue to answer.
     """
     from fogft.pool.commands import moving
     from fogft.pool.credentials.bundle import new_passphrase
@@ -232,11 +232,11 @@ def export(
     output.data(str(file))
     if own is None:
         output.say(f"passphrase: {passphrase}")
-    output.done(f"`{pool}` is exported; this machine manages it no more")
+    output.done(f"`{pool}` is exported; this machine no longer manages it")
     if identity.cloud != composition.LOCAL:
         output.warn(
-            "the file has nothing of SkyPilot's own state: use the same API server there, or copy "
-            "`~/.sky` and `~/.ssh/sky-key*` before the import"
+            "the file does not contain SkyPilot's own state: use the same API server there, or "
+            "copy `~/.sky` and `~/.ssh/sky-key*` before the import"
         )
     output.hint(f"run `fogft import {file.name}` on the other machine within {hours:g} hours, then "
                 f"`fogft down {pool}` here")  # fmt: skip

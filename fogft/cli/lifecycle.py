@@ -175,8 +175,8 @@ def down(
 ) -> None:
     """Shut down a pool: its replicas, client proxy and manager.
 
-    Works even if the manager is dead, and is safe to repeat. Of a pool that was exported, ends
-    only what this machine still runs.
+    Works even if the manager is dead, and is safe to repeat. If the pool was exported, ends only
+    what this machine still runs.
     """
     from fogft.pool.manager import shutdown
     from fogft.ros import shared_memory

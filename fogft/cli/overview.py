@@ -118,9 +118,8 @@ def _when(at: float) -> str:
 def cost(pool: PoolArgument = None, as_json: AsJson = False, named: PoolOption = None) -> None:
     """Show what a pool has cost so far, by day (UTC) and replica.
 
-    Every look of the manager is charged at the price of that time: machines, and on real clouds
-    their disks, addresses and what leaves the cloud. Without a name, of all pools, also of those
-    that have ended.
+    Charges each interval at its own price: machines, and on real clouds their disks, addresses
+    and egress. Without a name, shows all pools, including those that have ended.
     """
     from fogft.pool.folder.costs import read_all
     from fogft.pool.folder.paths import home

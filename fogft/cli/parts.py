@@ -51,7 +51,10 @@ def proxy(
     metrics: Metrics = None,
     *,
     standby: Annotated[
-        bool, typer.Option("--standby", help="Where one runs, wait, and take its place at its end.")
+        bool,
+        typer.Option(
+            "--standby", help="Wait while another proxy runs, and take over when it ends."
+        ),
     ] = False,
 ) -> None:
     """Run a client proxy: the robot's side of a pool.
@@ -109,7 +112,10 @@ def manager(
     *,
     metrics: Metrics = None,
     no_proxy: Annotated[
-        bool, typer.Option("--no-proxy", help="Start no client proxy: systemd does, for instance.")
+        bool,
+        typer.Option(
+            "--no-proxy", help="Do not start a client proxy, for example because systemd does."
+        ),
     ] = False,
 ) -> None:
     """Run a pool's manager: it observes the pool, plans and launches."""
@@ -146,15 +152,19 @@ def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> N
 # -- started by systemd ------------------------------------------------------------------
 
 System = Annotated[
-    bool, typer.Option("--system", help="Units of the machine instead of this user's; as root.")
+    bool, typer.Option("--system", help="System units instead of user units; needs root.")
 ]
 Gateway = Annotated[
     Path | None,
-    typer.Option("--gateway", metavar="FILE", help="A gateway with this configuration instead."),
+    typer.Option(
+        "--gateway", metavar="FILE", help="Install a gateway with this configuration instead."
+    ),
 ]
 Rendezvous = Annotated[
     Path | None,
-    typer.Option("--rendezvous", metavar="FILE", help="A rendezvous with this one instead."),
+    typer.Option(
+        "--rendezvous", metavar="FILE", help="Install a rendezvous with this configuration instead."
+    ),
 ]
 
 service = group("Have systemd start what a pool needs at boot, and restart it.")
@@ -182,7 +192,7 @@ def install(
 ) -> None:
     """Write units for the manager and two client proxies, and start them.
 
-    They get the present environment: source ROS 2 first. What runs already hands over.
+    Units get the current environment, so source ROS 2 first. Running processes hand over.
     """
     from fogft.pool.commands import service as units
 

@@ -49,8 +49,8 @@ def orphaned_processes(situation: Situation) -> Iterator[Finding]:
     yield warn(
         "leftovers",
         f"{len(orphans)} processes of replicas run whose pool is not in `{situation.home}`",
-        "they belong to a pool of another state folder: with that in FOGFT_HOME `fogft list` shows "
-        "it and `fogft down` ends it. Where the folder is lost they end by `unmanaged_max_hours`",
+        "they belong to a pool in another state folder: set FOGFT_HOME to it, and `fogft down` "
+        "ends the pool. If the folder is lost, they end after `unmanaged_max_hours`",
     )
 
 

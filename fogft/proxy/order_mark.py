@@ -51,7 +51,7 @@ class OrderMark:
         self._words = memoryview(self._map).cast("Q")
         self._version = self.holder or ""
         if self._words[0] != _MAGIC or self._words[1] != uid:
-            raise StateError(f"`{path}` is not a mark of this pool", "move it away")
+            raise StateError(f"`{path}` is not the order mark of this pool", "move it away")
 
     @property
     def position(self) -> Position:

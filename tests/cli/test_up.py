@@ -392,7 +392,7 @@ def test_refresh_without_a_manager_asks_the_cloud_and_says_so(home, capsys):
 def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
     paths = lay_down(home)
     with disk.locked(paths.manager_lock):
-        with pytest.raises(FogftError, match="did not look again"):
+        with pytest.raises(FogftError, match="did not refresh"):
             refreshed(composition.make_store("planner"), limit_s=0.2)
 
 

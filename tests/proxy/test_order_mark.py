@@ -56,5 +56,5 @@ def test_a_foreign_or_damaged_file_is_refused(tmp_path, content):
 
 def test_the_mark_of_another_pool_is_refused(tmp_path):
     OrderMark(tmp_path / "m", UID).close()
-    with pytest.raises(StateError, match="not a mark of this pool"):
+    with pytest.raises(StateError, match="not the order mark of this pool"):
         OrderMark(tmp_path / "m", "f" * 16)

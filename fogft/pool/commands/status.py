@@ -190,7 +190,7 @@ def renewed(paths: PoolPaths, limit_s: float) -> Seen:
             return seen
         if not seen.manager_alive or time.monotonic() >= deadline:
             raise StateError(
-                f"the manager of `{seen.status.pool}` did not look again within {limit_s:.0f} s",
+                f"the manager of `{seen.status.pool}` did not refresh within {limit_s:.0f} s",
                 "see `fogft logs`; `fogft status` shows what it saw last",
             )
         time.sleep(_LOOK_EVERY_S)

@@ -139,7 +139,7 @@ def describe_pem(pem: bytes) -> Description:
     try:
         return _described(x509.load_pem_x509_certificate(pem))
     except ValueError as error:
-        raise CredentialError("a certificate that is none") from error
+        raise CredentialError("not a certificate") from error
 
 
 def _described(certificate: x509.Certificate) -> Description:

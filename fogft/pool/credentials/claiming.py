@@ -109,7 +109,7 @@ def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record
 def _used_elsewhere(holder: Holder) -> CredentialError:
     return CredentialError(
         f"this bundle for `{holder.short}` was used before, on another machine",
-        "a bundle can be used once: have a new one issued. If nobody of yours has used it: "
+        "a bundle can be used once: have a new one issued. If you do not know who used it, run "
         f"`fogft credentials revoke {holder.role.value} {holder.name}`",
     )
 
@@ -117,7 +117,7 @@ def _used_elsewhere(holder: Holder) -> CredentialError:
 def _nobody_tells(client: RendezvousClient) -> CredentialError:
     said = "; ".join(str(one["detail"]) for one in client.status()["rendezvous"])
     return CredentialError(
-        "no rendezvous of the pool tells whether this bundle was used on another machine"
+        "no rendezvous of the pool could confirm that this bundle is unused"
         + (f": {said}" if said.strip("; ") else ""),
-        "join while one runs and can be reached from here; the bundle is as good as before",
+        "join when one can be reached from here; the bundle stays valid",
     )

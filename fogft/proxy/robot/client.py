@@ -239,7 +239,7 @@ class ClientProxy:
             RosError: The node's thread has ended: nothing would be taken any more.
         """
         if self._node is not None and not self._node.alive:
-            raise RosError("ROS does not go on; the log says why", "start the proxy again")
+            raise RosError("ROS has stopped; the log says why", "start the proxy again")
         self._wake.wait(max(0.0, min(timeout_s, self._next_look - self._clock())))
         self._wake.clear()
         changed, self._changed = self._changed, False
