@@ -83,7 +83,7 @@ class Buyer:
 
     @cached_property
     def _spent_before(self) -> float:
-        return sum(self._price(s) for s in self.machines.everyone())
+        return sum(self.price(s) for s in self.machines.everyone())
 
     @property
     def _spent(self) -> float:
@@ -125,7 +125,7 @@ class Buyer:
             return False
         if not self._is_within_limit(on_demand=not choice.offer.placement.spot):
             return False
-        generation = self._next_generation(need.slot)
+        generation = self.next_generation(need.slot)
         self.launches.append(PlannedLaunch(need.slot, generation, choice.offer, reason))
         return True
 
@@ -192,11 +192,15 @@ class Buyer:
         """Location -> losses of spot machines per hour."""
         return hazards(self.history, self.observed.now)
 
+    def losses_per_hour(self, placement: Placement) -> float:
+        """Return how often machines of a place are lost; on demand, never."""
+        return self.hazards.get(placement.location, UNKNOWN) if placement.spot else 0.0
+
     def score(self, placement: Placement, usd_per_hour: float) -> float:
         """Return the score of a place: price, distance and losses. Lower is better."""
         found = self.scale.score_of(usd_per_hour, self.scale.latency(placement))
         if placement.spot:
-            found += penalty(self.hazards.get(placement.location, UNKNOWN)) - penalty(UNKNOWN)
+            found += penalty(self.losses_per_hour(placement)) - penalty(UNKNOWN)
         return found
 
     def whole_market(self, group: Group, spot: bool | None) -> Market:
@@ -249,10 +253,10 @@ class Buyer:
         taken = [s.placement for s in stay]
         return taken + [launch.offer.placement for launch in self.launches]
 
-    def _price(self, replica: Assessment) -> float:
-        """Return what a machine costs: as ordered, or more where its spot price has risen."""
-        placement = replica.placement
-        return max(replica.machine.usd_per_hour, self._catalogue.cheapest.get(placement, 0.0))
+    def price(self, replica: Assessment) -> float:
+        """Return what a machine costs: today's price where that is known, else as ordered."""
+        group = group_of(self.groups, replica.slot).name
+        return self._catalogue.today.get((group, replica.placement), replica.machine.usd_per_hour)
 
     def _choose(self, need: Need, budget: float | None) -> tuple[Choice, Reason]:
         old = need.replaces
@@ -274,13 +278,13 @@ class Buyer:
 
     def _make_room(self, need: Need, cap: float) -> None:
         """Under a cap, a silent machine that blocks its own replacement goes first."""
-        left = cap - self._spent + sum(self._price(s) for s in self.machines.ending)
+        left = cap - self._spent + sum(self.price(s) for s in self.machines.ending)
         if self._choose(need, left)[0].offer is not None:
             return  # what is being ended already makes room enough
         for replica in self.machines.lost:
             if replica.verdict is not Verdict.UNRESPONSIVE:
                 continue
-            if self._choose(need, left + self._price(replica))[0].offer is not None:
+            if self._choose(need, left + self.price(replica))[0].offer is not None:
                 full = Reason(Cause.BUDGET_FULL, because=because(replica.why))
                 self.ended_for_room.append((replica, full))
                 return
@@ -293,10 +297,11 @@ class Buyer:
         """Whether there is room for a successor once the one that it replaces is gone."""
         if self.cap is None:
             return True
-        left = self.cap - self._spent + self._price(old)
+        left = self.cap - self._spent + self.price(old)
         return self._choose(need, left)[0].offer is not None
 
-    def _next_generation(self, slot: int) -> int:
+    def next_generation(self, slot: int) -> int:
+        """Return the generation of a slot's next launch."""
         listed = [s.id.generation for s in self.machines.everyone() if s.slot == slot]
         known = [self.history.generation(slot), self.intent.drained.get(slot, 0)]
         return max([*known, *listed]) + 1

@@ -6,6 +6,7 @@ Not here: health (`health`), and moving those that could be better placed (`migr
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -43,14 +44,14 @@ class Classification:
     aborted: list[Assessment] = field(default_factory=list)
     ending: list[Assessment] = field(default_factory=list)
 
+    @property
+    def _kinds(self) -> tuple[list[Assessment], ...]:
+        kept = self.good, self.replaced, self.lost
+        return (*kept, self.failed, self.aborted, self.ending)
+
     def everyone(self) -> Iterator[Assessment]:
         """Yield every machine."""
-        yield from self.good
-        yield from self.replaced
-        yield from self.lost
-        yield from self.failed
-        yield from self.aborted
-        yield from self.ending
+        return itertools.chain(*self._kinds)
 
     def without(self, others: Collection[Assessment]) -> Classification:
         """Return the same without some of those that work."""
@@ -62,19 +63,8 @@ class Classification:
         """Return the part that counts for a group; it is not to be changed."""
         if len(groups) == 1:
             return self
-        return Classification(
-            *(
-                [s for s in kind if group_of(groups, s.slot) is group]
-                for kind in (
-                    self.good,
-                    self.replaced,
-                    self.lost,
-                    self.failed,
-                    self.aborted,
-                    self.ending,
-                )
-            )
-        )
+        kinds = ([s for s in kind if group_of(groups, s.slot) is group] for kind in self._kinds)
+        return Classification(*kinds)
 
     @property
     def live(self) -> int:

@@ -5,7 +5,8 @@ Where a group has `fallback`, on-demand machines in slots of their own stand in.
 the moment that a spot replica is lost, is noticed or is refused, beside the order of
 another spot machine, and end once enough others have been ready for `SETTLED_S`.
 
-While an on-demand machine serves, which nobody takes away, spot is asked for alone, and another one
+Once all are lost, one more than is wanted boots until the first of them serves. While an
+on-demand machine serves, which nobody takes away, spot is asked for alone, and another one
 stands in only once that was refused. Nor is a slot short whose first machine is still booting.
 
 Owns: who stands in, and how many are missing.
@@ -22,8 +23,8 @@ from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment
 from fogft.planning.observed.history import History
 
-# A quarter of all losses come within minutes of the order.
-SETTLED_S = 60.0
+# Longer would cost more than the few losses that it bridges: others serve.
+SETTLED_S = 20.0
 # Under a cap that has no room for both, a stand-in makes way for a spot machine after so long.
 STAYS_S = 600.0
 # Where spot machines are lost so often, one of a group is on demand. An hour of it then costs
@@ -89,7 +90,9 @@ def missing(
     covered = sum(
         s.ever_ready or is_first(s.slot, s.id.generation, history, safe=safe) for s in kept
     )
-    return wanted - covered - len(standing_in)
+    ever_served = any(map(history.served, history.generations))
+    racing = _racing(wanted, standing_in) if ever_served and not covered else 0
+    return wanted + racing - covered - len(standing_in)
 
 
 def spare(
@@ -107,7 +110,13 @@ def spare(
     settled_s = 0.0 if held and any(s.serving for s in standing_in) else SETTLED_S
     settled = sum(has_served(s, settled_s, now) for s in (*here.good, *here.replaced))
     kept = sum(not s.unwanted for s in standing_in)
-    return kept - max(0, wanted - settled)
+    racing = 0 if settled else _racing(wanted, standing_in)
+    return kept - max(0, wanted + racing - settled)
+
+
+def _racing(wanted: int, standing_in: Sequence[Assessment]) -> int:
+    """Return 1 where none stands in yet: of machines that boot at once the fastest decides."""
+    return int(wanted > 1 and not any(s.serving for s in standing_in))
 
 
 def has_served(replica: Assessment, for_s: float, now: float) -> bool:

@@ -72,11 +72,12 @@ class Catalogue:
         self._listings: dict[object, Listing] = {}
 
     @cached_property
-    def cheapest(self) -> Mapping[Placement, float]:
-        """Placement -> the least that is asked for it, of whichever group."""
-        out: dict[Placement, float] = {}
-        for offer in self.offers:
-            out[offer.placement] = min(offer.usd_per_hour, out.get(offer.placement, math.inf))
+    def today(self) -> Mapping[tuple[str, Placement], float]:
+        """Group and placement -> the least that is asked for it."""
+        out: dict[tuple[str, Placement], float] = {}
+        for offer in filter(is_possible, self.offers):
+            key = offer.group, offer.placement
+            out[key] = min(offer.usd_per_hour, out.get(key, math.inf))
         return out
 
     @cached_property

@@ -4,11 +4,12 @@ Only a pool that is whole and quiet moves anything, one replica at a time, the n
 A replica moves when
 
 * it is on demand and should be spot, or the other way round; or
-* its new place would leave the pool better spread over clouds, regions or zones; or
-* the spread stays as it is, and its score falls by `gain`.
+* its new place would leave the pool better spread over clouds, regions or zones, where they are
+  not lost `TOO_OFTEN`; or
+* the spread stays as it is, and its score falls by `gain`, or at all where far fewer are lost.
 
 It has then been ready for `stay_s`, and the new place neither backs off nor is avoided, nor has it
-refused within an hour. To move back, the scores must swing by twice the gain: so while prices
+refused within an hour. To move back, they must swing by twice as much: so while prices
 waver within it nobody returns to where he was, and with steady offers every move lowers the
 crowding or the sum of the scores, so that moves come to an end.
 
@@ -27,9 +28,13 @@ from fogft.model.replica import ReplicaId
 from fogft.model.scoring import gain
 from fogft.planning.buying import Buyer
 from fogft.planning.classification import Classification
-from fogft.planning.listing import catalogue
 from fogft.planning.observed.health import Assessment, Health
 from fogft.planning.placement import Choice, Crowd, crowding
+
+# Far fewer losses: this part of them.
+CALMER = 0.6
+# Losses an hour with which no better spread is worth a move: lower, and outages of a region count.
+TOO_OFTEN = 1.0
 
 
 def is_quiet(machines: Classification, health: Health) -> bool:
@@ -86,7 +91,7 @@ def _would_move(buyer: Buyer, replica: Assessment) -> bool:
     market = buyer.whole_market(group_of(buyer.groups, replica.slot), kind)
     count = crowding(buyer.places(replica))
     choice = market.choose(count, budget_usd_per_hour=buyer.budget)
-    return _is_better(buyer, replica, choice, count) is not None
+    return _is_better(buyer, replica, choice, count, at_most=True) is not None
 
 
 def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | None:
@@ -107,14 +112,22 @@ def _moves(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Iterato
         if replica.id not in restless or not _stayed(replica, rules.stay_s, now):
             continue
         count = crowding(buyer.places(replica))
-        choice = _best(buyer, replica, count, at_leisure=True)
+        group = group_of(buyer.groups, replica.slot)
+        market = buyer.market(group, buyer.kind(group, replica), at_leisure=True)
+        choice = market.choose(count, budget_usd_per_hour=buyer.budget)
         move = _is_better(buyer, replica, choice, count)
         if move is not None:
             yield move
 
 
-def _is_better(buyer: Buyer, replica: Assessment, choice: Choice, count: Crowd) -> Move | None:
-    """Return the move to a place if that is so much better."""
+def _is_better(
+    buyer: Buyer, replica: Assessment, choice: Choice, count: Crowd, *, at_most: bool = False
+) -> Move | None:
+    """Return the move to a place if that is so much better.
+
+    Args:
+        at_most: It is the best of all: could it, or one that is less good, be worth a move?
+    """
     rules, placement = buyer.spec.migration, replica.placement
     offer, (avoided, *there) = choice.offer, choice.rank
     if rules is None or offer is None or avoided or offer.placement == placement:
@@ -124,28 +137,19 @@ def _is_better(buyer: Buyer, replica: Assessment, choice: Choice, count: Crowd) 
         cause = Cause.SPOT_AGAIN if kind else Cause.ON_DEMAND_AGAIN
         return Move(replica, Reason(cause, location=offer.placement.location), (-1.0,))
     here = [count[domain] for domain in placement.domains]
-    if there < here:
+    losses, losses_there = (buyer.losses_per_hour(p) for p in (placement, offer.placement))
+    if there < here and (at_most or losses_there <= max(losses, TOO_OFTEN)):
         why = Reason(Cause.BETTER_SPREAD, location=offer.placement.location)
         return Move(replica, why, (0.0, *there))
-    better = gain(_score(buyer, replica), buyer.score(offer.placement, offer.usd_per_hour))
-    if there == here and better >= rules.gain:
+    better = gain(
+        buyer.score(placement, buyer.price(replica)),
+        buyer.score(offer.placement, offer.usd_per_hour),
+    )
+    is_calmer = better > 0 and (at_most or losses_there <= CALMER * losses)
+    if there == here and (better >= rules.gain or is_calmer):
         why = Reason(Cause.BETTER_SCORE, location=offer.placement.location, share=better)
         return Move(replica, why, (1.0, -better))
     return None
-
-
-def _best(buyer: Buyer, replica: Assessment, count: Crowd, *, at_leisure: bool = False) -> Choice:
-    group = group_of(buyer.groups, replica.slot)
-    market = buyer.market(group, buyer.kind(group, replica), at_leisure=at_leisure)
-    return market.choose(count, budget_usd_per_hour=buyer.budget)
-
-
-def _score(buyer: Buyer, replica: Assessment) -> float:
-    """Return the score of where it is, at today's price there if that is known."""
-    machine = replica.machine
-    today = catalogue(buyer.observed.offers).cheapest
-    price = today.get(machine.placement, machine.usd_per_hour)
-    return buyer.score(machine.placement, price)
 
 
 def _stayed(replica: Assessment, stay_s: float, now: float) -> bool:

@@ -175,9 +175,9 @@ def plan_once(
     sought = [count - kept for count, kept in zip(counts, held, strict=True)]
     needs = needed_launches(sized.groups, sought, others, history, settling=settling)
     may_move = not needs and not standing_in and len(machines.good) == wanted and spec.max_surge > 0
-    may_move = may_move and migration.is_quiet(machines, health)
     waits = False
-    restless = migration.restless(buyer) if may_move else frozenset()
+    is_quiet = may_move and migration.is_quiet(machines, health)
+    restless = migration.restless(buyer) if is_quiet else frozenset()
     found = migration.mover(buyer, observed.now, restless) if restless else None
     if found is not None:
         machines.good.remove(found.replica)
@@ -189,24 +189,25 @@ def plan_once(
     begun = {
         need.slot
         for need in needs
-        if fallback.is_first(need.slot, history.generation(need.slot) + 1, history, safe=safe)
+        if fallback.is_first(need.slot, buyer.next_generation(need.slot), history, safe=safe)
     }
     stand_ins_missing = partial(
         _stand_ins_missing, sized.groups, counts, others, standing_in, history=history, safe=safe
     )
     short = stand_ins_missing(begun)
-    kept_free = _kept_free(len(short), room, machines) if not standing_in else 0
+    kept_free = _urgent_first(buyer, short, room)
     for need in needs:
         if not buyer.buy(need, room=room - kept_free):
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
             first = first or _stand_in_to_go(need, buyer, wanted, room)
             waits = True
             break
-    for need in stand_ins_missing(begun.intersection(x.slot for x in buyer.launches)):
-        buyer.buy(need, room=room)
-    staying: Sequence[ReplicaId] = ()
-    if settling:
-        staying = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
+    ordered = {launch.slot for launch in buyer.launches}
+    for need in stand_ins_missing(begun & ordered):
+        if need.slot not in ordered:
+            buyer.buy(need, room=room)
+    outdated = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
+    staying = outdated if settling else []
     endings = Endings()
     # No group's surplus is another's.
     for group, count, kept in zip(sized.groups, counts, held, strict=True):
@@ -228,12 +229,12 @@ def plan_once(
                 spare=fallback.spare(count, here, mine, observed.now, held=kept),
             )
         )
-    ends = [
-        PlannedEnd(s.id, s.why or Reason(Cause.NOT_WANTED))
-        for s in (*machines.failed, *machines.aborted)
+    going = [
+        *((s, s.why or Reason(Cause.NOT_WANTED)) for s in (*machines.failed, *machines.aborted)),
+        *endings.now,
+        *((s, why) for s, why in buyer.ended_for_room if s.id not in endings.ids),
     ]
-    ends += [PlannedEnd(s.id, why) for s, why in endings.now]
-    ends += [PlannedEnd(s.id, why) for s, why in buyer.ended_for_room if s.id not in endings.ids]
+    ends = [PlannedEnd(s.id, why) for s, why in going]
     notes = [*sized.notes, *excess, *buyer.notes, *endings.notes]
     if health.uplink_suspected:
         notes.insert(0, Reason(Cause.UPLINK_SUSPECTED))
@@ -255,13 +256,19 @@ def plan_once(
     )
 
 
-def _kept_free(short: int, room: int, machines: Classification) -> int:
-    """Return how many of the machines that there is room for are to be stand-ins.
+def _urgent_first(buyer: Buyer, short: Sequence[Need], room: int) -> int:
+    """Order stand-ins before all else where nobody serves; return how much room is kept for them.
 
-    One, as long as somebody serves. Else a spot machine may be refused, and boots no faster.
+    One machine's, as long as somebody serves. Else spot, which may be refused and boots no faster,
+    has what they leave; under a cap it comes first, for one dear machine might be all there is.
     """
-    serves = any(s.may_serve for s in (*machines.good, *machines.replaced))
-    return max(0, min(1 if serves else short, short, room - 1))
+    serves = any(s.may_serve for s in (*buyer.machines.good, *buyer.machines.replaced))
+    if buyer.cap is None and not serves:
+        for need in short:
+            buyer.buy(need, room=room)
+        return 0
+    most = 1 if serves else len(short)
+    return 0 if buyer.standing_in else max(0, min(most, len(short), room - 1))
 
 
 def _held(
@@ -299,8 +306,8 @@ def _stand_ins_missing(
             continue
         here = [s for s in standing_in if group_of(groups, s.slot) is group and not s.unwanted]
         mine = others.part(groups, group)
-        lacking = fallback.missing(count, mine, here, history, safe=safe)
-        for _ in range(lacking - sum(group_of(groups, slot) is group for slot in begun)):
+        first = sum(group_of(groups, slot) is group for slot in begun)
+        for _ in range(fallback.missing(count - first, mine, here, history, safe=safe)):
             need = stand_in(group, used)
             used.add(need.slot)
             needs.append(need)

@@ -38,8 +38,6 @@ def unavailability(uptime_s: float, recovery_s: float) -> float:
 def system_unavailability(replicas: Iterable[float]) -> float:
     """Return the fraction of time that no replica answers.
 
-    Assumes that replicas fail independently.
-
     Args:
         replicas: The unavailability of each, in [0, 1]. Of none, nothing ever answers.
 
@@ -57,9 +55,7 @@ def system_unavailability(replicas: Iterable[float]) -> float:
 def replicas_needed(availability: float, target: float, *, limit: int = 16) -> int:
     """Return the fewest replicas that together reach a target availability.
 
-    Assumes that replicas fail independently, so that all n are down with probability
-    ``(1 - availability) ** n``. Replicas in one zone are preempted together: spread them
-    over zones before trusting the result.
+    All n are down with probability ``(1 - availability) ** n``.
 
     Args:
         availability: Fraction of time that one replica answers, in (0, 1].

@@ -44,6 +44,21 @@ def test_at_a_notice_a_stand_in_is_ordered_beside_another_spot_machine():
     assert ordered(world(spot(0), spot(1, state="noticed"))) == [(1, True), (STAND_INS, False)]
 
 
+def test_when_all_are_lost_one_stand_in_more_than_is_wanted_boots_until_the_first_serves():
+    """As many as the surge allows; spot machines are asked for beside those that serve."""
+    both = spot(0, state="noticed"), spot(1, state="noticed")
+    slots = [STAND_INS, STAND_INS + 1, STAND_INS + 2]
+    assert ordered(world(*both)) == [(slot, False) for slot in slots]
+    at = {"at": replace(PLACES[3], spot=False), "price": 0.3, "of": MIXED}
+    serving = replica(slots[0], **at)
+    booting = [replica(slot, state="provisioning", **at) for slot in slots[1:]]
+    alone = world(*both, replica(slots[0], state="provisioning", **at), *booting).plan()
+    assert not alone.launches
+    assert not alone.terminations
+    later = world(*both, serving, *booting).plan()
+    assert [end.id.slot for end in later.terminations] == [slots[2]]
+
+
 def test_while_an_on_demand_machine_serves_spot_is_asked_first():
     """Nobody takes it away, so one more loss is not urgent; a refusal is."""
     three = replace(MIXED, replicas=3, on_demand=OnDemandSpec(1, fallback=True))

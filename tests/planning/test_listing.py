@@ -57,9 +57,9 @@ def test_what_is_kept_is_what_would_be_worked_out(sold, others, asked):
 def test_a_list_that_changes_is_looked_at_each_time():
     place = Placement("a", "r", "1", "m")
     sold = [Offer(place, 0.1)]
-    assert catalogue(sold).cheapest == {place: 0.1}
+    assert catalogue(sold).today == {("", place): 0.1}
     sold[0] = Offer(place, 0.2)
-    assert catalogue(sold).cheapest == {place: 0.2}
+    assert catalogue(sold).today == {("", place): 0.2}
 
 
 @given(offers)

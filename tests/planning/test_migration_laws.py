@@ -104,3 +104,25 @@ def test_what_was_planned_before_changes_no_plan(
     world.plan()
     fresh = replace(world, spec=replace(world.spec))
     assert world.plan() == fresh.plan()
+
+
+def test_calmer_places_are_moved_to_and_restless_ones_are_not_for_spread_alone() -> None:
+    """Both replicas are in one zone. Ten losses in a day speak against another region."""
+    one = spec(2, migration=MigrationSpec(0.3, 60.0))
+    here, elsewhere = PLACES[0], PLACES[-1]
+    offers = tuple(Offer(place, 0.1) for place in (here, elsewhere))
+    world = World(one, offers=offers).having(
+        *(replica(slot, at=here, age_s=9000.0, price=0.1, of=one) for slot in (0, 1))
+    )
+    assert [x.offer.placement for x in world.plan().launches] == [elsewhere]
+    lost = [
+        Event(NOW - 90_000 + 7000 * n + after_s, kind, 9, n + 1, elsewhere.location)
+        for n in range(10)
+        for after_s, kind in ((0, EventKind.LAUNCH), (100, EventKind.READY), (900, EventKind.GONE))
+    ]
+    assert not replace(world, events=(*lost, *world.events)).plan().launches
+    lone = replace(one, replicas=1)
+    there = World(lone, offers=offers).having(replica(0, at=elsewhere, age_s=9000.0, of=lone))
+    assert [
+        x.offer.placement for x in replace(there, events=(*lost, *there.events)).plan().launches
+    ] == [here]

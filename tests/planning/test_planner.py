@@ -54,8 +54,8 @@ def test_notice_is_replaced_at_once_elsewhere_and_kept_until_then() -> None:
     assert ends(world) == []
 
 
-def test_a_spot_price_that_has_risen_counts_against_the_budget() -> None:
-    """The machine at A was ordered for 0.1 and costs 0.3 now: no room for another one."""
+def test_the_price_of_today_counts_against_the_budget() -> None:
+    """The machine at A was ordered for 0.1 and costs 0.3 now: no room; or the other way round."""
     dearer = (replace(OFFERS[0], usd_per_hour=0.3), *OFFERS[1:])
     world = World(spec(2, max_usd_per_hour=0.35)).having(replica(0, at=A))
     assert launches(world) == ["1.1"]
@@ -63,6 +63,8 @@ def test_a_spot_price_that_has_risen_counts_against_the_budget() -> None:
     assert planned.launches == ()
     [left] = planned.notes[0].because
     assert (left.cause, left.limit_usd_per_hour) == (Cause.OVER_BUDGET, pytest.approx(0.05))
+    fallen = World(spec(2, max_usd_per_hour=0.35)).having(replica(0, at=A, price=0.3))
+    assert launches(fallen) == ["1.1"]
 
 
 def test_a_rebalance_is_an_early_hint() -> None:

@@ -129,10 +129,13 @@ def test_what_a_plan_orders_it_does_not_end(world: World) -> None:
 @many
 @given(worlds())
 def test_budget_and_exclusions_hold_for_every_launch(world: World) -> None:
-    """No launch exceeds `max_usd_per_hour`, and none goes to an excluded location."""
+    """No launch exceeds `max_usd_per_hour` at today's prices; none goes to an excluded location."""
     planned = world.plan()
     cap = world.spec.max_usd_per_hour
-    spent = sum(m.usd_per_hour for m in world.machines or () if m.id.pool_uid == UID)
+    dearest_first = sorted(world.offers, key=lambda offer: -offer.usd_per_hour)
+    today = {offer.placement: offer.usd_per_hour for offer in dearest_first}
+    ours = [m for m in world.machines or () if m.id.pool_uid == UID]
+    spent = sum(today.get(m.placement, m.usd_per_hour) for m in ours)
     if planned.launches and cap is not None:
         assert spent + sum(launch.offer.usd_per_hour for launch in planned.launches) <= cap + 1e-6
     for launch in planned.launches:

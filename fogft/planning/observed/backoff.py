@@ -93,7 +93,7 @@ def backing_off(history: History, now: float) -> Mapping[str, Backoff]:
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """
-    supplies = history.of_supplies(_outlook, _summed_up, now)
+    supplies = history.of_places(history.failures, _outlook, _summed_up, now)
     everywhere = _everywhere(history, supplies.setup, now) if supplies.setup else None
     return (
         supplies.backing_off
@@ -107,7 +107,7 @@ def recently_failed(history: History, now: float) -> Mapping[str, Backoff]:
 
     Only the last failure counts.
     """
-    return history.of_supplies(_outlook, _summed_up, now).recently_failed
+    return history.of_places(history.failures, _outlook, _summed_up, now).recently_failed
 
 
 def _outlook(history: History, supply: str, now: float) -> Expiring[_Outlook | None]:
@@ -213,7 +213,7 @@ class _Avoided(NamedTuple):
 
 def avoided(history: History, now: float) -> Mapping[str, float]:
     """Return the locations to use only when no other is left, and until when."""
-    return history.of_losses(_avoidance, _all_avoided, now).until
+    return history.of_places(history.losses, _avoidance, _all_avoided, now).until
 
 
 def _avoidance(history: History, location: str, now: float) -> Expiring[_Avoidance | None]:
@@ -243,7 +243,7 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
         waits: For the end of a pause; see `Plan`.
         restless: Somebody could be better off elsewhere.
     """
-    supplies = history.of_supplies(_outlook, _summed_up, now)
+    supplies = history.of_places(history.failures, _outlook, _summed_up, now)
     times: list[float] = []
     if supplies.setup:
         times += _everywhere_changes(history, supplies.setup, now)
@@ -254,7 +254,7 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
     if restless:
         times += [pause.until for pause in supplies.recently_failed.values()]
     if waits or restless:  # a stand-in does not return to where one was just lost
-        times.append(history.of_losses(_avoidance, _all_avoided, now).change)
+        times.append(history.of_places(history.losses, _avoidance, _all_avoided, now).change)
     return min([at for at in times if at > now], default=NEVER)
 
 

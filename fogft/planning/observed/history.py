@@ -339,30 +339,28 @@ class History:
         """Return when a replica from there last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
 
-    def of_supplies(
+    def of_places(
         self,
+        places: Mapping[str, Any],
         work_out: Callable[[History, str, float], Expiring[T | None]],
         sum_up: Callable[[Mapping[str, T]], S],
         now: float,
     ) -> S:
-        """Return what follows from the failures and proofs of each supply, summed up.
+        """Return what follows from the failures and proofs, or the losses, of places, summed up.
 
         Args:
+            places: This history's `failures` or `losses`.
             work_out: Pure, and looks at nothing else of a history. It is asked again only when
                 it may say something else. None says nothing.
             sum_up: Pure; always the same for one `work_out`.
             now: Seconds since the epoch.
         """
-        return self._follows(self._of_supplies, self._failures, work_out, sum_up, now)
-
-    def of_losses(
-        self,
-        work_out: Callable[[History, str, float], Expiring[T | None]],
-        sum_up: Callable[[Mapping[str, T]], S],
-        now: float,
-    ) -> S:
-        """Return what follows from the losses at each location; likewise."""
-        return self._follows(self._of_losses, self._losses, work_out, sum_up, now)
+        caches = self._of_losses if places is self._losses else self._of_supplies
+        cache = caches.get(work_out)
+        if cache is None:
+            cache = caches[work_out] = TtlCache(set(places), sum_up)
+        whole: S = cache.at(now, lambda place: work_out(self, place, now))
+        return whole
 
     def of_lives(
         self, work_out: Callable[[Sequence[Record], float], float], at: float
@@ -378,20 +376,6 @@ class History:
             if lives and self._of_lives.get(location, (None, 0.0))[0] != at:
                 self._of_lives[location] = at, work_out(lives, at)
         return {place: self._of_lives[place][1] for place, lives in self._lives.items() if lives}
-
-    def _follows(
-        self,
-        caches: dict[Callable[..., Any], TtlCache[Any, Any]],
-        places: Iterable[str],
-        work_out: Callable[[History, str, float], Expiring[T | None]],
-        sum_up: Callable[[Mapping[str, T]], S],
-        now: float,
-    ) -> S:
-        cache = caches.get(work_out)
-        if cache is None:
-            cache = caches[work_out] = TtlCache(set(places), sum_up)
-        whole: S = cache.at(now, lambda place: work_out(self, place, now))
-        return whole
 
     @property
     def losses(self) -> Mapping[str, list[float]]:
