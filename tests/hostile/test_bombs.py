@@ -12,25 +12,16 @@ import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import zenoh
-
 from fogft.link import frame
-from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.link.zenoh.settings import LinkSettings
-from fogft.model import names
 from fogft.model.credentials import CredentialPaths
-from fogft.records.signing import Signer
+from tests.hostile.robot import greets, session_at, target
 from tests.link.wire_pool import (
-    POOL_UID,
     SERVICE,
     Authority,
     Owner,
     ReplicaProcess,
-    hears,
     keys,
-    knows,
-    peer,
     request_id,
     wait_for,
 )
@@ -106,10 +97,9 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
     wait_for(lambda: good.usable)
     calm_s = round_trip_s(good, owner, 0)
     files = authority.robot("eve")
-    settings = config.robot_settings(peer(replica.endpoint), files, LinkSettings())
-    session = zenoh.open(config.to_zenoh(settings))
-    try:
-        token = greets(session, files)
+    at = target(replica.endpoint)
+    with session_at(at, files) as session:
+        token = greets(session, files, at)
         origin = frame.origin("eve", token)
         thrown = 0
 
@@ -126,25 +116,6 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
             took_s.append(round_trip_s(good, owner, number, 1))
             time.sleep(0.05)
         wait_for(lambda: replica.count("malformed") == thrown)
-    finally:
-        session.close()
     print(f"calm {calm_s * 1e3:.2f} ms, attacked {statistics.median(took_s) * 1e3:.2f} ms")
     assert statistics.median(took_s) < max(NO_SLOWER * calm_s, ANY_CASE_S)
     assert good.status().reopened == 0
-
-
-def greets(session: zenoh.Session, files: CredentialPaths) -> bytes:
-    """Have a robot's bare session let in, and return its token."""
-    hears(session, keys(0)[SERVICE])
-    knows(session, 0)
-    token = bytes(range(8))
-    replica = peer("h:1").certificate_name
-    signed = Signer(files.certificate, files.key)(frame.greeted_bytes(token, replica))
-    greeting = frame.encode_greeting(frame.Greeting(token, *signed))
-    probe = b'{"v":%d,"robot":"eve"}' % frame.VERSION
-    (said,) = session.get(names.probe_key(POOL_UID, 0), payload=probe, attachment=greeting)
-    assert said.ok is not None
-    bare = frame.encode_greeting(frame.Greeting(token))
-    session.get(names.answers_key(POOL_UID, 0), lambda reply: None, attachment=bare, timeout=1e6)
-    time.sleep(0.3)
-    return token

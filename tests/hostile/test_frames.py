@@ -12,27 +12,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import pytest
-import zenoh
 
 from fogft.errors import FrameError
-from fogft.link import batch_frames, frame, probe_frames
+from fogft.link import batch_frames, frame
 from fogft.link.frame import NO_LOAD
-from fogft.link.port import Answer, Probe
-from fogft.link.zenoh import settings as config
+from fogft.link.port import Answer
 from fogft.link.zenoh.robot.connection import read_reply
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.link.zenoh.settings import LinkSettings
-from fogft.model import names
 from tests.fuzz.mutation import damaged
-from tests.hostile.test_bombs import greets
+from tests.hostile.robot import greets, sends, session_at, target
 from tests.link.wire_pool import (
-    POOL_UID,
     SERVICE,
     Authority,
     Owner,
     ReplicaProcess,
-    keys,
-    peer,
     request_id,
     wait_for,
 )
@@ -43,42 +36,6 @@ from tests.nightly import by_day
 CASES = by_day(10_000, at_night=1_000_000)
 OURS = 1 << 100  # ids of the good robot's requests, which nobody guesses
 STAMP = b"seen"
-
-
-def sends(session: zenoh.Session, token: bytes, dice: random.Random) -> Callable[[], None]:
-    """Return what sends one damaged frame: at any key that a replica hears."""
-    origin = frame.origin("eve", token)
-    header, content = batch_frames.encode_requests(
-        [(request_id(1), 1.0, False, b"x"), (request_id(2), 1.0, True, b"y")], origin
-    )
-    requests = frame.encode_request(request_id(3), 1.0, origin), header
-    packed = frame.encode_request(request_id(4), 1.0, origin, packed=True)
-    cancel = frame.encode_cancel([request_id(1), request_id(2)])
-    greeting = frame.encode_greeting(frame.Greeting(token))
-    probe = probe_frames.encode_probe(Probe("eve", describe=True))
-    asked = [(names.probe_key, probe), (names.records_key, b"{}"), (names.answers_key, b"")]
-
-    def send() -> None:
-        kind = dice.randrange(10)
-        if kind < 8:
-            to = names.cancel_key(POOL_UID, 0) if kind == 0 else keys(0)[SERVICE]
-            payload = damaged((cancel if kind == 0 else content,), dice)
-            head = dice.choice((*requests, packed))
-            attachment = damaged((head,), dice) if kind < 6 else head
-            session.put(to, payload, attachment=attachment)
-        else:
-            hello = damaged((greeting,), dice) if kind == 8 else greeting
-            # Not the last as it should be: who asks for answers anew ends those to himself.
-            key, payload = dice.choice(asked[:-1] if token in hello else asked)
-            session.get(
-                key(POOL_UID, 0),
-                lambda reply: None,
-                payload=damaged((payload,), dice),
-                attachment=hello,
-                timeout=5.0,
-            )
-
-    return send
 
 
 @pytest.mark.timeout(1800)  # at night
@@ -93,10 +50,9 @@ def test_a_robot_that_sends_damaged_frames_costs_nobody_else_anything(
     good = dial(replica.endpoint)
     wait_for(lambda: good.usable)
     files = authority.robot("eve")
-    settings = config.robot_settings(peer(replica.endpoint), files, LinkSettings())
-    session = zenoh.open(config.to_zenoh(settings))
-    try:
-        send, done = sends(session, greets(session, files), random.Random(25)), threading.Event()
+    at, done = target(replica.endpoint), threading.Event()
+    with session_at(at, files) as session:
+        send = sends(session, greets(session, files, at), random.Random(25), at)
 
         def flood() -> None:
             for _ in range(CASES):
@@ -108,8 +64,6 @@ def test_a_robot_that_sends_damaged_frames_costs_nobody_else_anything(
         while not done.wait(0.005):
             asked += good.offer(SERVICE, request_id(OURS + asked), b"x%d" % asked, 30.0)
         wait_for(lambda: good.status().in_flight == 0)
-    finally:
-        session.close()
     assert asked > 0
     came = sorted((one.request_id, one.payload) for _, one in owner.answers)
     assert came == [(request_id(OURS + number), b"x%d" % number) for number in range(asked)]

@@ -80,12 +80,12 @@ def hears(session: zenoh.Session, key: str) -> None:
     publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
-def knows(session: zenoh.Session, slot: int) -> None:
+def knows(session: zenoh.Session, slot: int, pool_uid: str = POOL_UID) -> None:
     """Wait until a session knows all that a replica or gateway hears; what it declares last."""
-    querier = session.declare_querier(names.probe_key(POOL_UID, slot))
+    querier = session.declare_querier(names.probe_key(pool_uid, slot))
     wait_for(lambda: querier.matching_status.matching)  # type: ignore[attr-defined]
     querier.undeclare()  # type: ignore[no-untyped-call]
-    hears(session, names.cancel_key(POOL_UID, slot))
+    hears(session, names.cancel_key(pool_uid, slot))
 
 
 def request_id(number: int) -> bytes:
