@@ -195,7 +195,9 @@ def test_a_status_of_another_version_is_an_error(home, capsys):
     paths = lay_down(home)
     paths.status.write_text('{"pool": "planner", "replicas": [], "services": []}')
     assert main.run(["status"]) == 1
-    assert capsys.readouterr().err.startswith("error: not a status: ")
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: `{paths.status}` is not a status: ")
+    assert "remove it" in said
 
 
 def test_which_pool_is_meant_must_be_clear(home, capsys):

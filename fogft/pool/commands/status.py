@@ -128,7 +128,7 @@ def read(paths: PoolPaths, now: float) -> Seen:
         StateError: The status is damaged, or another version's.
     """
     raw = disk.read_json(paths.status)
-    seen = _unobserved(paths) if raw is None else status.from_json(raw)
+    seen = _unobserved(paths) if raw is None else status.from_json(raw, paths.status)
     return _current(paths, seen, now)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from fogft import __version__
@@ -349,13 +350,14 @@ class PoolStatus:
         return dict(to_plain(self))
 
 
-def from_json(raw: Any) -> PoolStatus:
-    """Read a status back.
+def from_json(raw: Any, path: Path) -> PoolStatus:
+    """Read back the status in a file.
 
     Raises:
         StateError: It is none, or of another version of fogft.
     """
-    return stored(PoolStatus, raw, "not a status", "is the manager of another version?")
+    hint = "remove it: a manager of this version writes it anew"
+    return stored(PoolStatus, raw, f"`{path}` is not a status", hint)
 
 
 def of_tick(

@@ -143,7 +143,7 @@ class Dispatcher:
             outcomes.received(len(payload))
             over = requests.held_bytes + len(payload) > self.max_pending_bytes
             if over or len(requests.table) >= self.max_pending:
-                self._turn_away(request)
+                self._turn_away(request, len(payload))
                 return False
             links, able = self._sender.links, self._sender.able
             item = Request(payload, handle, now, traced=outcomes.trace is not None)
@@ -164,14 +164,16 @@ class Dispatcher:
             self._wake()
         return True
 
-    def _turn_away(self, request: bytes) -> None:
+    def _turn_away(self, request: bytes, size: int) -> None:
         """Count a request that is not taken. Under the lock."""
         count = self.outcomes.count
         count["turned_away"] += 1
         self.outcomes.note(request, Outcome.TURNED_AWAY, took_s=0.0, at=self._clock())
         if worth_logging(count["turned_away"]):
+            held = f"{size} B, beside {self._requests.held_bytes} B of {len(self._requests.table)}"
+            limit = f"at most {self.max_pending_bytes} B and {self.max_pending} requests may wait"
             log.warning("request_turned_away service=%s reason=%r count=%d",
-                        self.spec.name, "pending is full", count["turned_away"])  # fmt: skip
+                        self.spec.name, f"{held}: {limit}", count["turned_away"])  # fmt: skip
 
     def cancel(self, request: bytes) -> None:
         """End a request that its caller no longer wants; unknown ids are fine."""

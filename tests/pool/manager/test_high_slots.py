@@ -143,7 +143,7 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
         (2000, "ready", "up"),
         (2001, "starting", ""),
     ]
-    assert status.from_json(found.to_json()) == found
+    assert status.from_json(found.to_json(), Path("status.json")) == found
     output.show(status_text.rendered(Seen(found, 0.4, True), width=100))
     lines = capsys.readouterr().out.splitlines()
     first = next(n for n, line in enumerate(lines) if line.startswith("REPLICA"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -140,7 +141,7 @@ def test_status_says_what_was_seen_and_survives_json() -> None:
     assert seen.reasons[-1] == Reason(Cause.TROUBLE, words="one more")
     assert [r.reason for r in seen.replicas] == [None, Reason(Cause.NOTICE), None]
     assert seen.events[0].event == "launched"
-    again = status.from_json(json.loads(json.dumps(seen.to_json())))
+    again = status.from_json(json.loads(json.dumps(seen.to_json())), Path("status.json"))
     assert again.to_json() == json.loads(json.dumps(seen.to_json()))
 
 
@@ -168,4 +169,4 @@ def test_stopping_is_shown() -> None:
 def test_what_is_no_status_is_an_error(junk: object) -> None:
     """A reader of another version is told so."""
     with pytest.raises(StateError):
-        status.from_json(junk)
+        status.from_json(junk, Path("status.json"))

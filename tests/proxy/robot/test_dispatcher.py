@@ -269,12 +269,14 @@ def test_a_response_that_is_not_ok_beats_silence_at_the_deadline():
     assert scene.responses == [("caller", b"bad")]
 
 
-def test_pending_bytes_are_bounded():
+def test_pending_bytes_are_bounded(caplog: pytest.LogCaptureFixture):
+    """And whoever asks for more is told the limit."""
     scene = Scene(1, max_pending_bytes=10)
     for _ in range(3):
         scene.dispatcher.submit(b"12345", "caller")
     report = scene.dispatcher.report()
     assert (report["turned_away"], report["pending_bytes"]) == (1, 10)
+    assert "5 B, beside 10 B of 2: at most 10 B" in caplog.text
     scene.answer(0, b"a", n=0)
     assert scene.dispatcher.report()["pending_bytes"] == 5
 
